@@ -1,0 +1,36 @@
+# Everything a newcomer needs: `make demo` and `make test` set up .venv by themselves.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test check bench docs pins clean
+
+.venv/ready: constraints.txt pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --require-hashes -r constraints.txt
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+demo: .venv/ready  ## the main job end to end, on simulated data (minutes on two cores)
+	$(BIN)/mvitac demo --out runs/demo
+
+test: .venv/ready  ## the test suite
+	$(BIN)/python -m pytest
+
+check: .venv/ready  ## lint, format, types, import contract
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+pins:  ## write constraints.txt anew: needs uv on the PATH
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-header --no-annotate --output-file constraints.txt
+
+bench: .venv/ready  ## the simulator's difficulty rule, measured anew (long)
+	$(BIN)/python -m benchmarks.difficulty materials
+
+docs: .venv/ready  ## draw the pictures of the docs again
+	$(BIN)/mvitac data sheet materials --out docs/materials.png
+
+clean:
+	rm -rf .venv build dist .pytest_cache .ruff_cache

@@ -1,0 +1,121 @@
+"""Derive the manifests behind docs/results/real.md from a folder of real data sets (see that page for their owners).
+
+    python examples/real_manifests.py ../shared/data runs/real/manifests
+
+What a derived manifest adds to the set's own: cross-validation columns ``fold1`` ... (whole objects; every object is
+tested once), the numbers behind the control probes, and for vt60 the weak pairs. Nothing here looks at a label to
+choose a fold's members other than to spread the classes over the folds. Image paths stay where they are.
+"""
+
+import csv
+import os
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+Rows = list[dict[str, str]]
+
+
+def read(file: Path) -> Rows:
+    with file.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def write(rows: Rows, file: Path, folder: Path, images: tuple[str, ...]) -> None:
+    """Write ``rows`` with the columns ``images`` rewritten from ``folder``-relative to ``file``-relative paths."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    back = os.path.relpath(folder.resolve(), file.parent.resolve())
+    for row in rows:
+        row.update({column: f"{back}/{row[column]}" for column in images})
+    with file.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"{file}: {len(rows)} rows")
+
+
+def add_folds(rows: Rows, num: int, *, by: str, stratum: str, val_every: int = 2) -> None:
+    """Columns fold1..fold<num>: every object is test once; of the next fold's, every ``val_every``-th is val.
+
+    Objects are dealt in turn, stratum by stratum, so that each fold has its share of every stratum.
+    """
+    names: dict[str, str] = {}
+    for row in rows:
+        names.setdefault(row[by], row[stratum])
+    shuffled = np.random.default_rng(0).permutation(sorted(names)).tolist()
+    order = {name: i for i, name in enumerate(sorted(shuffled, key=lambda name: names[name]))}  # stable: still shuffled
+    for fold in range(num):
+        for row in rows:
+            rank, home = divmod(order[row[by]], num)
+            away = (home - fold) % num
+            row[f"fold{fold + 1}"] = "test" if away == 0 else "val" if away == 1 and rank % val_every == 0 else "train"
+
+
+def slip_grasp(folder: Path, out: Path) -> None:
+    """Leave one object out; the sweep of gripper widths, raw and relative to the object's own mean width."""
+    rows = read(folder / "manifest.csv")
+    widths: dict[str, dict[str, float]] = defaultdict(dict)
+    for row in rows:
+        widths[row["object"]][row["grasp"]] = float(row["width_mm"])
+    for row in rows:
+        mean = np.mean(list(widths[row["object"]].values()))
+        row["width_in_sweep"] = f"{float(row['width_mm']) - mean:.3f}"
+    add_folds(rows, 6, by="object", stratum="object", val_every=1)
+    write(rows, out / "slip_grasp.csv", folder, ("vision", "touch"))
+
+
+def slip_gsmini(folder: Path, out: Path) -> None:
+    """Three folds of objects; motion since the recording's first frame, as the mean absolute difference of each gel."""
+    rows = [row for row in read(folder / "manifest.csv") if row["label_conflict"] == "0"]
+    slips: dict[str, list[float]] = defaultdict(list)
+    first: dict[tuple[str, str], np.ndarray] = {}
+    for row in rows:
+        slips[row["object"]].append(float(row["slip"]))
+        for gel in ("left", "right"):
+            with Image.open(folder / row[gel]) as image:
+                pixels = np.asarray(image.convert("L").resize((75, 56)), np.float32)
+            start = first.setdefault((row["experiment"], gel), pixels)
+            row[f"motion_{gel}"] = f"{np.abs(pixels - start).mean():.3f}"
+    for row in rows:
+        row["often"] = f"{np.mean(slips[row['object']]):.2f}"  # only to spread objects that slip over the folds
+    add_folds(rows, 3, by="object", stratum="often")
+    for row in rows:
+        del row["often"]  # a label in disguise
+    write(rows, out / "slip_gsmini.csv", folder, ("left", "right"))
+
+
+def physiclear(folder: Path, out: Path) -> None:
+    """The owners' split as it is; their objects without labels become "unlabelled"."""
+    rows = read(folder / "manifest.csv")
+    for row in rows:
+        row["owners_split"] = row.pop("split") or "unlabelled"
+    write(rows, out / "physiclear.csv", folder, ("touch",))
+
+
+def vt60(folder: Path, out: Path) -> None:
+    """Weak pairs: the k-th touch of an object with its (k mod 24)-th photo; two objects of a category in each fold."""
+    photos: dict[str, list[str]] = defaultdict(list)
+    everything = read(folder / "manifest.csv")
+    for row in everything:
+        if row["modality"] == "vision":
+            photos[row["object"]].append(row["image"])
+    rows, seen = [], defaultdict(int)
+    for row in everything:
+        if row["modality"] == "touch":
+            names = photos[row["object"]]
+            pair = {"vision": names[seen[row["object"]] % len(names)], "touch": row["image"]}
+            seen[row["object"]] += 1
+            rows.append({**pair, **{k: row[k] for k in ("category", "object", "x", "y", "z")}})
+    add_folds(rows, 3, by="object", stratum="category")
+    write(rows, out / "vt60.csv", folder, ("vision", "touch"))
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3 or not Path(sys.argv[1]).is_dir():
+        sys.exit(f"usage: python {sys.argv[0]} DATA_FOLDER OUT_FOLDER")
+    for make in (slip_grasp, slip_gsmini, physiclear, vt60):
+        source = Path(sys.argv[1]) / make.__name__
+        make(source, Path(sys.argv[2])) if (source / "manifest.csv").is_file() else print(f"{source}: not there")

@@ -1,0 +1,30 @@
+"""mvitac: learn from paired camera and optical-tactile images without labels, and say what the features are worth.
+
+    model = mvitac.load("runs/demo/seed0")                      # a trained run
+    features = model.embed(vision=photos, touch=presses)        # {"vision": [N, 512], "touch": [N, 512]}
+
+Names are imported on first use, so that ``import mvitac`` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mvitac.model import Model, load
+    from mvitac.pack import Pack
+    from mvitac.recipes import recipe
+    from mvitac.run import Run
+    from mvitac.train import train
+
+__version__ = "0.1.0"
+__all__ = ["Model", "Pack", "Run", "load", "recipe", "train"]
+
+_HOME = {"Model": "model", "Pack": "pack", "Run": "run", "load": "model", "recipe": "recipes", "train": "train"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f"mvitac.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'mvitac' has no attribute {name!r}")

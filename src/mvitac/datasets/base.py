@@ -1,0 +1,40 @@
+"""The dataset contract: a config that says where samples come from; everything else reads the pack made of them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from mvitac.pack import Pack, Source, build, check_request
+from mvitac.record import cache_dir, check_place, digest
+from mvitac.registry import Registered
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetConfig(Registered, ABC):
+    """Base of every dataset's config. Adding a dataset is one file: a ``Source`` and a config naming it."""
+
+    size: int = 256
+    """Side in pixels at which images are stored; crops are cut from it (paper: 256)."""
+    workers: int = 0
+    """Processes that read or simulate while packing; 0 = one per core."""
+
+    def __post_init__(self) -> None:
+        check_request(self.size, self.workers)
+
+    @abstractmethod
+    def source(self) -> Source:
+        """Where the samples come from; ValueError if it is not there."""
+
+    def open(self, *, quiet: bool = False) -> Pack:
+        """The pack of this dataset, made in the cache (see ``record.cache_dir``) the first time."""
+        source = self.source()
+        key = digest({"fingerprint": source.fingerprint(), "size": self.size})[:16]
+        path = cache_dir() / "packs" / f"{self.name}-{key}"
+        if path.exists():
+            return Pack(path)
+        try:
+            check_place(path)
+        except ValueError as error:
+            raise ValueError(f"the cache of packs: {error} with MVITAC_CACHE") from None
+        return build(source, path, size=self.size, workers=self.workers, quiet=quiet)

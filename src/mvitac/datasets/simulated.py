@@ -1,0 +1,175 @@
+"""The embedded default: simulated touches of materials and simulated grasps (``sim/``), split by instance and by object.
+
+Nothing here is comparable with the paper's numbers; it is what lets every claim of this project be re-run with no data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mvitac.datasets.base import DatasetConfig
+from mvitac.pack import Sample, Source
+from mvitac.sim import grasps, materials
+from mvitac.spec import DataSpec, Task
+
+LICENCE = "Apache-2.0 (made by this package)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedConfig(DatasetConfig):
+    """What both simulators share."""
+
+    num: int = 6000
+    """How many pairs (materials) or grasps of three phases each (grasps) to simulate."""
+    seed: int = 0
+    """World seed: another seed is another set of instances and objects."""
+    size: int = 72
+    """Side in pixels at which images are rendered and stored."""
+    held_out_sensor: bool = False
+    """Use the one sensor that is otherwise never used, to test transfer."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.num <= 10_000_000:
+            raise ValueError(f"num {self.num}: give how many to simulate, at least 1 and at most 10000000")
+        if not 0 <= self.seed < 1 << 63:
+            raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
+
+    def _fingerprint(self, version: int) -> dict[str, Any]:
+        own = {key: value for key, value in asdict(self).items() if key != "workers"}
+        return {"simulator": self.name, "version": version, **own}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialsConfig(SimulatedConfig):
+    """Simulated touches of 20 material classes; labels category, hard/soft, rough/smooth; split by instance."""
+
+    name: ClassVar[str] = "materials"
+
+    touches: int = 5
+    """Touches per instance, each at another place, force, sensor and lamp."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.touches < 1:
+            raise ValueError(f"touches {self.touches}: give touches per instance, at least 1")
+
+    def source(self) -> Source:
+        return Materials(self)
+
+
+class Materials(Source):
+    """Item i is touch (i // 20) % touches of instance i // (20 touches) of class i % 20, so a larger num only appends."""
+
+    def __init__(self, config: MaterialsConfig) -> None:
+        self.config = config
+
+    def spec(self) -> DataSpec:
+        return DataSpec(
+            name="materials",
+            vision_channels=3,
+            touch_channels=3,
+            tasks=(
+                Task(name="category", classes=materials.CLASSES),
+                Task(name="soft", classes=("hard", "soft")),
+                Task(name="rough", classes=("smooth", "rough")),
+            ),
+            group_by="instance",
+            licence=LICENCE,
+            source=f"mvitac.sim.materials version {materials.VERSION}",
+        )
+
+    def items(self) -> list[str]:
+        return ["{:02d}-{:04d}-{:02d}".format(*self._address(i)) for i in range(self.config.num)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return self.config._fingerprint(materials.VERSION)
+
+    def _address(self, item: int) -> tuple[int, int, int]:
+        num_classes, touches = len(materials.CLASSES), self.config.touches
+        return item % num_classes, item // num_classes // touches, item // num_classes % touches
+
+    def read(self, item: int) -> list[Sample]:
+        category, instance, touch = self._address(item)
+        made = materials.touch(
+            self.config.seed,
+            category,
+            instance,
+            touch,
+            size=self.config.size,
+            held_out_sensor=self.config.held_out_sensor,
+        )
+        labels = {f"label_{task}": int(made.pop(task)) for task in ("category", "soft", "rough")}
+        vision, pressed = made.pop("vision"), made.pop("touch")
+        group = f"{category:02d}-{instance:04d}"
+        # Of every 20 instances of a class, 4 test and 3 choose: instances are independent draws, so any fixed rule will do.
+        split = "test" if instance % 20 in (2, 7, 12, 17) else "val" if instance % 20 in (5, 10, 15) else "train"
+        columns = {"id": f"{group}-{touch:02d}", "group": group, "touch_group": group, "split": split, **labels, **made}
+        return [Sample(vision=vision, touch=pressed, columns=columns)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspsConfig(SimulatedConfig):
+    """Simulated two-finger grasps of 106 objects, before, during and after the lift; label success; split by object."""
+
+    name: ClassVar[str] = "grasps"
+
+    num: int = 5300
+    """How many grasps; each gives three rows (before, during, after)."""
+
+    def source(self) -> Source:
+        return Grasps(self)
+
+
+class Grasps(Source):
+    """Item i is grasp i // 106 of object i % 106; touch is both gels stacked on channels (6), as in the paper."""
+
+    def __init__(self, config: GraspsConfig) -> None:
+        self.config = config
+
+    def spec(self) -> DataSpec:
+        return DataSpec(
+            name="grasps",
+            vision_channels=3,
+            touch_channels=6,
+            # 'after' is taken when the outcome shows; only 'during', fingers closed before the lift, may be asked.
+            tasks=(Task(name="success", classes=("failure", "success"), only={"phase": "during"}),),
+            group_by="object",
+            controls={"contact only": ("contact_left", "contact_right")},
+            licence=LICENCE,
+            source=f"mvitac.sim.grasps version {grasps.VERSION}",
+        )
+
+    def items(self) -> list[str]:
+        return [f"{i % grasps.NUM_OBJECTS:03d}-{i // grasps.NUM_OBJECTS:04d}" for i in range(self.config.num)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return self.config._fingerprint(grasps.VERSION)
+
+    def num_samples(self) -> int:
+        return 3 * self.config.num
+
+    def read(self, item: int) -> list[Sample]:
+        obj, index = item % grasps.NUM_OBJECTS, item // grasps.NUM_OBJECTS
+        place = int(np.flatnonzero(np.random.default_rng(106).permutation(grasps.NUM_OBJECTS) == obj)[0])
+        split = "test" if place < 26 else "val" if place < 42 else "train"
+        samples = []
+        for made in grasps.grasp(
+            self.config.seed, obj, index, size=self.config.size, held_out_sensor=self.config.held_out_sensor
+        ):
+            vision = made.pop("vision")
+            both = np.concatenate([made.pop("touch_left"), made.pop("touch_right")], axis=2)
+            grasp_id = f"{obj:03d}-{index:04d}"
+            columns = {
+                "id": f"{grasp_id}-{made['phase']}",
+                "group": made["object"],
+                "touch_group": grasp_id,
+                "split": split,
+                "label_success": int(made.pop("success")),
+                **made,
+            }
+            samples.append(Sample(vision=vision, touch=both, columns=columns))
+        return samples

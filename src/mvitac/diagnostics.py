@@ -1,0 +1,98 @@
+"""Is it learning or collapsing? Plain numbers from features: spread, rank, alignment, gap, kNN, retrieval.
+
+Shapes: features [N, D] of one modality, row i of vision and row i of touch being a pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def spread(z: Float[Tensor, "N D"]) -> float:
+    """Mean over dimensions of the std of L2-normalised features, times sqrt(D): about 1 = spread, 0 = collapsed.
+
+    Source: https://arxiv.org/abs/2011.10566 (SimSiam, section 4.1).
+    """
+    z = F.normalize(z.float(), dim=1)
+    return float(z.std(dim=0).mean() * z.shape[1] ** 0.5)
+
+
+def rank_me(z: Float[Tensor, "N D"]) -> float:
+    """Effective rank, exp of the entropy of the singular values: 1 = collapsed, at most min(N, D).
+
+    Source: https://arxiv.org/abs/2210.02885 (RankMe, eq. 2).
+    """
+    p = torch.linalg.svdvals(z.double())
+    p = p / p.sum().clamp(min=1e-12)
+    return float(torch.exp(-(p * torch.log(p + 1e-12)).sum()))
+
+
+def alignment(a: Float[Tensor, "N D"], b: Float[Tensor, "N D"]) -> float:
+    """Mean squared distance of paired normalised embeddings (0 = paired ones agree, 2 = orthogonal).
+
+    Source: https://arxiv.org/abs/2005.10242 (Wang and Isola).
+    """
+    return float((F.normalize(a.float(), dim=1) - F.normalize(b.float(), dim=1)).square().sum(1).mean())
+
+
+def uniformity(z: Float[Tensor, "N D"]) -> float:
+    """log E exp(-2 |z_i - z_j|^2) over pairs of normalised embeddings: 0 = collapsed, -4 = spread over the sphere.
+
+    Source: https://arxiv.org/abs/2005.10242 (Wang and Isola).
+    """
+    return float(torch.pdist(F.normalize(z.float(), dim=1)).square().mul(-2).exp().mean().log())
+
+
+def modality_gap(a: Float[Tensor, "N D"], b: Float[Tensor, "M D"]) -> float:
+    """Distance of the two modalities' mean normalised embeddings (0 = mixed, up to 2).
+
+    Source: https://arxiv.org/abs/2203.02053 (Liang et al., section 2).
+    """
+    return float((F.normalize(a.float(), dim=1).mean(0) - F.normalize(b.float(), dim=1).mean(0)).norm())
+
+
+def knn_accuracy(
+    train: Float[Tensor, "N D"],
+    train_labels: Int[Tensor, " N"],
+    test: Float[Tensor, "M D"],
+    test_labels: Int[Tensor, " M"],
+    k: int = 20,
+) -> float:
+    """Share of ``test`` rows whose label wins among the ``k`` nearest ``train`` rows, votes weighted exp(cosine / .07).
+
+    Source: https://arxiv.org/abs/1805.01978 (Wu et al., section 3.4).
+    """
+    similarity = F.normalize(test.float(), dim=1) @ F.normalize(train.float(), dim=1).T
+    near = similarity.topk(min(k, len(train)), dim=1)
+    votes = torch.zeros(len(test), int(max(train_labels.max(), test_labels.max())) + 1)
+    votes.scatter_add_(1, train_labels[near.indices], (near.values / 0.07).exp())
+    return float((votes.argmax(1) == test_labels).float().mean())
+
+
+def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Tensor, "G D"]:
+    """Mean normalised embedding of each of the G groups numbered 0 .. G-1, itself normalised."""
+    sums = torch.zeros(int(groups.max()) + 1, z.shape[1]).index_add_(0, groups, F.normalize(z.float(), dim=1))
+    return F.normalize(sums, dim=1)
+
+
+def retrieval_ranks(
+    query: Float[Tensor, "N D"], gallery: Float[Tensor, "N D"], groups: Int[Tensor, " N"]
+) -> Int[Tensor, " N"]:
+    """Rank (0 = first) of each query row's own group among all groups, a group being its mean gallery embedding.
+
+    One gallery entry per group makes chance exact: R@k by guessing is k / number of groups.
+    """
+    similarity = F.normalize(query.float(), dim=1) @ group_means(gallery, groups).T
+    own = similarity.gather(1, groups[:, None])
+    # Ties count against the query: constant embeddings must not retrieve.
+    return (similarity >= own).sum(1) - 1
+
+
+def recall_at(ranks: Int[Tensor, " N"], ks: Sequence[int] = (1, 5, 10)) -> dict[str, float]:
+    """R@k: share of queries whose own group is among the first k."""
+    return {f"R@{k}": float((ranks < k).float().mean()) for k in ks}

@@ -1,0 +1,21 @@
+"""Contrastive losses as closed forms. B queries, B keys, D dimensions; row i of the keys is the positive of query i."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+
+def info_nce(query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], temperature: float) -> Float[Tensor, ""]:
+    """InfoNCE with in-batch negatives, mean over the queries (paper eq. 8 and 11).
+
+    L = -log( exp(q.k+ / tau) / sum_i exp(q.k_i / tau) ), the sum running over all B keys of the batch, the positive
+    included. Both inputs are L2-normalised here, and everything is computed in fp32 whatever the autocast: at
+    tau = .07 the logits span +-14, where bf16 keeps only two digits.
+    """
+    with torch.autocast(query.device.type, enabled=False):
+        query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)
+        logits = query @ key.T / temperature
+        return F.cross_entropy(logits, torch.arange(len(query), device=query.device))

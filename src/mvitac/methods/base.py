@@ -1,0 +1,50 @@
+"""The method contract: what a pre-training method owes the loop, and nothing more."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor, nn
+
+from mvitac.batch import Views
+from mvitac.encoders import EncoderConfig
+from mvitac.registry import Registered
+from mvitac.spec import DataSpec
+
+
+class Method(nn.Module, ABC):
+    """A pre-training method. Devices, precision, optimisers, logging and checkpoints are never its business."""
+
+    views: ClassVar[int] = 1
+    """Views per image that ``forward`` unpacks."""
+
+    @abstractmethod
+    def forward(self, batch: Views) -> dict[str, Tensor]:
+        """Scalars of one batch: "loss" is minimised, the rest is logged. Pure: no update, no print, no sync."""
+
+    @abstractmethod
+    def encoders(self) -> dict[str, nn.Module]:
+        """What outlives pre-training: modality -> trunk from [B, C, H, W] to features [B, D]."""
+
+    def projectors(self) -> dict[str, nn.Module]:
+        """modality -> head from features into the space both modalities share, for retrieval; {} if there is none."""
+        return {}
+
+    def after_step(self, progress: float) -> None:
+        """What happens after the optimiser's step, e.g. the momentum update; ``progress`` runs from 0 to 1."""
+        return
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodConfig(Registered, ABC):
+    """Base of every method's config, which lies beside its method."""
+
+    def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
+        """Tasks whose labels it learns from; none for a self-supervised method."""
+        return ()
+
+    @abstractmethod
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> Method:
+        """The method with fresh weights for a dataset; ValueError if it cannot work on that dataset."""

@@ -1,0 +1,125 @@
+"""MViTac (Dave, Lygerakis, Rueckert, ICRA 2024): intra- and inter-modal contrast of vision and touch, eq. 1-14.
+
+Notation of the paper: encoders f(.; theta) for vision and f(.; psi) for touch; heads phi_v (vision, intra), phi_t
+(vision, inter), Phi_t (touch, intra), Phi_v (touch, inter); q = query, k = key. z_xy: x is the query's modality, y the
+key's. Two views of each image: the first feeds the query tower, the second the key tower. Shapes: images [B, C, H, W],
+features [B, D], embeddings z [B, 128].
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor, nn
+
+from mvitac.batch import Views
+from mvitac.encoders import EncoderConfig, Head, build_trunk
+from mvitac.losses import info_nce
+from mvitac.methods.base import Method, MethodConfig
+from mvitac.momentum import Momentum
+from mvitac.spec import DataSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class MViTacConfig(MethodConfig):
+    """Momentum contrast within and across vision and touch; on touch-only (or vision-only) data its intra loss alone."""
+
+    name: ClassVar[str] = "mvitac"
+
+    temperature: float = 0.07
+    """tau of InfoNCE; the best of .07, .2, .5, 1 in the paper."""
+    lambda_inter: float = 1.0
+    """Weight of the two inter-modal losses (eq. 14); not given in the paper, 1 in the authors' code."""
+    momentum: float = 0.99
+    """m of eq. 1-3; not given in the paper, .99 in the authors' code."""
+    momentum_end: float | None = None
+    """If given, m rises to this along a half cosine (as in BYOL and MoCo v3); the paper has no schedule."""
+    out: int = 128
+    """Width of the embeddings z (paper: 128)."""
+    hidden: int = 512
+    """Hidden width of the 2-layer heads; not given in the paper (2048 in the authors' code), 512 is the trunk's width."""
+    dropout: float = 0.0
+    """Dropout in the heads; none in the paper, .5 in the authors' code."""
+    head_norm: bool = False
+    """BatchNorm after the heads' first layer, as in MoCo v3 and SimCLR v2; none in the paper."""
+
+    def __post_init__(self) -> None:
+        if not (self.temperature > 0 and math.isfinite(self.temperature)):
+            raise ValueError(f"temperature {self.temperature}: give a positive number, e.g. 0.07")
+        if not (self.lambda_inter >= 0 and math.isfinite(self.lambda_inter)):
+            raise ValueError(f"lambda_inter {self.lambda_inter}: give a finite weight >= 0")
+        for name, m in (("momentum", self.momentum), ("momentum_end", self.momentum_end)):
+            if m is not None and not 0 <= m <= 1:
+                raise ValueError(f"{name} {m}: give 0 (keys copy the queries) to 1 (keys never move)")
+        for name, width in (("out", self.out), ("hidden", self.hidden)):
+            if not 1 <= width <= 65536:
+                raise ValueError(f"head width {name} {width}: give 1 to 65536")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
+        return MViTac(self, spec, encoder)
+
+
+class Tower(nn.Module):
+    """One encoder with its two heads: an image passes the trunk once and leaves as (z intra, z inter)."""
+
+    def __init__(self, config: MViTacConfig, encoder: EncoderConfig, channels: int) -> None:
+        super().__init__()
+        self.trunk = build_trunk(encoder, channels)
+
+        def head() -> Head:
+            features = int(self.trunk.num_features)  # type: ignore[arg-type]
+            return Head(features, config.hidden, config.out, dropout=config.dropout, norm=config.head_norm)
+
+        self.intra, self.inter = head(), head()
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        features = self.trunk(images)
+        return self.intra(features), self.inter(features)
+
+
+class MViTac(Method):
+    """Query towers, their momentum copies, four losses."""
+
+    views = 2
+
+    def __init__(self, config: MViTacConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
+        self.query = nn.ModuleDict({m: Tower(config, encoder, spec.channels(m)) for m in spec.modalities})
+        self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.query.items()})
+
+    def forward(self, batch: Views) -> dict[str, Tensor]:
+        tau = self.config.temperature
+        query = {m: self.query[m](views[0]) for m, views in batch.images.items()}
+        key = {m: self.key[m](views[1]) for m, views in batch.images.items()}
+        losses: dict[str, Tensor] = {}
+        if "vision" in query:
+            (z_vv_q, z_vt_q), (z_vv_k, z_tv_k) = query["vision"], key["vision"]  # eq. 4, 9 and eq. 5, 13
+            losses["vv"] = info_nce(z_vv_q, z_vv_k, tau)  # eq. 8
+        if "touch" in query:
+            (z_tt_q, z_tv_q), (z_tt_k, z_vt_k) = query["touch"], key["touch"]  # eq. 6, 12 and eq. 7, 10
+            losses["tt"] = info_nce(z_tt_q, z_tt_k, tau)
+        intra = sum(losses.values())
+        if len(losses) < 2:  # one modality: eq. 14 keeps its intra loss
+            return {"loss": intra, **losses}  # type: ignore[dict-item]
+        losses["vt"] = info_nce(z_vt_q, z_vt_k, tau)  # eq. 11  # type: ignore[possibly-unbound]
+        losses["tv"] = info_nce(z_tv_q, z_tv_k, tau)  # type: ignore[possibly-unbound]
+        return {"loss": intra + self.config.lambda_inter * (losses["vt"] + losses["tv"]), **losses}  # eq. 14
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return {m: tower.trunk for m, tower in self.query.items()}  # type: ignore[misc]
+
+    def projectors(self) -> dict[str, nn.Module]:
+        return {m: tower.inter for m, tower in self.query.items()}  # type: ignore[misc]
+
+    def after_step(self, progress: float) -> None:
+        m, end = self.config.momentum, self.config.momentum_end
+        if end is not None:
+            m = end - (end - m) * (math.cos(math.pi * progress) + 1) / 2
+        for modality, tower in self.query.items():
+            self.key[modality].follow(tower, m)  # type: ignore[operator]  # eq. 1-3

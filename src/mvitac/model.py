@@ -1,0 +1,221 @@
+"""What outlives pre-training: frozen encoders (and the heads into the shared space), ready for raw images.
+
+model = mvitac.load("runs/demo/seed0")
+features = model.embed(vision=photos, touch=presses)      # {"vision": [N, 512], "touch": [N, 512]}
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+from mvitac.augment import plain_view
+from mvitac.encoders import SCRATCH
+from mvitac.methods.base import Method
+from mvitac.pack import Pack, fit
+from mvitac.record import brief, digest, read_json, write_atomic
+from mvitac.registry import from_json, to_json, unknown
+from mvitac.run import Run
+from mvitac.spec import DataSpec
+
+FORMAT = "mvitac-model"
+Images = np.ndarray | Tensor | Image.Image | Sequence[Any]
+
+
+class Model(nn.Module):
+    """Encoders modality -> trunk, projectors modality -> head, in eval mode, with their preprocessing."""
+
+    def __init__(self, method: Method, run: Run, spec: DataSpec, stored: int) -> None:
+        """``stored``: side in pixels at which the training pack stores images, to which raw ones are squashed first."""
+        super().__init__()
+        self.run, self.spec, self.stored = run, spec, stored
+        self.encoders = nn.ModuleDict(method.encoders())
+        self.projectors = nn.ModuleDict(method.projectors())
+        self.eval()
+
+    @torch.no_grad()
+    def features(self, modality: str, images: Tensor, *, precision: str = "fp32") -> Tensor:
+        """Pooled features [B, D] (fp32) of uint8 ``images`` [B, C, H, W] as a pack stores them."""
+        view = plain_view(images, self.run.augment.size)
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=precision == "bf16"):
+            return self.encoders[modality](view).float()
+
+    @torch.no_grad()
+    def project(self, modality: str, features: Tensor) -> Tensor:
+        """Features [B, D] into the space that both modalities share [B, E], L2-normalised."""
+        if modality not in self.projectors:
+            raise ValueError(f"this model has no shared space for {modality}: its method is {self.run.method.name!r}")
+        return nn.functional.normalize(self.projectors[modality](features), dim=1)
+
+    def embed(
+        self, *, vision: Images | None = None, touch: Images | None = None, shared: bool = False
+    ) -> dict[str, Tensor]:
+        """Embed raw images: features [N, D] by modality, or with ``shared`` the L2-normalised common space [N, E].
+
+        Each argument is one image or several: uint8 arrays [H, W, C] or [N, H, W, C], uint8 tensors [C, H, W] or
+        [N, C, H, W], PIL images, or a list of these. A two-sensor touch image has 6 channels (left, then right). Any
+        size: images are resized as the pack resized the training data. ValueError names what does not fit.
+        """
+        given = {m: v for m, v in (("vision", vision), ("touch", touch)) if v is not None}
+        if not given:
+            raise ValueError("embed: give vision=..., touch=..., or both")
+        device = next(self.parameters()).device
+        result = {}
+        for modality, value in given.items():
+            if modality not in self.encoders:
+                raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
+            arrays = [fit(a, self.stored) for a in to_arrays(value, self.spec.channels(modality), modality)]
+            images = torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).to(device)
+            features = self.features(modality, images)
+            result[modality] = self.project(modality, features) if shared else features
+        return result
+
+    def weights_digest(self) -> str:
+        """Content address of the weights and of the view they expect, for caches."""
+        tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
+        return digest([safetensors_digest(tensors), self.run.augment.size])
+
+    def save(self, path: Path) -> None:
+        """Write ``path`` (.safetensors) with run and data description in its header."""
+        tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
+        header = {
+            "format": FORMAT,
+            "run": json.dumps(to_json(self.run)),
+            "spec": json.dumps(to_json(self.spec)),
+            "stored": str(self.stored),
+            "digest": safetensors_digest(tensors),
+        }
+        header["header_digest"] = digest([header["run"], header["spec"], header["stored"]])
+        data = safetensors.torch.save(tensors, metadata=header)
+        write_atomic(path, lambda file: file.write(data))
+
+
+def safetensors_digest(tensors: dict[str, Tensor]) -> str:
+    """sha256 over names, shapes and bytes."""
+    import hashlib
+
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}\n".encode())
+        total.update(tensors[name].reshape(-1).view(torch.uint8).numpy().tobytes())
+    return total.hexdigest()
+
+
+def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
+    """The model of ``run`` before any training, from its seed: the untrained control, and the frame weights load into."""
+    torch.manual_seed(run.seed)
+    return Model(run.method.build(spec, run.encoder), run, spec, stored)
+
+
+def load(path: str | Path) -> Model:
+    """A trained model from a run's folder or its model.safetensors; never unpickles; ValueError says what is wrong."""
+    path = Path(path)
+    file = path / "model.safetensors" if path.is_dir() else path
+    if not file.is_file():
+        hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
+        raise ValueError(f"no trained model at {file}{hint}")
+    try:
+        with safetensors.safe_open(file, framework="pt") as opened:
+            header = opened.metadata() or {}
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - not a dict
+    except Exception as error:  # safetensors raises its own kind for every damaged byte
+        raise ValueError(f"{file} cannot be read as safetensors ({brief(error)}): copy it again or re-train") from None
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{file} was not written by mvitac: its header lacks format={FORMAT}")
+    if safetensors_digest(tensors) != header.get("digest"):
+        raise ValueError(f"{file} does not match its digest: the weights were changed or damaged")
+    given = digest([header.get("run"), header.get("spec"), header.get("stored")])
+    if header.get("header_digest", given) != given:
+        raise ValueError(f"{file} does not match its header's digest: it was changed or damaged")
+    try:
+        run = Run.load(json.loads(header["run"]))
+        spec: DataSpec = from_json(DataSpec, json.loads(header["spec"]), "spec")
+        stored = int(from_json(int, json.loads(header["stored"]), "stored"))
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
+    # The file holds every weight, so the frame needs none of its own, and must not reach for the network.
+    model = fresh(replace(run, encoder=replace(run.encoder, weights=SCRATCH)), spec, stored)
+    model.run = run
+    check_tensors(file, model.state_dict(), tensors)
+    model.load_state_dict(tensors)
+    return model
+
+
+def check_tensors(file: Path, expected: dict[str, Tensor], found: dict[str, Any]) -> None:
+    """ValueError, naming the first tensor, if ``found`` in ``file`` are not the ``expected`` names and shapes."""
+    for name in sorted(expected.keys() ^ found.keys()):
+        where = "is missing" if name in expected else "does not belong"
+        raise ValueError(f"{file} holds other weights than its run describes: tensor {name!r} {where}")
+    for name, tensor in expected.items():
+        if tensor.shape != found[name].shape:
+            shapes = f"{tuple(found[name].shape)}, expected {tuple(tensor.shape)}"
+            raise ValueError(f"{file} holds other weights than its run describes: {name!r} is {shapes}")
+
+
+def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
+    """The ``Run`` and the whole record of a run's folder."""
+    return read_record(path / "run.json")
+
+
+def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
+    """The ``Run`` and the whole record in a run.json; ValueError names the file and the field that does not fit."""
+    record = read_json(file, "a run's record")
+    if not isinstance(record, dict) or "run" not in record:
+        raise ValueError(f"{file} is not a run's record: give the run.json that `mvitac pretrain` wrote")
+    try:
+        return Run.load(record["run"]), record
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def pack_features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, precision: str = "fp32") -> Tensor:
+    """Features [len(rows), D] of pack rows, in chunks, on the model's device; returned on the CPU."""
+    device = next(model.parameters()).device
+    chunks = []
+    for chunk in np.array_split(rows, max(1, len(rows) // 256)):
+        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
+        chunks.append(model.features(modality, images, precision=precision).cpu())
+    return torch.cat(chunks)
+
+
+def to_arrays(value: Images, channels: int, what: str) -> list[np.ndarray]:
+    """Whatever ``Model.embed`` accepts as uint8 arrays [H, W, channels]."""
+    if isinstance(value, Image.Image):
+        value = [value]
+    if isinstance(value, (np.ndarray, Tensor)):
+        value = list(value) if value.ndim == 4 else [value]  # a foreign shape is named below
+    if isinstance(value, (str, bytes, dict)) or not isinstance(value, Iterable):
+        raise ValueError(f"{what}: expected uint8 images with {channels} channels, got {type(value).__name__}")
+    arrays = []
+    for image in value:
+        if isinstance(image, Image.Image):
+            image = np.asarray(image.convert("RGB"))
+        elif isinstance(image, Tensor):
+            image = image.permute(1, 2, 0).cpu().numpy() if image.ndim == 3 else image.cpu().numpy()
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3:
+            shown = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise ValueError(f"{what}: expected uint8 images with {channels} channels, got {shown}")
+        if 0 in image.shape[:2]:
+            raise ValueError(f"{what}: got an image of shape {image.shape}, which has no pixels")
+        if image.shape[2] != channels:
+            raise ValueError(f"{what}: this model takes {channels} channels, got an image of shape {image.shape}")
+        arrays.append(image)
+    if not arrays:
+        raise ValueError(f"{what}: no images given")
+    return arrays
+
+
+def check_modality(spec: DataSpec, modality: str) -> None:
+    """Refuse a modality the dataset lacks."""
+    if modality not in spec.modalities:
+        raise unknown("modality", modality, spec.modalities)

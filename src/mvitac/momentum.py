@@ -1,0 +1,34 @@
+"""The momentum copy of a module (paper eq. 1-3, after MoCo): whole module, so that no part can be forgotten."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+class Momentum(nn.Module):
+    """A frozen copy of ``query`` that follows it: theta_k <- m theta_k + (1 - m) theta."""
+
+    def __init__(self, query: nn.Module) -> None:
+        super().__init__()
+        self.module = copy.deepcopy(query).requires_grad_(False)
+
+    @torch.no_grad()
+    def forward(self, *inputs: Any) -> Any:
+        return self.module(*inputs)
+
+    @torch.no_grad()
+    def follow(self, query: nn.Module, m: float) -> None:
+        """Move every parameter and every floating buffer towards ``query``'s; integer buffers (counters) are copied."""
+        mine: list[Tensor] = [*self.module.parameters(), *self.module.buffers()]
+        theirs: list[Tensor] = [*query.parameters(), *query.buffers()]
+        floating = [(k, q) for k, q in zip(mine, theirs, strict=True) if k.is_floating_point()]
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage] - one call for all tensors
+            [k for k, _ in floating], [q.detach() for _, q in floating], 1 - m
+        )
+        for k, q in zip(mine, theirs, strict=True):
+            if not k.is_floating_point():
+                k.copy_(q)

@@ -1,0 +1,249 @@
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
+"""A camera by ray casting (MuJoCo's rays, no OpenGL) with its own shading: lamp, shadow, gloss, print, table and wall.
+
+Everything here but the thing and the gripper's pose is a nuisance: viewpoint, lamp, colours, table, wall and clutter
+change from grasp to grasp and say nothing about the outcome.
+
+Shapes: P rays (pixels times samples), colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mvitac.sim import objects
+
+SAMPLES = 2
+"""Rays per pixel along each axis."""
+
+TABLES = ("plain", "checker", "planks", "marble", "dots")
+
+VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+"""Geom groups the camera sees; the plain collision bars of the fingers are not drawn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One photograph's nuisances."""
+
+    position: np.ndarray
+    """Camera position [3]."""
+    target: np.ndarray
+    """Point [3] in the middle of the picture."""
+    roll: float
+    half_fov: float
+    """Tangent of half the field of view."""
+    lamp: np.ndarray
+    """Lamp position [3]."""
+    lamp_color: np.ndarray
+    ambient: float
+    exposure: float
+    table: str
+    table_colors: np.ndarray
+    """[2, 3]."""
+    table_turn: float
+    table_scale: float
+    wall_colors: np.ndarray
+    """[3, 3]: bottom, top, and a soft stain."""
+    wall_stain: np.ndarray
+    """Direction [3] of the stain."""
+    gripper_color: np.ndarray
+    gel_color: np.ndarray
+    clutter_poses: np.ndarray
+    """[clutter, 7]: position and quaternion; what is absent lies far under the table."""
+    clutter_colors: np.ndarray
+    noise: float
+
+
+def draw_view(rng: np.random.Generator) -> View:
+    """Draw the nuisances of one grasp."""
+    azimuth = np.deg2rad(-18 + rng.normal(0, 4))
+    elevation = np.deg2rad(33 + rng.normal(0, 3))
+    distance = 0.46 * rng.uniform(0.95, 1.08)
+    target = np.array([0.0, 0.0, 0.042]) + rng.normal(0, 0.004, 3)
+    forward = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    angle = azimuth + rng.uniform(-1.6, 1.6)
+    lamp = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.8)]) * rng.uniform(0.6, 1.0)
+    poses = np.zeros((len(objects.CLUTTER), 7))
+    for pose in poses:
+        # Behind the gripper, seen from the camera, or well to one side: clutter never hides the thing.
+        where = azimuth + np.pi + rng.uniform(-1.15, 1.15)
+        far = rng.uniform(0.15, 0.30)
+        pose[:3] = far * np.cos(where), far * np.sin(where), rng.uniform(0.015, 0.05)
+        if rng.random() < 0.7:
+            pose[2] = -5.0
+        pose[3:] = rng.normal(size=4)
+        pose[3:] /= np.linalg.norm(pose[3:])
+    tint = rng.normal(1, 0.10, 3)
+    return View(
+        position=target + distance * forward,
+        target=target,
+        roll=rng.normal(0, np.deg2rad(1.5)),
+        half_fov=0.2,
+        lamp=lamp,
+        lamp_color=tint * rng.uniform(0.7, 1.15),
+        ambient=rng.uniform(0.18, 0.45),
+        exposure=rng.uniform(0.75, 1.25),
+        table=str(rng.choice(TABLES)),
+        table_colors=_pair(rng),
+        table_turn=rng.uniform(0, np.pi),
+        table_scale=rng.uniform(0.02, 0.07),
+        wall_colors=rng.uniform(0.05, 0.85, (3, 3)),
+        wall_stain=rng.normal(size=3),
+        gripper_color=np.clip(rng.uniform(0.02, 0.08) * rng.normal(1, 0.12, 3), 0.01, 1),
+        gel_color=np.clip([0.25, 0.85, 1.0] * rng.normal(1, 0.1, 3), 0, 1),
+        clutter_poses=poses,
+        clutter_colors=rng.uniform(0.03, 0.9, (len(objects.CLUTTER), 3)),
+        noise=rng.uniform(1.0, 4.0),
+    )
+
+
+def _pair(rng: np.random.Generator) -> np.ndarray:
+    """Draw two related colours [2, 3]."""
+    color = rng.uniform(0.25, 0.85) * rng.normal(1, 0.12, 3)
+    return np.clip([color, color * rng.uniform(0.7, 1.3) + rng.normal(0, 0.03, 3)], 0.02, 0.95)
+
+
+def photograph(
+    model: mujoco.MjModel, data: mujoco.MjData, thing: objects.Thing, view: View, rng: np.random.Generator, *, size: int
+) -> np.ndarray:
+    """Return the picture [size, size, 3], uint8. Moves the clutter; ``rng`` is for the pixel noise alone."""
+    data.mocap_pos[:], data.mocap_quat[:] = view.clutter_poses[:, :3], view.clutter_poses[:, 3:]
+    mujoco.mj_kinematics(model, data)
+    rays = _rays(view, size * SAMPLES)
+    geom, distance, normal = cast(model, data, view.position, rays)
+    points = view.position + rays * distance[:, None]
+    hit = geom >= 0
+    albedo, gloss, glow = _surface(model, data, thing, view, geom, points, rays)
+
+    to_lamp = view.lamp - points
+    to_lamp /= np.linalg.norm(to_lamp, axis=1, keepdims=True)
+    facing = np.sum(normal * to_lamp, axis=1)
+    lit = hit & (facing > 0)
+    shadowed = _shadow(model, data, view.lamp, points, lit)
+    direct = np.clip(facing, 0, None) * ~shadowed
+    half = to_lamp - rays
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    shine = np.clip(np.sum(normal * half, axis=1), 0, 1) ** 40 * gloss * (direct > 0)
+    sky = view.ambient * (0.65 + 0.35 * normal[:, 2])
+    light = np.where(hit, sky, 1.0)[:, None] + np.where(hit, direct, 0.0)[:, None] * view.lamp_color
+    color = albedo * np.maximum(light, glow[:, None]) + shine[:, None] * view.lamp_color * hit[:, None]
+
+    color = color.reshape(size, SAMPLES, size, SAMPLES, 3).mean((1, 3)) * view.exposure
+    levels = 255 * np.clip(color, 0, 1) ** (1 / 2.2) + rng.normal(0, view.noise, color.shape)
+    return np.clip(levels, 0, 255).astype(np.uint8)
+
+
+def _rays(view: View, side: int) -> np.ndarray:
+    """Return unit directions [side * side, 3], row by row from the top left."""
+    ahead = view.target - view.position
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    cos, sin = np.cos(view.roll), np.sin(view.roll)
+    right, up = cos * right + sin * up, cos * up - sin * right
+    u = ((np.arange(side) + 0.5) / side * 2 - 1) * view.half_fov
+    rays = ahead + u[None, :, None] * right - u[:, None, None] * up
+    rays = rays.reshape(-1, 3)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def cast(
+    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray, groups: np.ndarray = VISIBLE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return geom [P] (-1: none), distance [P] (0 there) and normal [P, 3] of the first hit of each ray."""
+    count = len(rays)
+    geom, distance = np.full(count, -1, np.int32), np.zeros(count)
+    normal = np.zeros(3 * count)
+    mujoco.mj_multiRay(
+        model, data, origin, np.ascontiguousarray(rays).ravel(), groups, True, -1, geom, distance, normal, count, 10.0
+    )
+    return geom, np.where(geom >= 0, distance, 0.0), normal.reshape(-1, 3)
+
+
+def _shadow(
+    model: mujoco.MjModel, data: mujoco.MjData, lamp: np.ndarray, points: np.ndarray, lit: np.ndarray
+) -> np.ndarray:
+    """Return which of the points [P, 3] the lamp does not reach; only those in ``lit`` are asked."""
+    away = points[lit] - lamp
+    length = np.linalg.norm(away, axis=1)
+    geom, distance, _ = cast(model, data, lamp, away / length[:, None])
+    shadowed = np.zeros(len(points), bool)
+    shadowed[lit] = (geom >= 0) & (distance < length - 1e-3)
+    return shadowed
+
+
+def _surface(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    thing: objects.Thing,
+    view: View,
+    geom: np.ndarray,
+    points: np.ndarray,
+    rays: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return colour [P, 3], gloss [P] and own light [P] of what each ray has hit."""
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    color = np.tile(view.gripper_color, (model.ngeom, 1))
+    shine, own = np.full(model.ngeom, 0.25), np.zeros(model.ngeom)
+    for i, name in enumerate(names):
+        if name.endswith("_pad"):
+            color[i], own[i] = view.gel_color, 0.6
+        elif name == "table":
+            shine[i] = 0.05
+    mocap = model.body_mocapid[model.geom_bodyid]
+    color[mocap >= 0] = view.clutter_colors[mocap[mocap >= 0]]
+    albedo, gloss, glow = color[geom], shine[geom], own[geom]
+
+    body = model.body("thing").id
+    for part, i in zip(thing.parts, np.flatnonzero(model.geom_bodyid == body), strict=True):
+        seen = geom == i
+        if not seen.any():
+            continue
+        if part.density > 1.2:
+            albedo[seen], gloss[seen] = [0.42, 0.43, 0.45], 1.0
+            continue
+        finish = thing.finish
+        local = (points[seen] - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+        # At arm's length a pixel is wider than the relief; the print on the surface repeats it at a larger scale.
+        mix = (0.1 + 0.9 * finish.roughness) * (0.5 + 0.5 * np.tanh(3 * finish.pattern(1000 * local, scale=4.5)))
+        albedo[seen] = finish.color + (finish.accent - finish.color) * mix[:, None]
+        gloss[seen] = finish.gloss
+    table = geom == model.geom("table").id
+    albedo[table] = _table(view, points[table])
+    wall = geom < 0
+    albedo[wall] = _wall(view, rays[wall])
+    gloss[wall] = glow[wall] = 0.0
+    return albedo, gloss, glow
+
+
+def _table(view: View, points: np.ndarray) -> np.ndarray:
+    """Return the table's colour [P, 3] at points of its plane."""
+    cos, sin = np.cos(view.table_turn), np.sin(view.table_turn)
+    x = (cos * points[:, 0] + sin * points[:, 1]) / view.table_scale
+    y = (cos * points[:, 1] - sin * points[:, 0]) / view.table_scale
+    if view.table == "checker":
+        mix = ((np.floor(x) + np.floor(y)) % 2).astype(float)
+    elif view.table == "planks":
+        mix = 0.5 + 0.3 * np.sin(9 * y + 1.5 * np.sin(0.7 * x)) - 0.5 * (np.abs(y - np.round(y)) < 0.05)
+    elif view.table == "marble":
+        mix = 0.5 + 0.5 * np.sin(2 * x + 3 * np.sin(1.3 * y + np.sin(2.1 * x)))
+    elif view.table == "dots":
+        mix = (np.hypot(x - np.round(x), y - np.round(y)) < 0.28).astype(float)
+    else:
+        mix = np.zeros(len(x))
+    first, second = view.table_colors
+    return first + (second - first) * mix[:, None]
+
+
+def _wall(view: View, rays: np.ndarray) -> np.ndarray:
+    """Return the backdrop's colour [P, 3] in direction of the rays."""
+    bottom, top, stain = view.wall_colors
+    height = np.clip(rays[:, 2:] * 1.5 + 0.6, 0, 1)
+    spot = np.exp(-6 * (1 - rays @ (view.wall_stain / np.linalg.norm(view.wall_stain))))[:, None]
+    return (bottom + (top - bottom) * height) * (1 - 0.5 * spot) + 0.5 * spot * stain

@@ -1,0 +1,330 @@
+"""Simulated materials: a camera picture and a tactile picture of the same touched surface, with labels.
+
+A class sets ranges; an instance is one thing with its own relief, colour and physics; a touch is one press of it with
+its own pose, force, sensor, lamp and background. Split by instance.
+
+The labels are worth predicting by one rule (benchmarks/difficulty.py): on every task a supervised reference stands far
+above an untrained trunk, and below 97 %. Hence:
+- "soft" is a threshold on the instance's stiffness, not on its class. Soft things fold along curves, with lumpy outlines
+  and rolled edges; hard ones crack along straight lines and have corners. Number and size of such marks say nothing.
+- "rough" is the sign of the height skewness: peaks stand out, or pits are sunk in. Pictures of both have one spectrum.
+- Force, LED gain, sensor, lamp, tint, amplitude, background and clutter vary far more than what the labels change.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, F, area_resize, press, render
+from mvitac.sim.relief import Relief, draw_tables, fractal, marks
+
+VERSION = 1
+"""Changes with every change of a pixel; stored in the pack."""
+
+SOFT_BELOW = 0.12
+"""Stiffness in N/mm^3 below which an instance is labelled soft."""
+
+_TAG = 0x3A7
+_TOUCH_MM = 12.8
+"""Width of the gel's field of view."""
+_CAMERA_MM = 90.0
+"""Width of the camera's field of view at zoom 1."""
+MIN_SIZE, MAX_SIZE = 16, 512
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """The ranges of one class. `sight` and `feel` are relief kinds at camera and at gel scale."""
+
+    name: str
+    sight: str
+    feel: str
+    colour: tuple[float, float, float]
+    """Mean reflectance; instances scatter widely around it."""
+    wavelength_mm: tuple[float, float] = (0.9, 2.4)
+    anisotropy: tuple[float, float] = (1.0, 1.3)
+    irregularity: tuple[float, float] = (0.1, 0.6)
+    gloss: tuple[float, float] = (0.0, 0.3)
+    soft: float = 0.5
+    """Part of the instances that are soft (thin sheets lie on foam, panels on rubber, ...)."""
+    rough: float = 0.5
+
+
+# Confusable on purpose: laminate is wood to the eye and plastic to the finger; concrete and sand look alike, and glass,
+# plastic and paper do; concrete and brick feel alike, and glass, metal and tile do. So neither sense is enough.
+MATERIALS: tuple[Material, ...] = (
+    Material(name="concrete", sight="blotch", feel="pores", colour=(0.52, 0.51, 0.49), soft=0.3, rough=0.5),
+    Material(name="rock", sight="facets", feel="facets", colour=(0.47, 0.45, 0.43), soft=0.28, rough=0.66),
+    Material(name="sand", sight="blotch", feel="grains", colour=(0.62, 0.55, 0.44), soft=0.68, rough=0.6),
+    Material(name="gravel", sight="pebbles", feel="pebbles", colour=(0.5, 0.48, 0.46), soft=0.35, rough=0.7),
+    Material(name="soil", sight="grains", feel="blotch", colour=(0.34, 0.26, 0.19), soft=0.72, rough=0.6),
+    Material(name="brick", sight="brick", feel="pores", colour=(0.55, 0.32, 0.25), soft=0.3, rough=0.62),
+    Material(name="tile", sight="tiles", feel="plain", colour=(0.6, 0.6, 0.58), gloss=(0.2, 0.8), soft=0.3, rough=0.32),
+    Material(
+        name="glass", sight="plain", feel="plain", colour=(0.42, 0.5, 0.5), gloss=(0.4, 1.0), soft=0.28, rough=0.3
+    ),
+    Material(
+        name="metal", sight="brushed", feel="plain", colour=(0.55, 0.56, 0.58), gloss=(0.3, 1.0), soft=0.28, rough=0.34
+    ),
+    Material(
+        name="plastic", sight="plain", feel="emboss", colour=(0.5, 0.45, 0.45), gloss=(0.2, 0.8), soft=0.5, rough=0.36
+    ),
+    Material(
+        name="laminate", sight="wood", feel="emboss", colour=(0.52, 0.38, 0.26), gloss=(0.1, 0.6), soft=0.4, rough=0.36
+    ),
+    Material(name="wood", sight="wood", feel="wood", colour=(0.54, 0.4, 0.27), soft=0.36, rough=0.5),
+    Material(name="bark", sight="fissures", feel="fissures", colour=(0.36, 0.3, 0.24), soft=0.42, rough=0.7),
+    Material(name="grass", sight="blades", feel="blades", colour=(0.34, 0.45, 0.22), soft=0.72, rough=0.55),
+    Material(name="leaf", sight="veins", feel="veins", colour=(0.3, 0.45, 0.2), gloss=(0.0, 0.5), soft=0.7, rough=0.42),
+    Material(name="paper", sight="plain", feel="fibres", colour=(0.66, 0.64, 0.58), soft=0.6, rough=0.4),
+    Material(
+        name="leather", sight="crackle", feel="crackle", colour=(0.4, 0.27, 0.2), gloss=(0.1, 0.6), soft=0.7, rough=0.4
+    ),
+    Material(
+        name="rubber", sight="studs", feel="studs", colour=(0.3, 0.3, 0.31), gloss=(0.0, 0.4), soft=0.7, rough=0.46
+    ),
+    Material(name="cloth", sight="weave", feel="weave", colour=(0.48, 0.42, 0.46), soft=0.72, rough=0.5),
+    Material(name="knit", sight="rib", feel="rib", colour=(0.46, 0.44, 0.5), soft=0.74, rough=0.56),
+)
+CLASSES: tuple[str, ...] = tuple(m.name for m in MATERIALS)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Instance:
+    """One thing: what both its pictures share. Lengths in mm, stiffness in N/mm^3."""
+
+    sight: Relief
+    feel: Relief
+    stiffness: float
+    amplitude_mm: float
+    gloss: float
+    colour: NDArray[np.float32]
+    ink: NDArray[np.float32]
+    """Second colour, laid along the relief with either sign."""
+    contrast: float
+
+    @property
+    def soft(self) -> bool:
+        return self.stiffness < SOFT_BELOW
+
+    @property
+    def rough(self) -> bool:
+        return self.feel.asperity > 0
+
+    @property
+    def curl(self) -> float:
+        """How far its marks and outlines are folds (1) and not cracks (0)."""
+        return float(np.clip(0.5 - 2.6 * np.log10(self.stiffness / SOFT_BELOW), 0.0, 1.0))
+
+
+def draw_instance(seed: int, category: int, instance: int) -> Instance:
+    """Draw the latents of one thing; nothing but the three numbers enters."""
+    rng = np.random.default_rng([_TAG, seed, category, instance])
+    m = MATERIALS[category]
+    soft, rough = rng.random() < m.soft, rng.random() < m.rough
+    decades = rng.uniform(0.1, 0.6) if soft else -rng.uniform(0.1, 1.6)
+    asperity = rng.uniform(0.3, 0.85) * (1 if rough else -1)
+    wavelength = np.exp(rng.uniform(*np.log(m.wavelength_mm)))
+    shared = {
+        "anisotropy": rng.uniform(*m.anisotropy),
+        "irregularity": rng.uniform(*m.irregularity),
+        "asperity": asperity,
+    }
+    ratio = rng.uniform(6.0, 9.0)
+    tables = draw_tables(rng)
+    mean = np.asarray(m.colour, np.float32)
+    colour = np.clip(mean * np.exp(rng.normal(0, 0.28)) * np.exp(rng.normal(0, 0.12, 3)), 0.08, 0.85)
+    return Instance(
+        sight=Relief(kind=m.sight, wavelength_mm=wavelength * ratio, tables=tables, **shared),
+        feel=Relief(kind=m.feel, wavelength_mm=wavelength, tables=tables, **shared),
+        stiffness=SOFT_BELOW * 10**-decades,
+        amplitude_mm=float(np.exp(rng.uniform(*np.log((0.05, 0.13))))),
+        gloss=rng.uniform(*m.gloss),
+        colour=colour.astype(np.float32),
+        ink=np.clip(colour * np.exp(rng.normal(0, 0.25, 3)), 0.05, 0.9).astype(np.float32),
+        contrast=rng.uniform(-0.6, 0.6),
+    )
+
+
+def touch(
+    seed: int, category: int, instance: int, touch: int, *, size: int, held_out_sensor: bool = False
+) -> dict[str, Any]:
+    """Draw one pair: "vision" and "touch" uint8 [size, size, 3], "category", "soft", "rough" and the latents.
+
+    `held_out_sensor` draws the tactile picture with a sensor that is never used otherwise; all else stays the same.
+    """
+    for name, value in (("seed", seed), ("instance", instance), ("touch", touch)):
+        if value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value}")
+    if not 0 <= category < len(CLASSES):
+        raise ValueError(f"category must be 0 to {len(CLASSES) - 1} ({', '.join(CLASSES)}), got {category}")
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
+    thing = draw_instance(seed, category, instance)
+    # one stream per picture, so that a change in one never shifts the other; pixels are drawn last in each
+    pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
+    angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
+    vision = _look(thing, eye, angle + eye.normal(0, 0.1), place, size)
+    tactile, pressed = _feel(thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor)
+    return {
+        "vision": vision,
+        "touch": tactile,
+        "category": category,
+        "soft": int(thing.soft),
+        "rough": int(thing.rough),
+        **pressed,
+        "stiffness": thing.stiffness,
+        "amplitude_mm": thing.amplitude_mm,
+        "wavelength_mm": thing.feel.wavelength_mm,
+        "anisotropy": thing.feel.anisotropy,
+        "irregularity": thing.feel.irregularity,
+        "asperity": thing.feel.asperity,
+        "gloss": thing.gloss,
+        "angle_rad": angle,
+    }
+
+
+def _grid(size: int, width_mm: float) -> tuple[F, F, float]:
+    """Return x, y [n, n] in mm and mm per pixel of the internal picture: twice as fine as `size` while affordable."""
+    n = 2 * size if size <= 96 else max(192, size)
+    pixel = width_mm / n
+    axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
+    x, y = np.meshgrid(axis, axis)
+    return x, y, pixel
+
+
+def _turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
+    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    return cos * x + sin * y + np.float32(place[0]), cos * y - sin * x + np.float32(place[1])
+
+
+def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -> F:
+    """Return about the distance in mm [n, n] inside an outline (< 0 outside): corners for curl 0, lobes for curl 1."""
+    cx, cy = rng.normal(0, 0.22 * radius, 2)
+    x, y = x - np.float32(cx), y - np.float32(cy)
+    sides, turn = int(rng.integers(3, 6)), rng.uniform(0, 2 * np.pi)
+    phases, heights = rng.uniform(0, 2 * np.pi, 3), rng.normal(0, 1, 3)
+    inside = np.full(x.shape, np.float32(4 * radius))
+    for k in range(sides):
+        a = turn + 2 * np.pi * (k + rng.uniform(-0.18, 0.18)) / sides
+        inside = np.minimum(inside, np.float32(radius * 0.82) - np.float32(np.cos(a)) * x - np.float32(np.sin(a)) * y)
+    if curl > 0:
+        theta = np.arctan2(y, x)
+        waves = ((k + 2, h, p) for k, (h, p) in enumerate(zip(heights, phases, strict=True)))
+        lobes = sum(h / (k - 0.5) * np.cos(k * theta + p) for k, h, p in waves)
+        round_ = np.float32(radius) * (1 + np.float32(0.3) * lobes) - np.hypot(x, y)
+        inside = np.float32(1 - curl) * inside + np.float32(curl) * round_
+    return inside.astype(np.float32)
+
+
+def _look(
+    thing: Instance, rng: np.random.Generator, angle: float, place: NDArray[np.float64], size: int
+) -> NDArray[np.uint8]:
+    """Photograph the thing on a cluttered table under a lamp: uint8 [size, size, 3]."""
+    x, y, pixel = _grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
+    width = float(x.shape[0] * pixel)
+    curl = thing.curl
+    inside = _outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)
+    texture = thing.sight(*_turn(x, y, angle, place))
+    lines = marks(x, y, rng, curl=curl, extent_mm=width, count=int(rng.integers(2, 4)))
+    steep = np.float32(np.exp(rng.uniform(*np.log((0.05, 0.11)))) * thing.sight.wavelength_mm)
+    bevel = np.float32(0.06 * width)
+    edge = np.clip(inside / bevel, 0, 1)
+    form = np.float32(0.7) * bevel * (np.sqrt(edge * (2 - edge)) if curl > 0.5 else edge)  # rounded or chamfered
+    height = steep * texture + np.float32(0.012 * width) * lines + form
+
+    # people and cameras expect light from above: within 60 degrees of it, or peaks and pits could not be told apart
+    lamp, rise = rng.uniform(-np.pi / 3, np.pi / 3), rng.uniform(0.45, 0.8)
+    light = np.cos(rise) * np.sin(lamp), -np.cos(rise) * np.cos(lamp), np.sin(rise)
+    skin = _shade(thing, height, texture, light, rng.uniform(0.25, 0.5), pixel)
+    table = _table(x, y, rng, width, pixel)
+    body = np.clip(inside / np.float32(pixel) + 0.5, 0, 1)
+    away = tuple(round(-part * 0.035 * width / pixel) for part in (light[1], light[0]))
+    table *= (1 - np.float32(0.5) * np.roll(body, away, axis=(0, 1)))[..., None]  # the thing's shadow
+    picture = table + body[..., None] * (skin - table)
+
+    tint = np.exp(rng.normal(0, 0.12, 3) + rng.normal(0.0, 0.25)).astype(np.float32)
+    slant, drop, grain = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.35), rng.uniform(1, 5)
+    ramp = (np.float32(np.cos(slant)) * x + np.float32(np.sin(slant)) * y) / np.float32(width)
+    vignette = 1 - np.float32(0.5 / width**2) * (x * x + y * y)
+    picture = area_resize(picture * tint * ((1 + np.float32(drop) * ramp) * vignette)[..., None], size, size)
+    picture = 255 * np.clip(picture, 0, 1.2) ** np.float32(0.8)
+    picture = picture + rng.standard_normal(picture.shape, np.float32) * np.float32(grain)
+    return np.clip(picture + 0.5, 0, 255).astype(np.uint8)
+
+
+def _shade(
+    thing: Instance, height: F, texture: F, light: tuple[float, float, float], ambient: float, pixel: float
+) -> F:
+    """Light a height map [n, n] mm from direction `light`: reflected colour [n, n, 3], Lambert plus a Phong highlight."""
+    lx, ly, lz = (np.float32(part) for part in light)
+    gy, gx = np.gradient(height, np.float32(pixel))
+    normal = 1 / np.sqrt(1 + gx * gx + gy * gy)
+    across = lx * gx + ly * gy
+    diffuse = np.maximum((lz - across) * normal, 0)
+    shine = np.maximum((lz - np.float32(0.55) * across) * normal, 0) ** 18 * np.float32(0.6 * thing.gloss)
+    mix = np.clip(np.float32(0.5 * thing.contrast) * texture + np.float32(0.5), 0, 1)[..., None]
+    skin = thing.colour * mix + thing.ink * (1 - mix)
+    return skin * (np.float32(ambient) + np.float32(1 - ambient) / lz * diffuse)[..., None] + shine[..., None]
+
+
+def _table(x: F, y: F, rng: np.random.Generator, width: float, pixel: float) -> F:
+    """Paint what lies behind: a patterned ground and things with straight and with curved outlines, [n, n, 3]."""
+    ground, second = rng.uniform(0.12, 0.7, (2, 3)).astype(np.float32)
+    table = rng.standard_normal((64, 64), np.float32)
+    stretch, scale, turn = rng.uniform(1, 5), width * rng.uniform(0.04, 0.15), rng.uniform(0, np.pi)
+    u, v = _turn(x, y, turn, rng.uniform(0, 999, 2))
+    pattern = fractal(u / np.float32(scale * stretch), v / np.float32(scale), table, 3)
+    mix = np.clip(np.float32(rng.uniform(0, 0.35)) * pattern + 0.5, 0, 1)[..., None]
+    picture = ground * mix + second * (1 - mix)
+    for _ in range(int(rng.integers(1, 4))):
+        cx, cy = rng.uniform(-0.5, 0.5, 2) * width
+        radius, bend = rng.uniform(0.08, 0.25) * width, float(rng.integers(2))
+        inside = _outline(x - np.float32(cx), y - np.float32(cy), rng, radius, bend)
+        cover = np.clip(inside / np.float32(pixel) + 0.5, 0, 1)
+        picture = picture + cover[..., None] * (rng.uniform(0.1, 0.7, 3).astype(np.float32) - picture)
+    return picture
+
+
+def _feel(
+    thing: Instance, rng: np.random.Generator, angle: float, place: NDArray[np.float64], size: int, held_out: bool
+) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    """Press the thing into a gel: uint8 [size, size, 3] and what describes the press."""
+    choice = [s for s in SENSORS.values() if s.held_out == held_out]
+    sensor = choice[int(rng.random() * len(choice))]
+    force = float(np.exp(rng.uniform(*np.log((2.0, 12.0)))))
+    gain = float(np.exp(rng.uniform(*np.log((0.5, 1.2)))))
+    dome = float(rng.uniform(18.0, 40.0))
+    tilt = rng.normal(0, 0.04, 2).astype(np.float32)
+    shear = rng.normal(0, 0.25, 2)
+    x, y, pixel = _grid(size, _TOUCH_MM)
+    u, v = _turn(x, y, angle, place)
+    curl = thing.curl
+    # a soft thing gives way, which alone would make every imprint of it shallower: it is given more relief to give away
+    yielding = GEL_STIFFNESS / thing.stiffness
+    amplitude = np.float32(thing.amplitude_mm * (1 + yielding) * np.exp(rng.normal(0, 0.15)))
+    relief = amplitude * thing.feel(u, v)
+    depth = np.float32(0.14 * (1 + yielding) * np.exp(rng.normal(0, 0.25)))
+    relief = relief + depth * marks(x, y, rng, curl=curl, extent_mm=_TOUCH_MM, count=int(rng.integers(2, 4)))
+    inside = _outline(x, y, rng, rng.uniform(0.45, 0.75) * _TOUCH_MM, curl)
+    beyond = np.maximum(-inside, 0)
+    roll = np.float32(0.2 + 1.5 * curl)
+    fall = np.where(beyond < roll, beyond * beyond / (2 * roll), beyond - roll / 2)
+    relief = relief - np.float32(1 + yielding) * fall
+    # soft things bulge, as cushions do; else the width of the patch alone would give them away
+    bulge = np.float32(yielding * rng.uniform(0.6, 1.2) / (2 * dome))
+    relief = relief + tilt[0] * x + tilt[1] * y - bulge * (x * x + y * y)
+    imprint = press(relief, force_n=force, stiffness=thing.stiffness, pixel_mm=pixel, dome_radius_mm=dome)
+    picture = render(
+        imprint,
+        sensor,
+        rng,
+        pixel_mm=pixel,
+        shear_mm=(float(shear[0]), float(shear[1])),
+        size=size,
+        unit=int(rng.integers(2**31)),
+        gain=gain,
+    )
+    return picture, {"sensor": sensor.name, "force_n": force}

@@ -1,0 +1,348 @@
+"""Things to grasp: shapes, finishes and masses, and the MJCF of the scene around one of them.
+
+A thing is a few primitive geoms with one *finish*: a procedural relief evaluated in the thing's own coordinates, so the
+camera and both gels see the same surface. What decides a grasp is meant to be visible: rough finishes grip better,
+shine less and print deeper into the gel; bigger things are heavier; heavy parts are drawn as bare metal.
+
+Frames: the gripper closes along x, a thing's long side lies along y, z is up and the table is z = 0.
+Shapes: N points. Units: metres, kilograms and newtons, except names that end in ``_mm``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+OBJECT_TAG = 0x0B1EC7
+"""First word of the seed sequence of object properties; grasps use other tags, because trailing zeros do not count."""
+
+KINDS = ("box", "can", "rod", "ellipsoid", "capsule", "hammer", "mug", "bottle", "tee", "dumbbell")
+"""Shape kinds; objects cycle through them, so that any split by object holds every kind."""
+
+PAD_HALF_M = 0.0115
+"""Half the side of a gel pad."""
+
+DOME_RADIUS_MM = 20.0
+"""Radius of curvature of the gels, in the physics and in the optics."""
+
+PAD_DEPTH_M = PAD_HALF_M**2 / (DOME_RADIUS_MM / 1000)
+"""Half depth of the ellipsoid whose apex has that radius."""
+
+FINGER_M = (0.006, 0.009, 0.036)
+"""Half sizes of a finger's bar: thickness, width, height."""
+
+OPEN_M = 0.047
+"""Distance of an open pad's apex from the hand's axis."""
+
+CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045"), ("capsule", ".015 .05"))
+"""MuJoCo types and sizes of what lies about."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One primitive of a thing, in the thing's frame."""
+
+    shape: str
+    """MuJoCo geom type: box, cylinder, capsule, ellipsoid or sphere."""
+    size: tuple[float, ...]
+    """MuJoCo half sizes in metres."""
+    center: tuple[float, float, float]
+    lying: bool = False
+    """Whether the geom's own axis lies along y instead of standing along z."""
+    density: float = 1.0
+    """Multiple of the thing's density; above 1.2 the part is drawn as metal."""
+
+    def half(self) -> np.ndarray:
+        """Return the half extents [3] of the axis-aligned box around the part."""
+        if self.shape in ("box", "ellipsoid"):
+            return np.array(self.size)
+        if self.shape == "sphere":
+            return np.full(3, self.size[0])
+        radius, half = self.size
+        half += radius if self.shape == "capsule" else 0.0
+        return np.array([radius, half, radius] if self.lying else [radius, radius, half])
+
+    def volume(self) -> float:
+        """Return the volume in cubic metres."""
+        if self.shape == "box":
+            return 8 * float(np.prod(self.size))
+        if self.shape == "ellipsoid":
+            return 4 / 3 * np.pi * float(np.prod(self.size))
+        if self.shape == "sphere":
+            return 4 / 3 * np.pi * self.size[0] ** 3
+        radius, half = self.size
+        ball = 4 / 3 * np.pi * radius**3 if self.shape == "capsule" else 0.0
+        return 2 * np.pi * radius**2 * half + ball
+
+    def pad_radius(self) -> float:
+        """Return the effective radius of curvature between the pad's dome and the part's flank, in metres.
+
+        On a Winkler foundation principal curvatures a, b touch as much as a sphere of curvature sqrt(a b) does.
+        """
+        dome = 1000 / DOME_RADIUS_MM
+        if self.shape == "box":
+            across, along = 0.0, 0.0
+        elif self.shape in ("cylinder", "capsule"):
+            across, along = 1 / self.size[0], 0.0
+        else:
+            x, y, z = np.resize(self.size, 3)
+            across, along = x / z**2, x / y**2
+        return 1 / np.sqrt((dome + across) * (dome + along))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finish:
+    """A surface: its relief, its friction and its looks."""
+
+    kind: str
+    """ribs, knurl, grain or bumps: no friction is tied to it."""
+    roughness: float
+    """0 polished .. 1 coarse; it sets friction, relief and gloss together."""
+    wavelength_mm: float
+    waves: np.ndarray
+    """Unit directions [n, 3] of the pattern's waves, in the thing's frame."""
+    phases: np.ndarray
+    """Their phases [n] in radians."""
+    color: np.ndarray
+    """Linear RGB [3] of the body."""
+    accent: np.ndarray
+    """Linear RGB [3] of the pattern."""
+
+    @property
+    def amplitude_mm(self) -> float:
+        """Relief amplitude: a polished thing still has a few micrometres."""
+        return 0.005 + 0.20 * self.roughness**1.3
+
+    @property
+    def gloss(self) -> float:
+        """Strength of the highlight, 0..1."""
+        return float(np.clip(1.05 - 1.3 * self.roughness, 0, 1))
+
+    def pattern(self, points_mm: np.ndarray, scale: float = 1.0) -> np.ndarray:
+        """Return the pattern in about [-1, 1] at points [N, 3] of the thing's frame; ``scale`` stretches it."""
+        angle = points_mm @ self.waves.T * (2 * np.pi / (self.wavelength_mm * scale)) + self.phases
+        if self.kind == "ribs":
+            return np.sin(angle[:, 0])
+        if self.kind == "knurl":
+            return np.sin(angle[:, 0]) * np.sin(angle[:, 1])
+        if self.kind == "bumps":
+            return np.clip(np.cos(angle[:, :3]).sum(1) - 1, 0, None) - 0.5
+        return np.tanh(np.sin(angle).sum(1) * 1.5 / np.sqrt(angle.shape[1]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thing:
+    """Everything about an object that does not change between its grasps."""
+
+    name: str
+    kind: str
+    parts: tuple[Part, ...]
+    finish: Finish
+    friction: float
+    """Sliding friction coefficient against the gel."""
+    density: float
+    """Kilograms per cubic metre (things are mostly hollow)."""
+    softness: float
+    """0 hard .. 1 foam-like: stiffness, and the time constant of the contact."""
+
+    @property
+    def mass(self) -> float:
+        """Mass in kilograms."""
+        return sum(part.volume() * part.density * self.density for part in self.parts)
+
+    @property
+    def center_of_mass(self) -> np.ndarray:
+        """Centre of mass [3] in the thing's frame."""
+        weights = [part.volume() * part.density for part in self.parts]
+        return np.average([part.center for part in self.parts], axis=0, weights=weights)
+
+    @property
+    def stiffness(self) -> float:
+        """Winkler modulus in N/mm^3: wood-like 10 down to foam-like 0.02."""
+        return 10.0 * 0.002**self.softness
+
+    def heights(self, y: float) -> tuple[float, float]:
+        """Return the lowest and highest z of what lies across the plane at ``y``."""
+        across = [part for part in self.parts if abs(y - part.center[1]) <= part.half()[1]] or list(self.parts)
+        low = min(part.center[2] - part.half()[2] for part in across)
+        return low, max(part.center[2] + part.half()[2] for part in across)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner [3] in the thing's frame."""
+        center = np.array([part.center for part in self.parts])
+        half = np.array([part.half() for part in self.parts])
+        return (center - half).min(0), (center + half).max(0)
+
+
+def object_name(seed: int, index: int) -> str:
+    """Return the name of an object, shape kind and index, e.g. ``box_010``. It is the same for every seed."""
+    del seed
+    return f"{KINDS[index % len(KINDS)]}_{index:03d}"
+
+
+def _parts(kind: str, rng: np.random.Generator) -> tuple[Part, ...]:
+    """Draw the primitives of a shape kind; all of them stand on z = 0, the caller's frame is the table's."""
+
+    def u(low: float, high: float) -> float:
+        """Draw a length in millimetres and return it in metres."""
+        return rng.uniform(low, high) / 1000
+
+    if kind == "box":
+        x, y, z = u(11, 27), u(30, 72), u(13, 32)
+        return (Part(shape="box", size=(x, y, z), center=(0, 0, z)),)
+    if kind == "can":
+        r, h = u(16, 31), u(24, 52)
+        return (Part(shape="cylinder", size=(r, h), center=(0, 0, h)),)
+    if kind == "rod":
+        r, h = u(12, 24), u(38, 78)
+        return (Part(shape="cylinder", size=(r, h), center=(0, 0, r), lying=True),)
+    if kind == "ellipsoid":
+        x, y, z = u(16, 30), u(26, 58), u(15, 28)
+        return (Part(shape="ellipsoid", size=(x, y, z), center=(0, 0, z)),)
+    if kind == "capsule":
+        r, h = u(13, 25), u(22, 55)
+        return (Part(shape="capsule", size=(r, h), center=(0, 0, r), lying=True),)
+    if kind == "hammer":
+        r, h = u(11, 16), u(45, 65)
+        x, y, z = u(16, 22), u(7, 11), u(15, 20)
+        side = rng.choice([-1, 1])
+        return (
+            Part(shape="cylinder", size=(r, h), center=(0, 0, z), lying=True),
+            Part(shape="box", size=(x, y, z), center=(0, side * (h + y), z), density=rng.uniform(1.0, 1.3)),
+        )
+    if kind == "mug":
+        r, h = u(22, 31), u(32, 48)
+        y, z = u(9, 14), u(16, 26)
+        side = rng.choice([-1, 1])
+        return (
+            Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
+            Part(shape="box", size=(0.005, y, z), center=(0, side * (r + y - 0.001), h)),
+        )
+    if kind == "bottle":
+        r, h, neck, tall = u(18, 30), u(26, 44), u(10, 14), u(12, 20)
+        return (
+            Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
+            Part(shape="cylinder", size=(neck, tall), center=(0, 0, 2 * h + tall)),
+        )
+    if kind == "tee":
+        x, y, z = u(11, 20), u(36, 62), u(13, 20)
+        a, b, c = u(12, 26), u(12, 22), u(10, 22)
+        shift = rng.choice([-1, 1]) * rng.uniform(0.3, 0.75) * y
+        return (
+            Part(shape="box", size=(x, y, z), center=(0, 0, z)),
+            Part(shape="box", size=(a, b, c), center=(0, shift, 2 * z + c), density=rng.uniform(0.8, 1.4)),
+        )
+    if kind == "dumbbell":
+        r, h, left, right = u(10, 15), u(28, 48), u(17, 28), u(17, 28)
+        z = max(left, right)
+        return (
+            Part(shape="capsule", size=(r, h), center=(0, 0, z), lying=True),
+            Part(shape="cylinder", size=(z, left / 2), center=(0, -h, z), lying=True, density=rng.choice([1.0, 1.5])),
+            Part(shape="cylinder", size=(z, right / 2), center=(0, h, z), lying=True),
+        )
+    raise AssertionError(kind)
+
+
+def _finish(rng: np.random.Generator) -> Finish:
+    kind = str(rng.choice(["ribs", "knurl", "grain", "bumps"]))
+    waves = rng.normal(size=(7, 3))
+    # The flanks that meet the pads face x: a wave along x would be invisible to the gel.
+    waves[:, 0] *= 0.3
+    waves /= np.linalg.norm(waves, axis=1, keepdims=True)
+    if kind in ("knurl", "bumps"):
+        waves[1] = np.cross(waves[0], [1.0, 0.0, 0.0])
+        waves[1] /= np.linalg.norm(waves[1])
+        waves[2] = [1.0, 0.0, 0.0]
+    # Saturated, so that a thing stands out from the pale tables: the picture should tell where it is gripped.
+    color = rng.permutation([rng.uniform(0.02, 0.15), rng.uniform(0.02, 0.9), rng.uniform(0.6, 0.95)])
+    return Finish(
+        kind=kind,
+        roughness=rng.uniform(0, 1),
+        wavelength_mm=rng.uniform(1.8, 4.0),
+        waves=waves,
+        phases=rng.uniform(0, 2 * np.pi, 7),
+        color=color,
+        accent=np.clip(color * rng.uniform(0.25, 1.6) + rng.normal(0, 0.12, 3), 0.02, 1),
+    )
+
+
+def make_thing(seed: int, index: int) -> Thing:
+    """Draw object ``index`` of data seed ``seed``."""
+    rng = np.random.default_rng([OBJECT_TAG, seed, index])
+    kind = KINDS[index % len(KINDS)]
+    parts = _parts(kind, rng)
+    finish = _finish(rng)
+    return Thing(
+        name=object_name(seed, index),
+        kind=kind,
+        parts=parts,
+        finish=finish,
+        friction=float(0.32 * np.exp(1.05 * finish.roughness + rng.normal(0, 0.05))),
+        density=float(850 * np.exp(rng.normal(0, 0.1))),
+        softness=float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.0)])),
+    )
+
+
+def scene(thing: Thing) -> str:
+    """Return the MJCF of table, gripper, clutter and one thing.
+
+    Geom groups: 0 scenery, 1 gripper, 2 the thing (what the gels see), 3 the fingers' collision bars (not drawn: the
+    camera would see them twice).
+    The thing's geoms have priority 1: MuJoCo otherwise takes the larger friction of the two, and the pad would hide it.
+    """
+    # A soft thing's contact answers more slowly; below 2.5 time steps MuJoCo would clip the time constant anyway.
+    solref = f"{0.006 + 0.014 * thing.softness:.5f} 1"
+    geoms = "\n".join(
+        f'<geom name="part{i}" type="{part.shape}" size="{_numbers(part.size)}" pos="{_numbers(part.center)}"'
+        f' euler="{90 if part.lying else 0} 0 0" mass="{part.volume() * part.density * thing.density:.9g}"'
+        f' group="2" priority="1" condim="6" solref="{solref}" contype="1" conaffinity="1"/>'
+        for i, part in enumerate(thing.parts)
+    )
+    width, _, height = FINGER_M
+    bar = f'type="box" size="{_numbers(FINGER_M)}" pos="{PAD_DEPTH_M + 0.003 + width} 0 0.022"'
+    dome = f'size="{PAD_DEPTH_M} {PAD_HALF_M} {PAD_HALF_M}" pos="{PAD_DEPTH_M} 0 0"'
+    fingers = "\n".join(
+        f'''<body name="{name}" pos="{sign * OPEN_M} 0 0" euler="0 0 {turn}">
+          <joint name="{name}" type="slide" axis="-1 0 0" range="0 {OPEN_M - 0.004}" damping="3" armature="0.05"/>
+          <geom class="shown" {bar} mass=".05"/>
+          <geom class="shown" type="box" size=".0025 {PAD_HALF_M} {PAD_HALF_M}" pos="{PAD_DEPTH_M} 0 0" mass=".01"/>
+          <geom name="{name}_pad" type="ellipsoid" {dome} group="1" mass=".01" condim="6" contype="2" conaffinity="1"/>
+          <geom name="{name}_bar" {bar} group="3" mass=".001" condim="3" contype="2" conaffinity="1"/>
+        </body>'''
+        for name, sign, turn in (("left", -1, 180), ("right", 1, 0))
+    )
+    clutter = "\n".join(
+        f'<body name="clutter{i}" mocap="true"><geom type="{shape}" size="{size}" class="scenery"/></body>'
+        for i, (shape, size) in enumerate(CLUTTER)
+    )
+    return f"""<mujoco model="{thing.name}">
+      <compiler angle="degree" autolimits="true"/>
+      <option timestep=".002" integrator="implicitfast" cone="elliptic" impratio="8" iterations="30" tolerance="1e-9"/>
+      <default>
+        <default class="scenery"><geom contype="0" conaffinity="0" group="0"/></default>
+        <default class="shown"><geom contype="0" conaffinity="0" group="1"/></default>
+      </default>
+      <worldbody>
+        <geom name="table" type="plane" size="2 2 .1" group="0" contype="2" conaffinity="1" friction=".5 .002 .0001"/>
+        {clutter}
+        <body name="hand" pos="0 0 0" gravcomp="1">
+          <joint name="lift" type="slide" axis="0 0 1" armature="1"/>
+          <geom class="shown" type="box" size=".062 .018 .014" pos="0 0 {0.022 + height + 0.014}" mass=".4"/>
+          <geom class="shown" type="cylinder" size=".02 .06" pos="0 0 {0.022 + height + 0.085}" mass=".1"/>
+          {fingers}
+        </body>
+        <body name="thing"><freejoint name="thing"/>{geoms}</body>
+      </worldbody>
+      <tendon><fixed name="grip"><joint joint="left" coef="1"/><joint joint="right" coef="1"/></fixed></tendon>
+      <equality><joint joint1="left" joint2="right" solref=".004 1"/></equality>
+      <actuator>
+        <position name="lift" joint="lift" kp="4000" kv="200"/>
+        <position name="grip" tendon="grip" kp="1500" kv="4" forcerange="-1 1"/>
+      </actuator>
+    </mujoco>"""
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)

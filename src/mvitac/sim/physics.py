@@ -1,0 +1,181 @@
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
+"""One grasp in MuJoCo: settle, close, lift, hold; the scene is handed out at the three moments that are photographed.
+
+Frames and units as in :mod:`mvitac.sim.objects`: metres, kilograms, newtons, radians, seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from mvitac.sim import gel, objects
+
+PHASES = ("before", "during", "after")
+STEP_S = 0.002
+CHUNK = 5
+"""Time steps between two changes of the set points."""
+
+SETTLE_S, CLOSE_S, LIFT_S, HOLD_S = 0.10, 0.30, 0.36, 0.24
+CLOSE_SPEED = 0.14
+"""Metres per second of each finger."""
+
+HELD_PART = 0.7
+"""A thing is lifted if its centre of mass has risen by this part of the hand's way."""
+
+RUNAWAY = 30.0
+"""A velocity (m/s or rad/s) that no grasp reaches unless the solver has lost it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What varies between two grasps of the same thing."""
+
+    force_n: float
+    """Limit of the grip force, per finger."""
+    offset_m: tuple[float, float, float]
+    """Where the hand grips, in the thing's frame, relative to the middle of its bounds."""
+    yaw: float
+    """Angle in radians between the thing's long side and the pads."""
+    lift_m: float
+    friction: float
+    mass_scale: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Touch:
+    """What one gel feels."""
+
+    normal_n: float
+    shear_n: tuple[float, float]
+    """Tangential force on the gel along its picture's x (right) and y (down)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """The scene when it is photographed; ``data`` lives on and must be read before the next moment is asked for."""
+
+    phase: str
+    data: mujoco.MjData
+    left: Touch
+    right: Touch
+    success: int
+    """Valid at 'after'."""
+    rise_m: float
+    unstable: int
+
+
+def contact_radius_m(part: objects.Part, force_n: float, stiffness: float) -> float:
+    """Return the radius of a pad's contact on a part: Winkler, F = pi k R d^2 and a^2 = 2 R d, at most the pad.
+
+    ``stiffness`` is the part's own in N/mm^3; part and gel are springs in series, as in :func:`mvitac.sim.gel.press`.
+    """
+    spring = 1e9 * stiffness * gel.GEL_STIFFNESS / (stiffness + gel.GEL_STIFFNESS)
+    radius = part.pad_radius()
+    return float(min((4 * force_n * radius / (np.pi * spring)) ** 0.25, objects.PAD_HALF_M))
+
+
+class Bench:
+    """The compiled scene of one thing, reused for all its grasps."""
+
+    def __init__(self, thing: objects.Thing) -> None:
+        self.thing = thing
+        self.model = mujoco.MjModel.from_xml_string(objects.scene(thing))
+        self.data = mujoco.MjData(self.model)
+        self.body = self.model.body("thing").id
+        self.parts = np.flatnonzero(self.model.geom_bodyid == self.body)
+        self.pads = (self.model.geom("left_pad").id, self.model.geom("right_pad").id)
+        self.mass = self.model.body_mass.copy()
+        self.inertia = self.model.body_inertia.copy()
+        self.address = self.model.joint("thing").qposadr[0]
+
+    def moments(self, plan: Plan) -> Iterator[Moment]:
+        """Yield the three moments of a grasp. The result depends on ``plan`` alone, not on earlier grasps."""
+        model, data, thing = self.model, self.data, self.thing
+        mujoco.mj_resetData(model, data)
+        model.body_mass[self.body] = self.mass[self.body] * plan.mass_scale
+        model.body_inertia[self.body] = self.inertia[self.body] * plan.mass_scale
+        mujoco.mj_setConst(model, data)
+        for part, geom in zip(thing.parts, self.parts, strict=True):
+            # A round patch with a paraboloid of pressure turns at a torque of 8/15 mu a F.
+            patch = 8 / 15 * contact_radius_m(part, plan.force_n, thing.stiffness)
+            model.geom_friction[geom] = plan.friction, plan.friction * patch, 2e-4
+        model.actuator_forcerange[1] = -plan.force_n, plan.force_n
+        low, high = thing.bounds
+        middle = (low + high) / 2
+        grip = middle + plan.offset_m
+        height = max(float(grip[2]), objects.PAD_HALF_M + 0.002)
+        cos, sin = np.cos(plan.yaw), np.sin(plan.yaw)
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        place = -turn @ [grip[0], grip[1], 0.0]
+        data.qpos[self.address : self.address + 3] = place[0], place[1], 0.0003 - low[2]
+        data.qpos[self.address + 3 : self.address + 7] = np.cos(plan.yaw / 2), 0, 0, np.sin(plan.yaw / 2)
+        data.qpos[0] = height
+        half = (high - low)[:2] / 2
+        reach = abs(cos) * half[0] + abs(sin) * min(half[1], 0.02) + abs(plan.offset_m[0]) + 0.008
+        start = objects.OPEN_M - min(reach, objects.OPEN_M - 0.002)
+        data.qpos[1:3] = start
+        unstable = self._run(SETTLE_S, lambda _: height, lambda _: start)
+        yield self._moment("before", 0.0, unstable)
+
+        # The set point runs on into the thing: the force limit decides where the fingers stop.
+        unstable |= self._run(CLOSE_S, lambda _: height, lambda t: min(start + CLOSE_SPEED * t, objects.OPEN_M))
+        yield self._moment("during", 0.0, unstable)
+
+        lowest = float(data.xipos[self.body, 2])
+        closed = min(start + CLOSE_SPEED * CLOSE_S, objects.OPEN_M)
+
+        def way(t: float) -> float:
+            x = min(t / LIFT_S, 1.0)
+            return height + plan.lift_m * x * x * (3 - 2 * x)
+
+        unstable |= self._run(LIFT_S + HOLD_S, way, lambda _: closed)
+        rise = float(data.xipos[self.body, 2]) - lowest
+        moment = self._moment("after", rise, unstable)
+        held = moment.left.normal_n > 0 and moment.right.normal_n > 0
+        success = int(held and rise > HELD_PART * plan.lift_m and not self._on_table() and not unstable)
+        yield replace(moment, success=success)
+
+    def _run(self, seconds: float, lift: Callable[[float], float], close: Callable[[float], float]) -> int:
+        """Advance; return 1 if the solver lost the scene, which is then left at its last good state."""
+        model, data = self.model, self.data
+        for chunk in range(round(seconds / STEP_S / CHUNK)):
+            time = (chunk + 1) * CHUNK * STEP_S
+            data.ctrl[0] = lift(time)
+            data.ctrl[1] = 2 * close(time)
+            good = data.qpos.copy()
+            mujoco.mj_step(model, data, CHUNK)
+            warned = any(data.warning[i].number for i in _LOST)
+            if warned or not np.all(np.abs(data.qvel) < RUNAWAY):
+                mujoco.mj_resetData(model, data)
+                data.qpos[:] = good
+                mujoco.mj_forward(model, data)
+                return 1
+        return 0
+
+    def _moment(self, phase: str, rise: float, unstable: int) -> Moment:
+        left, right = self._touch(0), self._touch(1)
+        return Moment(phase=phase, data=self.data, left=left, right=right, success=0, rise_m=rise, unstable=unstable)
+
+    def _touch(self, side: int) -> Touch:
+        """Sum the contact forces on a pad's dome."""
+        total = np.zeros(3)
+        force = np.zeros(6)
+        for i in range(self.data.ncon):
+            pair = self.data.contact.geom[i]
+            if self.pads[side] in pair:
+                mujoco.mj_contactForce(self.model, self.data, i, force)
+                world = self.data.contact.frame[i].reshape(3, 3).T @ force[:3]
+                total += world if pair[1] == self.pads[side] else -world
+        out = -1.0 if side == 0 else 1.0
+        return Touch(normal_n=max(float(out * total[0]), 0.0), shear_n=(float(out * total[1]), float(-total[2])))
+
+    def _on_table(self) -> bool:
+        return any(0 in pair for pair in self.data.contact.geom[: self.data.ncon])
+
+
+_LOST = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)

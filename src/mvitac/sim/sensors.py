@@ -1,0 +1,125 @@
+"""What makes of tactile sensor look like: palettes, LED directions, printed dots, dirt and lens edge."""
+
+from dataclasses import dataclass
+
+RGB = tuple[float, float, float]
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """What one make of tactile sensor looks like. Colours in 8-bit levels; u, v run from -1 to 1 over the picture."""
+
+    name: str
+    base: RGB
+    """Level far away from the glow, per channel."""
+    glow: tuple[tuple[float, float, float, float, float], ...]
+    """Per channel (height in levels, centre u, centre v, width u, width v) of the soft bright spot its LEDs make."""
+    tilt: tuple[Pair, Pair, Pair]
+    """Per channel the linear change of level along (u, v)."""
+    response: tuple[Pair, Pair, Pair]
+    """Per channel the change of level per unit slope along (x, y): the direction its LED shines from."""
+    saturation: float = 75.0
+    """Level change at which the response bends over."""
+    shadow: float = 0.35
+    """How much light a ridge takes from what lies behind it, seen from the LED."""
+    marker_pitch_mm: float = 0.0
+    """Distance of the printed dots; 0 means no dots."""
+    marker_radius_mm: float = 0.0
+    marker_jitter: float = 0.0
+    """Scatter of a dot around its place, as a part of the pitch."""
+    marker_wear: float = 0.0
+    """0: round full dots; 1: odd shapes, half rubbed off."""
+    marker_angle_deg: float = 0.0
+    dirt: float = 6.0
+    """Expected number of specks on the gel."""
+    scratches: float = 1.0
+    """Expected number of scratches in the paint."""
+    edge: float = 0.0
+    """Visibility of the lens edge: a dark rim with a thin bright line inside."""
+    noise: float = 1.5
+    """Standard deviation of the camera noise in levels."""
+    held_out: bool = False
+    """Never drawn for training data: the sensor that tests what was learnt."""
+
+
+SENSORS: dict[str, Sensor] = {
+    s.name: s
+    for s in (
+        Sensor(
+            name="mini",  # GelSight Mini without dots: teal rim, rose heart, blue sky above, olive ground below
+            base=(30, 80, 90),
+            glow=((98, 0.0, 0.1, 0.62, 0.58), (44, 0.0, -0.05, 0.62, 0.75), (68, 0.0, -0.15, 0.68, 0.56)),
+            tilt=((3, 13), (-6, -3), (2, -16)),
+            response=((90, 140), (-70, -20), (25, -150)),
+            saturation=58,
+            dirt=9,
+            scratches=1.2,
+            edge=0.85,
+        ),
+        Sensor(
+            name="mini_dots",  # GelSight Mini with a printed grid of large round dots
+            base=(42, 88, 96),
+            glow=((84, 0.0, 0.1, 0.62, 0.55), (26, -0.1, -0.1, 0.7, 0.85), (66, 0.0, -0.2, 0.7, 0.55)),
+            tilt=((2, 12), (-8, -6), (3, -18)),
+            response=((95, 130), (-80, -25), (20, -150)),
+            saturation=60,
+            marker_pitch_mm=1.9,
+            marker_radius_mm=0.36,
+            marker_jitter=0.025,
+            marker_wear=0.2,
+            dirt=8,
+            scratches=1.0,
+            edge=0.25,
+        ),
+        Sensor(
+            name="classic",  # hand-made GelSight: pale, small worn dots, a pastel colour in every corner
+            base=(122, 126, 128),
+            glow=((26, -0.35, 0.25, 0.9, 0.8), (26, 0.1, 0.05, 0.9, 1.0), (24, 0.25, 0.0, 0.7, 0.6)),
+            tilt=((6, 7), (4, 6), (-8, -13)),
+            response=((85, 65), (12, -100), (-90, 60)),
+            saturation=46,
+            marker_pitch_mm=1.7,
+            marker_radius_mm=0.16,
+            marker_jitter=0.11,
+            marker_wear=0.85,
+            marker_angle_deg=14,
+            shadow=0.15,
+            dirt=16,
+            scratches=2.0,
+            edge=0.1,
+            noise=2.2,
+        ),
+        Sensor(
+            name="digit",  # DIGIT-like: three colours from three sides, strong falloff to the corners
+            base=(84, 82, 90),
+            glow=((46, -0.4, 0.4, 0.8, 0.8), (44, 0.45, 0.35, 0.8, 0.8), (50, 0.0, -0.5, 0.9, 0.7)),
+            tilt=((-6, 5), (6, 4), (0, -8)),
+            response=((-115, 65), (110, 60), (5, -125)),
+            saturation=52,
+            shadow=0.25,
+            dirt=5,
+            scratches=0.6,
+            edge=0.5,
+            noise=2.6,
+        ),
+        Sensor(
+            name="slim",  # a sensor nobody trains on: warm light from two sides, white fill, a fine tilted grid
+            base=(104, 96, 86),
+            glow=((30, 0.35, -0.2, 0.8, 0.9), (28, 0.0, 0.2, 0.9, 0.7), (28, -0.35, 0.1, 0.8, 0.8)),
+            tilt=((10, -5), (0, 6), (-10, 3)),
+            response=((105, -45), (35, 95), (-100, -30)),
+            saturation=50,
+            marker_pitch_mm=1.55,
+            marker_radius_mm=0.2,
+            marker_jitter=0.06,
+            marker_wear=0.45,
+            marker_angle_deg=-27,
+            dirt=8,
+            scratches=1.5,
+            edge=0.35,
+            noise=2.0,
+            held_out=True,
+        ),
+    )
+}

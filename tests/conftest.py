@@ -1,0 +1,29 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+# Before anything imports the hub's client, which reads it once: no test reaches the network.
+os.environ["HF_HUB_OFFLINE"] = "1"
+
+import pytest
+import torch
+from toy import toy_pack
+
+from mvitac.pack import Pack
+
+torch.set_num_threads(1)  # sums in one order, whatever the machine
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Packs and features of the tests live and die with them."""
+    path = tmp_path_factory.mktemp("cache")
+    os.environ["MVITAC_CACHE"] = str(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def pack(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """120 striped pairs at 32 px: 3 classes x 20 instances x 2; split by instance."""
+    return toy_pack(tmp_path_factory.mktemp("toy") / "pack")

@@ -1,0 +1,99 @@
+"""Views: replayed parameters, exact special cases, and the statistics the paper names."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from mvitac import augment
+from mvitac.augment import Drawn, ViewAugment, draw, plain_view, random_view
+from mvitac.encoders import IMAGENET_MEAN, IMAGENET_STD
+
+
+def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
+    """Smooth uint8 pictures, as photographs are."""
+    noise = torch.rand(num, channels, 6, 6, generator=torch.Generator().manual_seed(3))
+    return (F.interpolate(noise, (side, side), mode="bicubic").clamp(0, 1) * 255).to(torch.uint8)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def denormalise(view: torch.Tensor) -> torch.Tensor:
+    sensors = view.unflatten(1, (-1, 3))
+    mean, std = (torch.tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    return (sensors * std + mean).flatten(1, 2)
+
+
+def test_plain_view_is_the_normalised_image() -> None:
+    raw = images(side=32)
+    torch.testing.assert_close(denormalise(plain_view(raw, 32)), raw.float() / 255, atol=1e-6, rtol=0)
+
+
+def test_same_generator_same_view() -> None:
+    config = ViewAugment(jitter=0.4)
+    torch.testing.assert_close(
+        random_view(images(), config, 24, generator()), random_view(images(), config, 24, generator()), atol=0, rtol=0
+    )
+    assert not torch.equal(
+        random_view(images(), config, 24, generator()), random_view(images(), config, 24, generator(1))
+    )
+
+
+def test_both_routes_replay_the_same_parameters() -> None:
+    """The batched grid sample (GPU route) shows the crop of the one-by-one route to within resampling error."""
+    raw = images(16, side=40)
+    drawn = draw(ViewAugment(scale=(0.3, 1.0)), 16, 40, generator())
+    one_by_one, batched = augment._crop_cpu(raw, drawn, 40), augment._crop_gpu(raw, drawn, 40)
+    assert (one_by_one - batched).abs().mean() < 0.01
+    wrong = Drawn(drawn.boxes.roll(1, 0), drawn.flip, drawn.grayscale, drawn.gains)
+    assert (one_by_one - augment._crop_gpu(raw, wrong, 40)).abs().mean() > 0.05  # the bound can fail
+
+
+def test_flip_is_exact() -> None:
+    raw = images(4, side=32)
+    drawn = Drawn(
+        torch.tensor([[0, 0, 32, 32]] * 4),
+        torch.ones(4, dtype=torch.bool),
+        torch.zeros(4, dtype=torch.bool),
+        torch.ones(4, 5),
+    )
+    torch.testing.assert_close(
+        denormalise(augment.apply(raw, drawn, 32)), raw.flip(-1).float() / 255, atol=1e-6, rtol=0
+    )
+
+
+def test_statistics_of_the_paper() -> None:
+    """Area uniform in .2-1 (where the crop fits), ratio within 3/4-4/3, flips .5, grayscale .2."""
+    drawn = draw(ViewAugment(), 20000, 256, generator())
+    top, left, height, width = drawn.boxes.T
+    assert (top >= 0).all() and (left >= 0).all()
+    assert (top + height <= 256).all() and (left + width <= 256).all()
+    area, ratio = height * width / 256**2, width / height
+    assert 0.19 < float(area.min()) < 0.22 and 0.95 < float(area.max()) <= 1
+    assert float(ratio.min()) > 0.73 and float(ratio.max()) < 1.37
+    assert float(drawn.flip.float().mean()) == pytest.approx(0.5, abs=0.02)
+    assert float(drawn.grayscale.float().mean()) == pytest.approx(0.2, abs=0.02)
+    assert (drawn.gains == 1).all()
+
+
+def test_grayscale_makes_channels_equal_before_normalisation() -> None:
+    view = denormalise(random_view(images(), ViewAugment(grayscale=1.0), 24, generator()))
+    torch.testing.assert_close(view[:, 0], view[:, 1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(view[:, 0], view[:, 2], atol=1e-5, rtol=0)
+
+
+def test_stacked_sensors_move_together_unless_told() -> None:
+    raw = images()
+    stacked = torch.cat([raw, raw], dim=1)
+    together = random_view(stacked, ViewAugment(jitter=0.3), 24, generator())
+    assert torch.equal(together[:, :3], together[:, 3:])
+    apart = random_view(stacked, ViewAugment(independent_sensors=True), 24, generator())
+    assert not torch.equal(apart[:, :3], apart[:, 3:])
+
+
+def test_jitter_keeps_the_range() -> None:
+    view = denormalise(random_view(images(), ViewAugment(jitter=0.9), 24, generator()))
+    assert float(view.min()) >= -1e-5 and float(view.max()) <= 1 + 1e-5

@@ -1,0 +1,57 @@
+"""Weights are what was asked for, or an error: never a silent fallback."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import timm
+import torch
+
+from mvitac.encoders import SCRATCH, EncoderConfig, build_trunk
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A local stand-in for an ImageNet checkpoint: a whole resnet10t with its 1000-way classifier."""
+    torch.manual_seed(11)
+    path = tmp_path_factory.mktemp("weights") / "resnet10t.safetensors"
+    safetensors.torch.save_file(timm.create_model("resnet10t").state_dict(), path)
+    return path
+
+
+def test_file_weights_are_loaded(weights: Path) -> None:
+    trunk = build_trunk(EncoderConfig(trunk="resnet10t", weights=str(weights)), 3)
+    stored = safetensors.torch.load_file(weights)
+    for name, value in trunk.state_dict().items():
+        assert torch.equal(value, stored[name]), name
+
+
+def test_six_channels_keep_the_pretrained_stem(weights: Path) -> None:
+    """timm repeats the filters and halves them, so a pair of equal images answers like one image."""
+    three = build_trunk(EncoderConfig(trunk="resnet10t", weights=str(weights)), 3).eval()
+    six = build_trunk(EncoderConfig(trunk="resnet10t", weights=str(weights)), 6).eval()
+    image = torch.randn(2, 3, 64, 64)
+    torch.testing.assert_close(six(torch.cat([image, image], 1)), three(image), atol=1e-4, rtol=1e-3)
+
+
+def test_imagenet_offline_says_what_to_do() -> None:
+    with pytest.raises(ValueError, match=r"--encoder\.weights FILE.*scratch"):
+        build_trunk(EncoderConfig(trunk="resnet18.tv_in1k"), 3)
+
+
+def test_foreign_file_is_refused(tmp_path: Path, weights: Path) -> None:
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"not weights")
+    with pytest.raises(ValueError, match="does not hold weights for resnet10t"):
+        build_trunk(EncoderConfig(trunk="resnet10t", weights=str(bad)), 3)
+    with pytest.raises(ValueError, match="does not hold weights for resnet18"):
+        build_trunk(EncoderConfig(trunk="resnet18", weights=str(weights)), 3)
+
+
+def test_unknown_names() -> None:
+    with pytest.raises(ValueError, match="unknown trunk 'resnet81'"):
+        EncoderConfig(trunk="resnet81", weights=SCRATCH)
+    with pytest.raises(ValueError, match="give imagenet, scratch, or a file"):
+        build_trunk(EncoderConfig(weights="nowhere.pth"), 3)

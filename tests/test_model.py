@@ -1,0 +1,106 @@
+"""What is saved is what is loaded, and embed() sees what the probe saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from toy import toy_pack
+
+import mvitac
+from mvitac.datasets.packed import PackConfig
+from mvitac.model import Model, pack_features
+from mvitac.pack import Pack
+from mvitac.recipes import recipe
+from mvitac.train import train
+
+
+def trained(pack: Pack, out: Path) -> Path:
+    return train(replace(recipe("smoke", PackConfig(path=pack.path)), steps=2), out, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(pack, tmp_path_factory.mktemp("model") / "run")
+
+
+@pytest.fixture(scope="module")
+def model(run: Path) -> Model:
+    return mvitac.load(run)
+
+
+def test_embed_equals_the_probes_features(model: Model, pack: Pack) -> None:
+    rows = np.array([3, 50, 119])
+    for modality in ("vision", "touch"):
+        expected = pack_features(model, pack, modality, rows)
+        found = model.embed(**{modality: pack.images[modality][rows]})[modality]
+        assert torch.equal(found, expected)
+
+
+def test_embed_takes_arrays_tensors_and_pictures_alike(model: Model, pack: Pack) -> None:
+    array = pack.images["touch"][7]
+    expected = model.embed(touch=array)["touch"]
+    assert torch.equal(model.embed(touch=torch.from_numpy(array.copy()).permute(2, 0, 1))["touch"], expected)
+    assert torch.equal(model.embed(touch=Image.fromarray(array))["touch"], expected)
+    several = model.embed(touch=[Image.fromarray(array), array])["touch"]
+    torch.testing.assert_close(several, expected.expand(2, -1))  # a larger batch sums in another order
+
+
+def test_embed_resizes_as_the_pack_does(model: Model) -> None:
+    large = np.random.default_rng(0).integers(0, 255, (100, 80, 3), dtype=np.uint8)
+    small = np.asarray(Image.fromarray(large).resize((32, 32), Image.Resampling.BILINEAR))
+    assert torch.equal(model.embed(vision=large)["vision"], model.embed(vision=small)["vision"])
+
+
+def test_shared_space_is_normalised(model: Model, pack: Pack) -> None:
+    both = model.embed(vision=pack.images["vision"][:5], touch=pack.images["touch"][:5], shared=True)
+    assert both["vision"].shape == both["touch"].shape == (5, 16)
+    for z in both.values():
+        torch.testing.assert_close(z.norm(dim=1), torch.ones(5))
+
+
+def test_is_in_eval_mode_and_leaves_itself_alone(model: Model, pack: Pack) -> None:
+    assert not any(module.training for module in model.modules())
+    before = model.weights_digest()
+    model.embed(touch=pack.images["touch"][:4])
+    assert model.weights_digest() == before
+
+
+def test_two_sensors_keep_their_order(tmp_path: Path) -> None:
+    pack = toy_pack(tmp_path / "p", touch_channels=6, num=90)
+    model = mvitac.load(trained(pack, tmp_path / "r"))
+    stacked = pack.images["touch"][:2]
+    swapped = np.concatenate([stacked[..., 3:], stacked[..., :3]], axis=-1)
+    assert model.embed(touch=stacked)["touch"].shape == (2, 64)
+    assert not torch.allclose(model.embed(touch=stacked)["touch"], model.embed(touch=swapped)["touch"])
+    with pytest.raises(ValueError, match="takes 6 channels"):
+        model.embed(touch=stacked[..., :3])
+
+
+def test_changed_weights_are_refused(run: Path, tmp_path: Path) -> None:
+    data = bytearray((run / "model.safetensors").read_bytes())
+    data[-2] ^= 1
+    (tmp_path / "model.safetensors").write_bytes(data)
+    with pytest.raises(ValueError, match="does not match its digest"):
+        mvitac.load(tmp_path)
+
+
+def test_loading_needs_no_network_and_no_start_weights(pack: Pack, tmp_path: Path) -> None:
+    """A run that started from a weights file loads where that file is gone."""
+    import safetensors.torch
+    import timm
+
+    from mvitac.encoders import EncoderConfig
+
+    torch.manual_seed(0)
+    start = tmp_path / "start.safetensors"
+    safetensors.torch.save_file(timm.create_model("resnet10t").state_dict(), start)
+    base = recipe("smoke", PackConfig(path=pack.path))
+    run = replace(base, steps=1, encoder=EncoderConfig(trunk="resnet10t", weights=str(start)))
+    out = train(run, tmp_path / "r", quiet=True)
+    start.unlink()
+    assert mvitac.load(out).embed(touch=pack.images["touch"][0])["touch"].shape == (1, 512)

@@ -1,0 +1,205 @@
+"""Probes: they find what is there, choose nothing on test, and their intervals are what they say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from sklearn.linear_model import LogisticRegression
+from toy import toy_pack
+
+from mvitac import probe
+from mvitac.datasets.packed import PackConfig
+from mvitac.pack import Pack
+from mvitac.probe import Session, interval, parts, probe_features, probe_runs, summarise
+from mvitac.recipes import recipe
+from mvitac.tables import markdown
+from mvitac.train import train
+
+
+@pytest.fixture(scope="module")
+def runs(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    base = tmp_path_factory.mktemp("runs")
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=2, eval_every=0)
+    return [train(replace(run, seed=seed), base / f"seed{seed}", quiet=True) for seed in (0, 1)]
+
+
+@pytest.fixture(scope="module")
+def result(runs: list[Path]) -> dict:
+    return probe_runs(runs, Session(probes=("linear", "knn")))
+
+
+def features_that_know(pack: Pack, task_index: int, how_well: float = 3.0) -> np.ndarray:
+    """Features of the task's (train, val, test) rows in which the label is a direction plus noise."""
+    task = pack.spec.tasks[task_index]
+    rows = parts(pack, task)
+    everything = np.concatenate([rows.train, rows.val, rows.test])
+    labels = pack.column(f"label_{task.name}")[everything]
+    rng = np.random.default_rng(0)
+    return (np.eye(8)[labels] * how_well + rng.normal(0, 0.3, (len(labels), 8))).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["linear", "knn"])
+@pytest.mark.parametrize("task_index", [0, 1])
+def test_finds_what_is_there(pack: Pack, kind: str, task_index: int) -> None:
+    task = pack.spec.tasks[task_index]
+    found = probe_features(features_that_know(pack, task_index), pack, task, parts(pack, task), kind, 0)
+    assert found["accuracy"] == 1.0
+    assert found["balanced_accuracy"] == 1.0
+    assert found["macro_f1"] == 1.0
+    assert found["auroc"] == (1.0 if len(task.classes) == 2 else None)
+    assert np.trace(found["confusion"]) == found["num_test"]
+
+
+def test_finds_nothing_in_noise(pack: Pack) -> None:
+    task = pack.spec.tasks[0]
+    noise = np.random.default_rng(1).normal(size=features_that_know(pack, 0).shape).astype(np.float32)
+    found = probe_features(noise, pack, task, parts(pack, task), "linear", 0)
+    assert found["accuracy"] < 0.65
+
+
+def test_the_papers_probe_learns_and_repeats() -> None:
+    """60 epochs of 8 Adam steps at 1e-4 move a weight by at most .05: a hundred agreeing features make that decide."""
+    rng = np.random.default_rng(0)
+    y = rng.integers(0, 3, 2048)
+    x = (10 * np.repeat(np.eye(3)[y], 100, axis=1) + rng.normal(0, 5, (2048, 300))).astype(np.float32)
+    predict = probe.fit_paper(x, y, 3, seed=0)
+    assert (predict(x).argmax(1) == y).mean() > 0.9
+    assert np.array_equal(predict(x), probe.fit_paper(x, y, 3, seed=0)(x))
+    assert not np.array_equal(predict(x), probe.fit_paper(x, y, 3, seed=1)(x))
+
+
+def test_linear_equals_scikit_learn(pack: Pack) -> None:
+    task = pack.spec.tasks[0]
+    rows, x = parts(pack, task), features_that_know(pack, 0, how_well=0.4)
+    found = probe_features(x, pack, task, rows, "linear", 0)
+    labels = pack.column("label_pattern")
+    num_train, num_both = len(rows.train), len(rows.train) + len(rows.val)
+    mean, std = x[:num_train].mean(0), x[:num_train].std(0)
+    model = LogisticRegression(C=found["C"], max_iter=2000)
+    model.fit((x[:num_both] - mean) / std, labels[np.concatenate([rows.train, rows.val])])
+    expected = model.score((x[num_both:] - mean) / std, labels[rows.test])
+    assert found["accuracy"] == pytest.approx(expected, abs=1.5 / found["num_test"])  # solvers stop at different digits
+
+
+def test_nothing_is_chosen_on_test(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shuffling the test labels changes the score but not the regularisation nor the predictions."""
+    task = pack.spec.tasks[0]
+    rows, x = parts(pack, task), features_that_know(pack, 0, how_well=0.6)
+    before = probe_features(x, pack, task, rows, "linear", 0)
+    real = Pack.column
+
+    def shuffled(self: Pack, name: str) -> np.ndarray:
+        values = real(self, name)
+        if name == "label_pattern":
+            values[rows.test] = (values[rows.test] + 1) % 3
+        return values
+
+    monkeypatch.setattr(Pack, "column", shuffled)
+    after = probe_features(x, pack, task, rows, "linear", 0)
+    assert after["C"] == before["C"]
+    assert np.array_equal(np.roll(before["confusion"], 1, axis=0), after["confusion"])
+
+
+def test_val_is_carved_from_train_by_group_if_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pack = toy_pack(tmp_path / "p")
+    real = Pack.column
+
+    def without_val(self: Pack, name: str) -> np.ndarray:
+        values = real(self, name)
+        return np.where(values == "val", "train", values) if name == "split" else values
+
+    monkeypatch.setattr(Pack, "column", without_val)
+    rows = parts(pack, pack.spec.tasks[0])
+    groups = pack.column("group")
+    assert len(rows.val) and not set(groups[rows.val]) & set(groups[rows.train])
+    assert not set(groups[rows.val]) & set(groups[rows.test])
+
+
+def test_every_score_has_its_controls(result: dict) -> None:
+    for task in ("pattern", "bright"):
+        for modality in ("touch", "vision", "both"):
+            assert {"mvitac", "untrained", "pixels"} <= set(result["summary"][task][modality])
+        assert set(result["summary"][task]["none"]) == {"majority", "noise only"}
+        assert "border" in result["summary"][task]["touch"]
+        assert result["summary"][task]["touch"]["mvitac"]["seeds"] == [0, 1]
+    text = markdown(result)
+    assert "| majority |" in text and "| mvitac | touch -> vision |" in text
+
+
+def test_majority_is_the_share_of_trains_commonest_class(pack: Pack, result: dict) -> None:
+    rows = parts(pack, pack.spec.tasks[1])
+    labels = pack.column("label_bright")
+    common = np.bincount(labels[np.concatenate([rows.train, rows.val])]).argmax()
+    expected = float((labels[rows.test] == common).mean())
+    assert result["summary"]["bright"]["none"]["majority"]["mean"] == pytest.approx(expected)
+
+
+def test_untrained_is_this_runs_trunk_before_training(runs: list[Path], pack: Pack) -> None:
+    from mvitac.model import fresh, load
+
+    run = load(runs[0]).run
+    a, b = fresh(run, pack.spec, 32), fresh(run, pack.spec, 32)
+    for x, y in zip(a.parameters(), b.parameters(), strict=True):
+        assert torch.equal(x, y)
+    trained = load(runs[0])
+    assert any(not torch.equal(x, y) for x, y in zip(a.parameters(), trained.parameters(), strict=True))
+
+
+def test_interval_of_one_seed_is_the_group_bootstrap() -> None:
+    """100 groups of 1 row, 70 right: the 95 % interval of a mean of 100 coin flips at .7, about +-1.96 sqrt(.21/100)."""
+    record = {"group_sizes": [1] * 100, "group_correct": [1] * 70 + [0] * 30}
+    mean, low, high = interval([record])
+    assert mean == pytest.approx(0.7)
+    assert (low, high) == (pytest.approx(0.61, abs=0.015), pytest.approx(0.79, abs=0.015))
+
+
+def test_interval_counts_groups_not_rows() -> None:
+    """Ten times the rows in the same groups say nothing new: the interval stays."""
+    few = {"group_sizes": [1] * 20, "group_correct": [1, 0] * 10}
+    many = {"group_sizes": [10] * 20, "group_correct": [10, 0] * 10}
+    assert interval([few]) == pytest.approx(interval([many]))
+
+
+def test_seeds_widen_the_interval() -> None:
+    same = {"group_sizes": [10] * 50, "group_correct": [5] * 50}
+    good = {"group_sizes": [10] * 50, "group_correct": [9] * 50}
+    _, low, high = interval([same])
+    assert low == high == 0.5
+    mean, low, high = interval([same, good])
+    assert mean == pytest.approx(0.7)
+    assert (low, high) == pytest.approx((0.5, 0.9))
+
+
+def test_summary_shows_a_controls_only_probe(result: dict) -> None:
+    knn = summarise(result["records"], "knn")
+    assert "majority" in knn["pattern"]["none"] and "pixels" in knn["pattern"]["touch"]
+    assert knn["pattern"]["touch"]["mvitac"]["mean"] != pytest.approx(-1)
+
+
+def test_features_are_computed_once(runs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session(probes=("knn",), controls=False)
+    first = probe_runs(runs[:1], session)
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("the features were in the cache")
+
+    monkeypatch.setattr(probe, "pack_features", never)
+    assert probe_runs(runs[:1], session)["records"] == first["records"]
+
+
+def test_retrieval_of_the_untrained_is_chance(result: dict) -> None:
+    for record in result["retrieval"]:
+        assert record["chance R@5"] == pytest.approx(5 / record["num_groups"])
+        assert 0 <= record["R@1"] <= record["R@5"] <= record["R@10"] <= 1
+
+
+def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) -> None:
+    other = toy_pack(tmp_path / "p", num=90)
+    run = replace(recipe("smoke", PackConfig(path=other.path)), steps=1)
+    path = train(run, tmp_path / "r", quiet=True)
+    with pytest.raises(ValueError, match="trained on different data"):
+        probe_runs([runs[0], path], Session())

@@ -1,0 +1,88 @@
+"""The recipes are what the paper and the released code say, and every run survives its own record."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.recipes import RECIPES, recipe
+from mvitac.registry import from_json, to_json
+from mvitac.run import Run
+from mvitac.spec import DataSpec, Task
+
+
+def test_paper_constants() -> None:
+    """Appendix A and B as printed."""
+    run = recipe("paper")
+    assert (run.batch_size, run.epochs, run.augment.size) == (256, 240, 224)
+    assert (run.optim.name, run.optim.lr, run.optim.betas, run.optim.eps) == ("adam", 0.03, (0.9, 0.999), 1e-7)
+    assert (run.optim.weight_decay, run.optim.schedule) == (0, "constant")
+    assert (run.encoder.trunk, run.encoder.weights) == ("resnet18.tv_in1k", "imagenet")
+    method = run.method
+    assert isinstance(method, MViTacConfig)
+    assert (method.temperature, method.out, method.dropout, method.head_norm) == (0.07, 128, 0, False)
+    for view in (run.augment.vision, run.augment.touch):
+        assert (view.scale, view.flip, view.grayscale, view.jitter) == ((0.2, 1.0), 0.5, 0.2, 0)
+
+
+def test_no_grayscale_for_grasping() -> None:
+    grasping = recipe("paper", GraspsConfig()).augment
+    assert grasping.touch.grayscale == grasping.vision.grayscale == 0
+
+
+def test_authors_constants() -> None:
+    """FACTS section 1, third column."""
+    run = recipe("authors", GraspsConfig())
+    method = run.method
+    assert isinstance(method, MViTacConfig)
+    assert (method.momentum, method.lambda_inter, method.hidden, method.dropout) == (0.99, 1, 2048, 0.5)
+    assert (run.optim.lr, run.optim.weight_decay, run.optim.eps, run.optim.schedule) == (1e-3, 1e-6, 1e-8, "step")
+    assert run.augment.touch.independent_sensors and run.augment.touch.flip == 0.25
+    assert run.augment.touch.grayscale == 0.2
+    assert (run.batch_size, run.epochs) == (256, 240)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("data", [MaterialsConfig(num=7), GraspsConfig(seed=3)])
+def test_every_recipe_survives_its_record(name: str, data: MaterialsConfig) -> None:
+    run = recipe(name, data)
+    assert run.recipe == name
+    again = Run.load(json.loads(json.dumps(to_json(run))))
+    assert again == run
+    assert again.digest() == run.digest()
+    assert run.__doc__ and RECIPES[name].__doc__
+
+
+def test_digest_is_of_the_outcome() -> None:
+    from dataclasses import replace
+
+    run = recipe("demo")
+    assert replace(run, log_every=3, device="cpu").digest() == run.digest()
+    assert replace(run, data=replace(run.data, workers=7)).digest() == run.digest()
+    assert replace(run, seed=5).digest() != run.digest()
+
+
+def test_spec_survives_its_record() -> None:
+    spec = DataSpec(
+        name="x",
+        vision_channels=3,
+        touch_channels=6,
+        tasks=(Task(name="t", classes=("a", "b"), only={"phase": "during"}),),
+        group_by="object",
+        controls={"width": ("width_mm",)},
+        licence="none",
+        source="here",
+    )
+    assert from_json(DataSpec, json.loads(json.dumps(to_json(spec)))) == spec
+
+
+def test_unknown_names_are_hinted() -> None:
+    with pytest.raises(ValueError, match="did you mean 'modern'"):
+        recipe("modren")
+    value = to_json(recipe("demo"))
+    value["optim"]["learning_rate"] = 1
+    with pytest.raises(ValueError, match=r"field in run\.optim 'learning_rate'"):
+        Run.load(value)

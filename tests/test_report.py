@@ -1,0 +1,306 @@
+"""The report: its numbers are the probe's, its marks are true, it asks nothing of the network, it bears odd input."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from mvitac import figures
+from mvitac.cli import main
+from mvitac.datasets.packed import PackConfig
+from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.gallery import nearest_groups
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.pack import Pack, Sample, Source, build
+from mvitac.probe import Session, probe_runs, summarise
+from mvitac.recipes import recipe
+from mvitac.report import wall_seconds, write_report
+from mvitac.run import Run
+from mvitac.spec import DataSpec, Task
+from mvitac.tables import cell, columns_of
+from mvitac.train import train
+
+
+class Page(HTMLParser):
+    """Tags, attributes and text of a page, as a browser would take it apart."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.skip = False
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self.skip = tag == "style"
+
+    def handle_data(self, data: str) -> None:
+        self.text += "" if self.skip else data + "\n"
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+HOSTILE = '<script>alert("1")</script> & $x_1$'
+
+
+@dataclass(frozen=True)
+class Noise(Source):
+    """Random pictures: eighteen groups of four rows, every third group test, all with hostile names."""
+
+    vision: int = 3
+    touch: int = 3
+    labelled: bool = True
+    name: str = "noise"
+
+    def spec(self) -> DataSpec:
+        tasks = (Task(name="kind", classes=(HOSTILE, "b")),) if self.labelled else ()
+        channels: dict[str, Any] = {"vision_channels": self.vision, "touch_channels": self.touch}
+        return DataSpec(name=self.name, **channels, tasks=tasks, group_by="thing", licence="none", source=HOSTILE)
+
+    def items(self) -> Sequence[str]:
+        return [str(i) for i in range(72)]
+
+    def read(self, item: int) -> list[Sample]:
+        rng, group = np.random.default_rng(item), item // 4
+        split = "test" if group % 3 == 2 else "train"
+        columns = {"id": str(item), "group": f"{group}{HOSTILE}", "split": split}
+        labels = {"label_kind": group % 2} if self.labelled else {}
+        shown = [rng.integers(0, 256, (16, 16, c), np.uint8) if c else None for c in (self.vision, self.touch)]
+        return [Sample(vision=shown[0], touch=shown[1], columns={**columns, **labels})]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"noise": [self.vision, self.touch, self.labelled]}
+
+
+def smoke(pack: Pack, **changes: Any) -> Run:
+    run = recipe("smoke", PackConfig(path=pack.path))
+    return replace(run, augment=replace(run.augment, size=16), batch_size=8, steps=2, log_every=1, **changes)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MVITAC_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a simulated pack, two seeds trained on it, what their probe found, their report."""
+    folder = tmp_path_factory.mktemp("materials")
+    pack = build(MaterialsConfig(num=240, touches=1, size=16).source(), folder / "pack", size=16, quiet=True)
+    runs = [train(smoke(pack, seed=seed), folder / f"run{seed}", quiet=True) for seed in (0, 1)]
+    assert main(["probe", *map(str, runs), "--json", str(folder / "probe.json")]) == 0
+    assert main(["report", *map(str, runs), "--probe", str(folder / "probe.json"), "--out", str(folder / "out")]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def result(materials: Path) -> dict[str, Any]:
+    import json
+
+    return json.loads((materials / "probe.json").read_text())
+
+
+def noise(tmp_path: Path, source: Noise, **changes: Any) -> tuple[Path, Pack]:
+    pack = build(source, tmp_path / "pack", size=16, quiet=True)
+    return train(smoke(pack, **changes), tmp_path / "run", quiet=True), pack
+
+
+def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any]) -> None:
+    html = (materials / "out" / "report.html").read_text()
+    body = re.search(r"<tbody>(.*?)</tbody>", html, re.DOTALL)
+    assert body
+    rows = [re.findall(r">([^<]*)</t[hd]>", row) for row in body[1].split("</tr>")]
+    shown: dict[tuple[str, str], list[str]] = {}
+    task = ""
+    for row in filter(None, rows):
+        task = row[0] if len(row) == 1 else task
+        shown[task, row[0]] = row[1:]
+    assert set(result["summary"]) == {"category", "soft", "rough"}
+    for task, found in result["summary"].items():
+        sources = {source for cells in found.values() for source in cells}
+        assert sources == {"mvitac", "untrained", "pixels", "border", "majority"}
+        for source in sources:
+            assert shown[task, source] == [cell(found, source, m) for m in columns_of(found)]
+
+
+def test_verdict_and_figures_carry_the_numbers(materials: Path, result: dict[str, Any]) -> None:
+    page = Page((materials / "out" / "report.html").read_text())
+    for source, name in (("mvitac", "reaches"), ("untrained", "untrained trunk"), ("pixels", "pixels")):
+        mean = result["summary"]["category"]["both"][source]["mean"]
+        assert f"{name} {100 * mean:.1f}" in page.text
+    drawn = {path.name for path in (materials / "out" / "figures").iterdir()}
+    assert {"probe-category.png", "loss.png", "confusion-soft.png", "map-touch.png", "retrieval.png"} <= drawn
+    assert len(page.all("svg")) == len(drawn)
+    for curve in ("parts of the loss", "effective rank", "kNN accuracy, rough", "modality gap", "retrieval R@5"):
+        assert curve in page.text
+
+
+def test_asks_nothing_of_the_network(materials: Path) -> None:
+    html = (materials / "out" / "report.html").read_text()
+    page = Page(html)
+    assert "http://" not in html
+    assert "https://" not in html
+    assert not page.all("script")
+    assert not page.all("link")
+    for _, attributes in page.tags:
+        for name in ("src", "href", "xlink:href", "srcset", "data"):
+            value = attributes.get(name) or "#"
+            assert value.startswith(("#", "data:image/jpeg;base64,"))
+    assert all(image["alt"] for image in page.all("img"))
+    ids = [a["id"] for _, a in page.tags if "id" in a]
+    assert len(ids) == len(set(ids)), "an id names one thing"
+    assert {a["href"] for a in page.all("a")} <= {f"#{id_}" for id_ in ids}
+    assert set(re.findall(r'xlink:href="#([^"]*)"|url\(#([^)]*)\)', html)) <= {
+        pair for id_ in ids for pair in ((id_, ""), ("", id_))
+    }
+
+
+def test_a_drawing_drawn_again_is_the_same_file() -> None:
+    def drawn() -> Figure:
+        return figures.curves("loss", [figures.Line("a $b", [1, 2], [3.0, 4.0], "blue")], {"chance": 3.5})
+
+    assert figures.to_svg(drawn(), "x", "alt") == figures.to_svg(drawn(), "x", "alt")
+    assert figures.to_png(drawn()) == figures.to_png(drawn())
+    both = drawn()  # one layout serves both files
+    assert figures.to_png(both) == figures.to_png(drawn())
+    assert figures.to_svg(both, "x", "alt").count("a $b") == 1
+
+
+def test_every_drawn_colour_follows_the_page(materials: Path) -> None:
+    html = (materials / "out" / "report.html").read_text()
+    for svg in re.findall(r"<svg.*?</svg>", html, re.DOTALL):
+        assert not re.findall(r"(?:fill|stroke): #\w+", svg)
+
+
+def test_marks_are_true_in_a_constructed_case() -> None:
+    # Four groups of two rows on the four axes. The gallery is exact but for group 1, which sits where group 0 belongs.
+    groups = torch.arange(4).repeat_interleave(2)
+    query = torch.eye(4)[groups]
+    gallery = torch.eye(4)[torch.tensor([1, 1, 0, 0, 2, 2, 3, 3])]
+    labels = np.array([5, 5, 5, 5, 6, 6, -1, -1])
+    first, third, last = nearest_groups(query, gallery, groups, labels, [0, 4, 6], num=2)
+    assert (first.rank, first.found[0].mark) == (4, "same class")  # ties count against the query
+    assert first.found[0].row in (2, 3)
+    assert (third.rank, [f.mark for f in third.found]) == (1, ["right", "wrong"])
+    assert third.found[0].row in (4, 5)
+    assert last.found[0].mark == "right"
+    unlabelled = nearest_groups(query, gallery, groups, np.full(8, -1), [0], num=4)[0]
+    assert [f.mark for f in unlabelled.found] == ["wrong", "wrong", "wrong", "right"]
+
+
+def test_shown_row_is_the_group_member_most_like_the_query() -> None:
+    gallery = torch.nn.functional.normalize(torch.tensor([[1.0, 0.2], [1.0, 0.0], [0.0, 1.0], [0.1, 1.0]]), dim=1)
+    query = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    found = nearest_groups(query, gallery, torch.tensor([0, 0, 1, 1]), np.zeros(4, int), [0, 3], num=1)
+    assert [(q.found[0].row, q.found[0].mark) for q in found] == [(1, "right"), (2, "right")]
+
+
+def test_gallery_agrees_with_the_score(materials: Path, result: dict[str, Any]) -> None:
+    html = (materials / "out" / "report.html").read_text()
+    queries = re.findall(r'<div class="query">.*?(?=<div class="query">|</section>)', html, re.DOTALL)
+    assert len(queries) == 16
+    for query in queries:
+        rank = re.search(r"is at rank (\d+) of (\d+)", query)
+        assert rank
+        assert int(rank[2]) == result["retrieval"][0]["num_groups"]
+        marks = re.findall(r'<div class="(right|same|wrong)">', query)
+        assert len(marks) == 5
+        assert [i + 1 for i, mark in enumerate(marks) if mark == "right"] == (
+            [int(rank[1])] if int(rank[1]) < 6 else []
+        )
+
+
+def test_hostile_names_stay_text(tmp_path: Path) -> None:
+    folder = tmp_path / "<script>x&"
+    run, _ = noise(folder, Noise(touch=6))
+    html = write_report([run], tmp_path / "out", quiet=True).read_text()
+    page = Page(html)
+    assert not page.all("script")
+    assert HOSTILE in page.text  # the data's source
+    assert page.text.count(HOSTILE[:15]) > 16  # the class name, in figures and below pictures
+    assert any(HOSTILE in (image["alt"] or "") for image in page.all("img"))
+    assert str(run) in page.text
+    widths = {int(image["width"] or 0) for image in page.all("img")}
+    assert widths == {16, 32}  # two gels stand side by side
+
+
+def test_touch_alone(tmp_path: Path) -> None:
+    run, _ = noise(tmp_path, Noise(vision=0))
+    page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
+    assert "Not scored: the data has one modality." in page.text
+    assert not page.all("img")
+    assert "Touch reaches" in page.text
+    assert not (tmp_path / "out" / "figures" / "map-vision.png").exists()
+
+
+def test_without_labels(tmp_path: Path) -> None:
+    run, _ = noise(tmp_path, Noise(labelled=False))
+    page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
+    assert "What the frozen features are worth" not in page.text
+    assert "finds its thing among the first five by camera" in page.text
+    assert len(page.all("img")) == 2 * 8 * 6  # eight queries with five groups, both directions
+
+
+def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
+    first, pack = noise(tmp_path, Noise(), method=SupervisedConfig())
+    second = train(smoke(pack), tmp_path / "second", quiet=True)
+    (first / "log.jsonl").unlink()
+    result = probe_runs([first, second], Session(probes=("knn", "linear"), controls=False))
+    page = Page(write_report([first, second], tmp_path / "out", result=result, quiet=True).read_text())
+    assert "supervised, mvitac on noise" in page.text
+    assert "The same by logistic regression" in page.text
+    assert "parts of the loss, mvitac" in page.text
+    assert len(page.all("img")) == 2 * 8 * 6  # the gallery of the second run; the first one has none
+    linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
+    assert f"with supervised, mvitac {100 * nearest['mvitac']['mean']:.1f}" in page.text
+    assert cell({"both": linear}, "mvitac", "both") in page.text
+    assert not page.all("script")
+    alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
+    assert "Not scored: no space that both modalities share." in alone.text
+    assert "The runs left no log lines." in alone.text
+    assert not alone.all("img")
+
+
+def test_wall_time_adds_up_the_logged_speeds(materials: Path) -> None:
+    from mvitac.report import open_runs
+
+    run = open_runs([materials / "run0"])[0]
+    log = [{"step": 10, "loss": 1.0, "pairs_per_s": 8.0}, {"step": 10, "eval": {}}]
+    log += [{"step": 14, "loss": 1.0, "pairs_per_s": 16.0}]
+    assert wall_seconds(replace(run, log=log)) == 10 * 8 / 8 + 4 * 8 / 16
+    assert wall_seconds(replace(run, log=[])) is None
+
+
+def test_mistakes_end_in_one_line(
+    materials: Path, result: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pack = Pack(materials / "pack")
+    with pytest.raises(ValueError, match=r"no run at .*nowhere: give the folder"):
+        write_report([tmp_path / "nowhere"], tmp_path)
+    unfinished = train(smoke(pack), tmp_path / "unfinished", quiet=True)
+    (unfinished / "model.safetensors").unlink()
+    with pytest.raises(ValueError, match=r"not finished: continue it with `mvitac pretrain .*--resume"):
+        write_report([unfinished], tmp_path)
+    with pytest.raises(ValueError, match="other data"):
+        write_report([materials / "run0"], tmp_path, result={**result, "pack": "other"}, quiet=True)
+    other = train(smoke(pack, seed=7), tmp_path / "other", quiet=True)
+    with pytest.raises(ValueError, match=r"does not score .*other"):
+        write_report([other], tmp_path, result=result, quiet=True)
+    (tmp_path / "odd.json").write_text("[1]")
+    assert main(["report", str(other), "--probe", str(tmp_path / "odd.json"), "--quiet"]) == 2
+    assert "not a probe result" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="at least one"):
+        write_report([], tmp_path)

@@ -1,0 +1,187 @@
+"""Simulated materials and gel optics: what must hold whatever the generator's numbers are."""
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, background, press, pressure, relax, render
+from mvitac.sim.materials import CLASSES, draw_instance, touch
+from mvitac.sim.relief import KINDS, Relief, draw_tables
+
+LIST = "import sys; from mvitac.sim.materials import touch; import hashlib; p = touch(3, 7, 2, 1, size=32); "
+PRINT = "print(hashlib.sha256(p['vision'].tobytes() + p['touch'].tobytes()).hexdigest())"
+
+
+def digest(pair: dict) -> str:
+    return hashlib.sha256(pair["vision"].tobytes() + pair["touch"].tobytes()).hexdigest()
+
+
+def bumps(seed: int = 0) -> np.ndarray:
+    """A relief [48, 64] mm with holes in it."""
+    relief = np.random.default_rng(seed).normal(0, 0.2, (48, 64)).astype(np.float32)
+    relief[:, :5] = -np.inf
+    return relief
+
+
+def test_an_item_depends_on_its_numbers_alone():
+    first = digest(touch(3, 7, 2, 1, size=32))
+    touch(3, 8, 2, 1, size=32)
+    assert digest(touch(3, 7, 2, 1, size=32)) == first
+    other = subprocess.run([sys.executable, "-c", LIST + PRINT], capture_output=True, text=True, check=True, timeout=60)
+    assert other.stdout.strip() == first
+
+
+def test_every_number_matters():
+    items = [(0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)]
+    assert len({digest(touch(*item, size=32)) for item in items}) == len(items)
+
+
+def test_touches_share_the_instance():
+    first, second = touch(0, 4, 1, 0, size=32), touch(0, 4, 1, 1, size=32)
+    shared = ("category", "soft", "rough", "stiffness", "wavelength_mm", "amplitude_mm", "asperity", "gloss")
+    assert all(first[name] == second[name] for name in shared)
+    assert first["force_n"] != second["force_n"]
+
+
+@pytest.mark.parametrize("size", [16, 72, 256])
+def test_a_size_changes_the_pixels_and_not_the_scene(size):
+    pair, small = touch(0, 11, 0, 0, size=size), touch(0, 11, 0, 0, size=64)
+    for name in ("vision", "touch"):
+        assert pair[name].shape == (size, size, 3)
+        assert pair[name].dtype == np.uint8
+        coarse = [p[name].reshape(8, p[name].shape[0] // 8, 8, -1, 3).mean((1, 3)) for p in (pair, small)]
+        assert np.abs(coarse[0] - coarse[1]).mean() < 8
+    assert {k: v for k, v in pair.items() if np.isscalar(v)} == {k: v for k, v in small.items() if np.isscalar(v)}
+
+
+def test_the_held_out_sensor_is_never_drawn_otherwise():
+    seen = {touch(0, c, 0, 0, size=16)["sensor"] for c in range(len(CLASSES))}
+    assert len(seen) >= 3
+    assert all(not SENSORS[name].held_out for name in seen)
+    pair = touch(0, 0, 0, 0, size=16, held_out_sensor=True)
+    assert SENSORS[pair["sensor"]].held_out
+    assert (pair["vision"] == touch(0, 0, 0, 0, size=16)["vision"]).all()
+
+
+def test_labels_are_balanced_and_not_the_category_again():
+    things = [[draw_instance(0, c, i) for i in range(60)] for c in range(len(CLASSES))]
+    for label in ("soft", "rough"):
+        share = np.array([[getattr(thing, label) for thing in row] for row in things]).mean(1)
+        assert 0.4 <= share.mean() <= 0.6
+        assert share.min() > 0.05
+        assert share.max() < 0.95
+        assert np.maximum(share, 1 - share).mean() <= 0.8  # who knows the class knows the label this often
+
+
+@pytest.mark.parametrize(
+    ("item", "size", "words"),
+    [
+        ((0, 20, 0, 0), 64, "category must be 0 to 19"),
+        ((0, -1, 0, 0), 64, "category must be 0 to 19"),
+        ((0, 0, -1, 0), 64, "instance must be >= 0"),
+        ((0, 0, 0, -1), 64, "touch must be >= 0"),
+        ((-1, 0, 0, 0), 64, "seed must be >= 0"),
+        ((0, 0, 0, 0), 4, "size must be 16 to 512"),
+    ],
+)
+def test_wrong_numbers_are_named(item, size, words):
+    with pytest.raises(ValueError, match=words):
+        touch(*item, size=size)
+
+
+@pytest.mark.parametrize(("force", "stiffness", "dome"), [*product((0.01, 1.0, 20.0), (0.02, 1e3), (None, 20.0))])
+def test_pressure_integrates_to_the_force(force, stiffness, dome):
+    p = pressure(bumps(), force_n=force, stiffness=stiffness, pixel_mm=0.2, dome_radius_mm=dome)
+    assert p.min() >= 0
+    assert p.sum(dtype=np.float64) * 0.2**2 == pytest.approx(force, rel=0.01)
+
+
+def test_a_dome_on_a_rigid_plane_is_the_closed_form():
+    # Winkler paraboloid: F = pi k R d^2 with the deepest point d
+    plane, force, radius = np.zeros((201, 201), np.float32), 1.5, 20.0
+    p = pressure(plane, force_n=force, stiffness=1e9, pixel_mm=0.1, dome_radius_mm=radius)
+    depth = np.sqrt(force / (np.pi * GEL_STIFFNESS * radius))
+    assert p.max() / GEL_STIFFNESS == pytest.approx(depth, rel=0.01)
+
+
+def test_softer_is_wider_and_shallower():
+    plane = np.zeros((101, 101), np.float32)
+    hard, soft = (press(plane, force_n=1.0, stiffness=s, pixel_mm=0.15, dome_radius_mm=20.0) for s in (1e3, 0.03))
+    assert soft.max() < hard.max()
+    assert (soft > 0.02).sum() > (hard > 0.02).sum()
+
+
+def test_the_membrane_only_adds():
+    indent = np.maximum(np.random.default_rng(0).normal(0, 0.1, (64, 64)), 0).astype(np.float32)
+    smooth = np.full((64, 64), 0.3, np.float32)
+    assert relax(indent, pixel_mm=0.1).mean() >= indent.mean()
+    np.testing.assert_allclose(relax(smooth, pixel_mm=0.1), smooth, atol=1e-6)
+
+
+@pytest.mark.parametrize("sensor", [*SENSORS.values()], ids=lambda s: s.name)
+def test_no_force_is_the_background(sensor):
+    imprint = press(bumps(), force_n=0.0, stiffness=1.0, pixel_mm=0.1)
+    pressed = render(imprint, sensor, np.random.default_rng(5), pixel_mm=0.1)
+    untouched = background(sensor, np.random.default_rng(5), size=(48, 64), pixel_mm=0.1)
+    assert (pressed == untouched).all()
+
+
+@pytest.mark.parametrize("sensor", [*SENSORS.values()], ids=lambda s: s.name)
+def test_opposite_slopes_change_the_colour_oppositely(sensor):
+    bare = replace(sensor, shadow=0.0, marker_pitch_mm=0.0, noise=0.0)
+    x = np.linspace(-1, 1, 96, dtype=np.float32)
+    ridge = 0.3 * np.exp(-((x / 0.3) ** 2))[None] * np.exp(-((x / 0.3) ** 2))[:, None]
+    levels = [
+        render(h.astype(np.float32), bare, np.random.default_rng(0), pixel_mm=0.1, unit=1).astype(float)
+        for h in (ridge, -ridge, 0 * ridge)
+    ]
+    up, down = levels[0] - levels[2], levels[1] - levels[2]
+    assert np.abs(up).max() > 10
+    assert np.abs(up + down).max() <= 3  # odd in slope, up to rounding and the paint's grain
+    assert np.abs(up.mean((0, 1))).max() < 1  # a symmetric bump leaves the mean colour
+
+
+def test_a_unit_is_one_copy_of_a_sensor():
+    sensor, flat = SENSORS["classic"], np.zeros((60, 80), np.float32)
+    a, b, c = (
+        render(flat, sensor, np.random.default_rng(n), pixel_mm=0.2, unit=u).astype(float)
+        for n, u in ((0, 4), (1, 4), (0, 5))
+    )
+    assert np.abs(a - b).mean() < 4
+    assert np.abs(a - c).mean() > 6
+
+
+def test_shear_moves_dots_inside_the_contact_only():
+    sensor, imprint = SENSORS["mini_dots"], np.zeros((96, 96), np.float32)
+    imprint[20:76, :48] = 0.4
+    still, dragged = (
+        render(imprint, sensor, np.random.default_rng(0), pixel_mm=0.15, unit=2, shear_mm=s).astype(float)
+        for s in ((0.0, 0.0), (0.5, 0.0))
+    )
+    moved = np.abs(still - dragged).mean((0, 2))
+    assert moved[10:40].mean() > 20 * moved[-12:].mean()
+
+
+@pytest.mark.parametrize("kind", [*KINDS])
+def test_every_relief_has_unit_height_and_the_skewness_asked_for(kind):
+    axis = np.arange(96, dtype=np.float32) * 0.15
+    x, y = np.meshgrid(axis, axis)
+    tables = draw_tables(np.random.default_rng(0))
+    for asperity in (-0.7, 0.7):
+        height = Relief(kind=kind, wavelength_mm=1.5, asperity=asperity, tables=tables)(x, y)
+        assert height.std() == pytest.approx(1, abs=0.3)
+        assert np.sign(((height - height.mean()) ** 3).mean()) == np.sign(asperity)
+
+
+def test_wrong_shapes_and_kinds_are_named():
+    with pytest.raises(ValueError, match="unknown kind 'marble': choose one of blotch"):
+        Relief(kind="marble", wavelength_mm=1.0, tables=np.zeros((4, 64, 64), np.float32))
+    with pytest.raises(ValueError, match=r"must be \[H, W\]"):
+        press(np.zeros((4, 4, 3), np.float32), force_n=1.0, stiffness=1.0, pixel_mm=0.1)
+    with pytest.raises(ValueError, match="force_n >= 0"):
+        press(np.zeros((4, 4), np.float32), force_n=-1.0, stiffness=1.0, pixel_mm=0.1)
