@@ -1,0 +1,154 @@
+"""``mvitac demo``, ``pretrain``, ``probe`` and ``report``: the main road."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mvitac.options import parse, selectors
+
+
+def pretrain(argv: list[str]) -> None:
+    """mvitac pretrain --method M --data D --recipe R [--from run.json] [fields] --out DIR [--resume]"""
+    chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--sink"))
+    from typing import Annotated
+
+    import tyro
+    from rich.console import Console
+
+    from mvitac.datasets import DatasetConfig
+    from mvitac.methods import MethodConfig
+    from mvitac.model import read_record
+    from mvitac.recipes import RECIPES, recipe
+    from mvitac.registry import default
+    from mvitac.run import Run
+    from mvitac.sinks import open_sinks
+    from mvitac.train import train
+
+    if "--from" in chosen:
+        for name in ("--method", "--data", "--recipe"):
+            if name in chosen:
+                raise ValueError(f"--from already decides {name}: leave it out, or change single fields")
+        base, _ = read_record(Path(chosen["--from"]))
+    else:
+        data = default(DatasetConfig, chosen.get("--data", "materials"))
+        base = recipe(chosen.get("--recipe", "demo"), data)
+        method = chosen.get("--method", base.method.name)
+        if method != base.method.name:
+            base = replace(base, method=default(MethodConfig, method))
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        run: Annotated[Run, tyro.conf.arg(name="")] = base
+        out: Path = Path("runs") / f"{base.data.name}-{base.method.name}-{base.recipe}"
+        """Folder of the run."""
+        resume: bool = False
+        """Continue the run in --out from its last checkpoint."""
+        quiet: bool = False
+        """No progress bar."""
+
+    Options.__doc__ = f"""Pre-train encoders without labels.
+
+    First choose, then change single fields below (defaults are the chosen recipe's):
+      --recipe {"|".join(RECIPES)}  (default demo)
+      --data {"|".join(DatasetConfig.choices)}  (default materials)
+      --method {"|".join(MethodConfig.choices)}  (default mvitac)
+      --from RUN.JSON   repeat a recorded run instead
+      --sink tensorboard|wandb|trackio   also log there (extras; none by default)
+    """
+    options = parse(Options, rest, "pretrain")
+    console = Console()
+    with open_sinks(chosen.get("--sink"), options.out, options.run) as sinks:
+        out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, sinks=sinks)
+    console.print(f"trained: {out}\nnext: mvitac probe {out}", soft_wrap=True, highlight=False)
+
+
+def probe(argv: list[str]) -> None:
+    """mvitac probe RUN... [--data-pack DIR] [--json FILE]"""
+    from typing import Annotated
+
+    import tyro
+    from rich.console import Console
+
+    from mvitac.pack import Pack
+    from mvitac.probe import Session, probe_runs, summarise
+    from mvitac.record import check_place, write_json
+    from mvitac.tables import print_retrieval, print_summary
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """Score frozen features by linear probes, kNN and retrieval, each beside its controls."""
+
+        runs: tyro.conf.Positional[tuple[Path, ...]]
+        """Folders of finished runs: seeds of one method, or several methods, on the same data."""
+        session: Annotated[Session, tyro.conf.arg(name="")] = Session()
+        on: Path | None = None
+        """Probe on this pack instead of the data the runs were trained on."""
+        json: Path | None = None
+        """Also write everything that is printed, and more, to this file."""
+
+    options = parse(Options, argv, "probe")
+    if options.json:
+        check_place(options.json)
+        if options.json.is_dir():
+            raise ValueError(f"--json {options.json} is a folder: give another name, of a file")
+    result = probe_runs(options.runs, options.session, Pack(options.on) if options.on else None)
+    console = Console()
+    for kind in options.session.probes:
+        print_summary({**result, "summary": summarise(result["records"], kind)}, console, probe=kind)
+    print_retrieval(result, console)
+    if options.json:
+        write_json(options.json, result)
+        console.print(f"written: {options.json}", soft_wrap=True, highlight=False)
+
+
+def demo(argv: list[str]) -> None:
+    """mvitac demo [--out DIR] [--seeds N] [--resume]"""
+    from typing import Annotated
+
+    import tyro
+    from rich.console import Console
+
+    from mvitac.demo import run_demo
+    from mvitac.recipes import recipe
+    from mvitac.run import Run
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """The whole road on simulated materials: simulate, pre-train, probe, report. A second call goes on where the
+        first stopped."""
+
+        out: Path = Path("runs/demo")
+        """Folder of the demo: one run per seed, summary.json, report."""
+        seeds: int = 3
+        """How many times to pre-train, each from its own seed."""
+        run: Annotated[Run, tyro.conf.arg(name="")] = recipe("demo")
+
+    options = parse(Options, argv, "demo")
+    run_demo(options.run, options.out, options.seeds, Console())
+
+
+def report(argv: list[str]) -> None:
+    """mvitac report RUN... [--out DIR] [--probe FILE.json]"""
+    import tyro
+    from rich.console import Console
+
+    from mvitac.record import read_json
+    from mvitac.report import write_report
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """One self-contained HTML page about finished runs, and its figures as PNG."""
+
+        runs: tyro.conf.Positional[tuple[Path, ...]]
+        """Folders of finished runs: seeds of one method, or several methods, on the same data."""
+        out: Path | None = None
+        """Folder of the page (default: report inside the run's folder; runs/report for several runs)."""
+        probe: Path | None = None
+        """What `mvitac probe RUN... --json FILE` wrote; without it the runs are probed now."""
+        quiet: bool = False
+        """No progress."""
+
+    options = parse(Options, argv, "report")
+    result = read_json(options.probe, "a probe result") if options.probe else None
+    out = options.out or (options.runs[0] / "report" if len(options.runs) == 1 else Path("runs") / "report")
+    written = write_report(options.runs, out, result=result, quiet=options.quiet)
+    Console().print(f"written: {written}", soft_wrap=True, highlight=False)
