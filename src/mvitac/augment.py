@@ -50,12 +50,21 @@ class Augment:
 
     size: int = 224
     """Side of the crop that enters the encoders (paper: 224)."""
+    whole: int | None = None
+    """Side at which the frozen encoders see whole images; none = size. A random crop shows things larger than the whole
+    image squeezed into the same side does, so features of whole images gain from a larger side (arXiv:1906.06423)."""
     vision: ViewAugment = ViewAugment()
     touch: ViewAugment = ViewAugment()
 
     def __post_init__(self) -> None:
-        if not 8 <= self.size <= 1024:
-            raise ValueError(f"augment size {self.size}: give a side of 8 to 1024 pixels")
+        for name, side in (("size", self.size), ("whole", self.seen)):
+            if not 8 <= side <= 1024:
+                raise ValueError(f"augment {name} {side}: give a side of 8 to 1024 pixels")
+
+    @property
+    def seen(self) -> int:
+        """Side of the whole image that probes and predictions see."""
+        return self.size if self.whole is None else self.whole
 
 
 @dataclass(frozen=True)

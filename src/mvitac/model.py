@@ -46,7 +46,7 @@ class Model(nn.Module):
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, precision: str = "fp32") -> Tensor:
         """Pooled features [B, D] (fp32) of uint8 ``images`` [B, C, H, W] as a pack stores them."""
-        view = plain_view(images, self.run.augment.size)
+        view = plain_view(images, self.run.augment.seen)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=precision == "bf16"):
             return self.encoders[modality](view).float()
 
@@ -83,7 +83,7 @@ class Model(nn.Module):
     def weights_digest(self) -> str:
         """Content address of the weights and of the view they expect, for caches."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
-        return digest([safetensors_digest(tensors), self.run.augment.size])
+        return digest([safetensors_digest(tensors), self.run.augment.seen])
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.safetensors) with run and data description in its header."""

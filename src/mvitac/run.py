@@ -145,6 +145,11 @@ class Run:
                 f"views of {self.augment.size} px cannot be cut from images stored at {stored_size} px:"
                 f" give --augment.size {stored_size} or less, or pack the data at a larger --data.size"
             )
+        if self.augment.seen > stored_size:
+            raise ValueError(
+                f"whole images of {self.augment.seen} px were stored at {stored_size} px:"
+                f" give --augment.whole {stored_size} or less, or pack the data at a larger --data.size"
+            )
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 

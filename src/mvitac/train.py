@@ -312,7 +312,7 @@ def _try(method: Method, run: Run, pack: Pack) -> None:
             model.features(modality, blank)
         except Exception as error:  # each family of trunks has its own words for it
             raise ValueError(
-                f"trunk {run.encoder.trunk} cannot see views of {run.augment.size} px ({brief(error)}):"
+                f"trunk {run.encoder.trunk} cannot see images of {run.augment.seen} px ({brief(error)}):"
                 " give another --augment.size or --encoder.trunk"
             ) from None
 
