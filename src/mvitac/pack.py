@@ -32,6 +32,7 @@ import pyarrow.parquet as pq
 from PIL import Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from mvitac.allocator import keep_freed_memory
 from mvitac.record import brief, digest, digest_file, naming, provenance, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.spec import DataSpec
@@ -302,6 +303,7 @@ def _check_disk(out: Path, spec: DataSpec, num: int, size: int) -> None:
 def _run(jobs: list[tuple[Source, DataSpec, range, int, Path]], workers: int) -> Iterator[range]:
     workers = workers or os.cpu_count() or 1
     if workers == 1 or len(jobs) < 2:
+        keep_freed_memory()
         for job in jobs:
             yield _write_part(job)
         return
@@ -323,6 +325,7 @@ _work_on: tuple[Source, DataSpec]
 
 def _start_worker(source: Source, spec: DataSpec) -> None:
     global _work_on
+    keep_freed_memory()
     os.environ["OMP_NUM_THREADS"] = "1"  # one worker, one core; also keeps sums in one order
     _work_on = source, spec
 
