@@ -18,7 +18,9 @@ import pytest
 from PIL import Image
 
 from mvitac.cli import main
-from mvitac.datasets.folder import Folder, FolderConfig, deal, decode
+from mvitac.datasets.folder import Folder, FolderConfig
+from mvitac.datasets.images import decode
+from mvitac.datasets.splits import deal
 from mvitac.pack import Pack, build
 from mvitac.recipes import recipe
 from mvitac.record import cache_dir
