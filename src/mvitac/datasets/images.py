@@ -6,6 +6,7 @@ import os
 import stat
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -22,8 +23,12 @@ def size_of(path: str) -> int:
     return found.st_size if stat.S_ISREG(found.st_mode) else -1
 
 
-def decode(path: str | Path) -> np.ndarray:
-    """An image file as uint8 RGB [H, W, 3]: upright (EXIF), 16 bits scaled to 8, transparent parts black."""
+def decode(path: str | Path | BinaryIO, name: str = "") -> np.ndarray:
+    """An image file as uint8 RGB [H, W, 3]: upright (EXIF), 16 bits scaled to 8, transparent parts black.
+
+    ``name`` is what to call an open file in errors.
+    """
+    name = name or str(path)
     try:
         with Image.open(path) as image:
             # A camera's MPO hides a second picture behind the first; a GIF or TIFF stack is no photo.
@@ -32,12 +37,12 @@ def decode(path: str | Path) -> np.ndarray:
             image.load()
             return _to_rgb(ImageOps.exif_transpose(image))
     except FileNotFoundError:
-        raise ValueError(f"{path} does not exist any more: it was there when packing began") from None
+        raise ValueError(f"{name} does not exist any more: it was there when packing began") from None
     # What PIL raises for damaged files is not one family.
     except (OSError, ValueError, SyntaxError, TypeError, IndexError, EOFError, struct.error) as error:
-        raise ValueError(f"{path} cannot be read as an image ({' '.join(str(error).split())})") from None
+        raise ValueError(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from None
     except Image.DecompressionBombError as error:
-        raise ValueError(f"{path} is too large ({error})") from None
+        raise ValueError(f"{name} is too large ({error})") from None
 
 
 def _to_rgb(image: Image.Image) -> np.ndarray:

@@ -9,10 +9,11 @@ import csv
 import json
 import math
 import operator
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mvitac.datasets.images import IMAGES
+from mvitac.datasets.places import VIDEOS, File, Frame, Place
 from mvitac.pack import SPLITS
 from mvitac.record import digest, digest_file
 from mvitac.registry import unknown
@@ -39,10 +41,39 @@ class Manifest:
     columns: tuple[str, ...]
     rows: list[dict[str, str]]
     digest: str
+    found: dict[str, list[Place | None]] = field(default_factory=dict)
+    """Image columns that a reader resolved itself; the others hold paths."""
+    labels: tuple[str, ...] = ()
+    """Columns that are labels unless others are asked for."""
 
     def check(self, column: str) -> None:
-        if column not in self.columns:
-            raise ValueError(f"{self.file}: {unknown('column', column, self.columns)}")
+        if column not in self.columns and column not in self.found:
+            raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
+
+    def places(self, column: str) -> list[Place | None]:
+        """Where each row's image of ``column`` lies; None where the cell is empty.
+
+        A path to a video needs the frame's number, from 0, in column <column>_frame or, if there is none, frame.
+        """
+        if column in self.found:
+            return self.found[column]
+        root, places = str(self.root), []
+        counter = f"{column}_frame" if f"{column}_frame" in self.columns else "frame"
+        for number, row in enumerate(self.rows, 1):
+            cell = row[column]
+            path = os.path.join(root, cell)
+            if not cell:
+                places.append(None)
+            elif not cell.lower().endswith(VIDEOS):
+                places.append(File(path))
+            elif (row.get(counter) or "").isdecimal():
+                places.append(Frame(path, int(row[counter])))
+            else:
+                raise ValueError(
+                    f"{self.file} row {number}: {column} {cell} is a video, column {counter!r} says"
+                    f" {row.get(counter, 'nothing')!r}: give the frame's number, from 0"
+                )
+        return places
 
 
 def text_of(value: Any) -> str:
@@ -145,40 +176,49 @@ def _check_header(file: Path, columns: Sequence[str]) -> None:
         raise ValueError(f"{file} has {what}: give every column its own name in the first line")
 
 
-def list_class_folders(root: Path) -> Manifest:
-    """The manifest that a tree of class folders amounts to (see the module's docstring)."""
+def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bool = False) -> Manifest:
+    """The manifest that a tree of class folders amounts to (see ``folder``'s docstring).
+
+    ``pictures`` is what a tree without folders for the modalities shows; ``allow_missing`` leaves a cell empty where an
+    image has no counterpart.
+    """
     splits = [split for split in SPLITS if (root / split).is_dir()]
     rows: list[dict[str, str]] = []
     for split in splits or [""]:
         base = root / split
-        have = [name for name in ("vision", "touch", "left", "right") if (base / name).is_dir()]
-        if not have:
+        named = [name for name in ("vision", "touch", "left", "right") if (base / name).is_dir()]
+        found = {name: _images_below(base / name) for name in named} or {pictures: _images_below(base)}
+        have = list(found)
+        if not named and not any("/" in key for key in found[pictures]):
             raise ValueError(
-                f"{base} has no manifest.csv (.parquet, .jsonl) and no folder vision, touch, left or right:"
-                " make one of them, or give another path"
+                f"{base} has no manifest.csv (.parquet, .jsonl) and no folder vision, touch, left or right"
+                " nor class folders with images: make them, or give another path"
             )
-        found = {name: _images_below(base / name) for name in have}
         for key in sorted(set().union(*found.values())):
             lacking = next((name for name in have if key not in found[name]), None)
-            if lacking:
+            if lacking and not allow_missing:
                 other = next(found[name][key] for name in have if key in found[name])
-                raise ValueError(f"{other} has no counterpart {base / lacking / key}.*: add it, or remove the other")
+                raise ValueError(
+                    f"{other} has no counterpart {base / lacking / key}.*: add it, remove the other, or allow_missing"
+                )
             parts = key.split("/")
             if len(parts) < 2:
-                raise ValueError(f"{found[have[0]][key]} is not in a class folder: put it in one, named by its class")
-            row = {name: found[name][key].relative_to(root).as_posix() for name in have}
+                where = next(found[name][key] for name in have if key in found[name])
+                raise ValueError(f"{where} is not in a class folder: put it in one, named by its class")
+            row = {name: found[name][key].relative_to(root).as_posix() if key in found[name] else "" for name in have}
             group = "/".join(parts[:-1]) if len(parts) > 2 else f"{split}/{key}"
             rows.append({**row, "label": parts[0], "group": group, **({"split": split} if split else {})})
     columns = list(dict.fromkeys(name for row in rows for name in row))
     for number, row in enumerate(rows, 1):
-        if len(row) < len(columns):
+        if len(row) < len(columns) and not allow_missing:
             lacking = next(name for name in columns if name not in row)
             raise ValueError(
                 f"{root} has {lacking} images in some splits only (row {number} has none): add or remove them"
             )
+    rows = [{name: row.get(name, "") for name in columns} for row in rows]
     if not rows:
         raise ValueError(f"{root} holds no images ({', '.join(IMAGES)}): put them in <class> folders")
-    return Manifest(root, root, tuple(columns), rows, digest(rows))
+    return Manifest(root, root, tuple(columns), rows, digest(rows), labels=("label",))
 
 
 def _images_below(folder: Path) -> dict[str, Path]:
@@ -209,6 +249,9 @@ class Condition:
         if condition.sign in COMPARE and number_of(condition.value) is None:
             raise ValueError(f"condition {text!r}: {condition.sign} needs a number, not {condition.value!r}")
         return condition
+
+    def __str__(self) -> str:
+        return f"{self.column}{self.sign}{self.value}"
 
     def holds(self, row: dict[str, str]) -> bool:
         """Whether ``row`` meets it; an empty cell is neither <= nor >= anything."""
