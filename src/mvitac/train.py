@@ -61,7 +61,7 @@ def train(
     _check_out(out, resume)
     device = pick_device(run.device)
     pack = pack or run.data.open(quiet=quiet)
-    rows = pack.rows("train", "unlabelled")
+    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)  # a pair with a hole in it is no pair
     run.check(pack.spec, len(rows), pack.size)
     again = (out / "run.json").exists()
     if again:
@@ -208,11 +208,12 @@ def make_views(
 def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
     """For each of ``rows`` a random other row of its touch group in the same split, or itself if it is alone there."""
     groups, split = pack.touch_groups, pack.column("split")
+    whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]))
-        others = others[(others != row) & (split[others] == split[row])]
+        others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found
@@ -237,14 +238,16 @@ NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
 def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """kNN accuracy of each task and the collapse panel on held-out groups (split val); never looks at test.
 
-    Without a val split the panel is over training rows and there is no kNN score.
+    Without a val split the panel is over training rows and there is no kNN score. Only rows with both modalities count.
     """
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
 
     def some(rows: np.ndarray, num: int) -> np.ndarray:
         return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
-    train_rows, val_rows = some(pack.rows("train", "unlabelled"), NUM_EVAL_TRAIN), pack.rows("val")
+    whole = pack.spec.modalities
+    train_rows = some(pack.rows("train", "unlabelled", having=whole), NUM_EVAL_TRAIN)
+    val_rows = pack.rows("val", having=whole)
     held_out = len(val_rows) > 1
     panel_rows = some(val_rows, NUM_EVAL_VAL) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: pack_features(model, pack, m, panel_rows, precision=run.precision) for m in model.encoders}
