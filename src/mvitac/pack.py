@@ -58,6 +58,17 @@ class Sample:
     """At least id (str), group (str), split (one of SPLITS) and a label_<task> (int, -1 = none) per task."""
 
 
+@dataclass(frozen=True)
+class Count:
+    """What a published list says there is, beside what was found."""
+
+    what: str
+    published: int
+    found: int
+    detail: str = ""
+    """What is missing or too many, where that can be said."""
+
+
 class Source(ABC):
     """Something to read samples from; picklable, so that packing can use several processes."""
 
@@ -79,6 +90,10 @@ class Source(ABC):
     def num_samples(self) -> int:
         """How many samples to expect, for the disk estimate."""
         return len(self.items())
+
+    def expected(self) -> list[Count]:
+        """What a published list of the dataset says, beside what is there, for `mvitac data check`."""
+        return []
 
 
 class Pack:
@@ -141,6 +156,18 @@ class Pack:
         if name not in self.table.column_names:
             raise unknown("column", name, self.table.column_names)
         return np.array(self.table.column(name).to_numpy(zero_copy_only=False))  # arrow memory is read-only
+
+    @functools.cached_property
+    def _labels(self) -> dict[str, np.ndarray]:
+        labels = {task.name: self.column(f"label_{task.name}").astype(np.int64) for task in self.spec.tasks}
+        for task in self.spec.tasks:
+            for name, value in task.only.items():
+                labels[task.name][self.column(name).astype(str) != value] = -1
+        return labels
+
+    def labels(self, task: str) -> np.ndarray:
+        """[N] int64 labels of ``task``, -1 where there is none or the task is not about the row (``Task.only``)."""
+        return self._labels[task]
 
     def has(self, modality: str) -> np.ndarray:
         """bool [N]: which rows have an image of ``modality``; the others hold zeros, which nothing should look at."""

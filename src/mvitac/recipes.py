@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from mvitac.augment import Augment, ViewAugment
 from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.calandra import CalandraConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.encoders import SCRATCH, EncoderConfig
 from mvitac.methods.mvitac import MViTacConfig
@@ -20,7 +21,7 @@ def paper(data: DatasetConfig) -> Run:
     Grayscale views are left out for grasping (appendix B). One 24 GB GPU. What the paper leaves open (m, lambda_inter,
     hidden width) is said in the method's fields. lr .03 is very high for Adam; expect to see what it does.
     """
-    views = ViewAugment(grayscale=0.0) if isinstance(data, GraspsConfig) else ViewAugment()
+    views = ViewAugment(grayscale=0.0) if isinstance(data, (GraspsConfig, CalandraConfig)) else ViewAugment()
     return Run(recipe="paper", data=data, augment=Augment(vision=views, touch=views))
 
 

@@ -73,7 +73,7 @@ def train(
     method = run.method.build(pack.spec, run.encoder).to(device)
     method.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     for task in run.method.labels_needed(pack.spec):
-        if not (pack.column(f"label_{task}")[rows] >= 0).any():
+        if not (pack.labels(task)[rows] >= 0).any():
             raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
     _try(method, run, pack)
     optimiser = build_optimiser(run.optim, method)
@@ -201,7 +201,7 @@ def make_views(
         for source in sources:
             raw = torch.from_numpy(pack.images[modality][source]).permute(0, 3, 1, 2).to(device)
             images[modality].append(random_view(raw, config, run.augment.size, generator))
-    labels = {t.name: torch.from_numpy(pack.column(f"label_{t.name}")[rows]).to(device) for t in pack.spec.tasks}
+    labels = {t.name: torch.from_numpy(pack.labels(t.name)[rows]).to(device) for t in pack.spec.tasks}
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
 
 
@@ -258,7 +258,7 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     if held_out:
         bank = {m: pack_features(model, pack, m, train_rows, precision=run.precision) for m in model.encoders}
         for task in pack.spec.tasks:
-            labels = torch.from_numpy(pack.column(f"label_{task.name}"))
+            labels = torch.from_numpy(pack.labels(task.name))
             keep_bank, keep = labels[train_rows] >= 0, labels[panel_rows] >= 0
             if not (keep_bank.any() and keep.any()):
                 continue
