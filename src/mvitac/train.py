@@ -61,7 +61,7 @@ def train(
     _check_out(out, resume)
     device = pick_device(run.device)
     pack = pack or run.data.open(quiet=quiet)
-    rows = pack.rows("train", "unlabelled")
+    rows = training_rows(run, pack)
     run.check(pack.spec, len(rows), pack.size)
     again = (out / "run.json").exists()
     if again:
@@ -70,11 +70,9 @@ def train(
         return out  # resumed after its end
 
     torch.manual_seed(run.seed)
-    method = run.method.build(pack.spec, run.encoder).to(device)
-    method.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    for task in run.method.labels_needed(pack.spec):
-        if not (pack.column(f"label_{task}")[rows] >= 0).any():
-            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    method = run.method.build(pack.spec, run.encoder)
+    method.prepare(torch.from_numpy(rows))
+    method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _try(method, run, pack)
     optimiser = build_optimiser(run.optim, method)
     num_steps, start = run.num_steps(len(rows)), 0
@@ -146,6 +144,19 @@ def describe(device: torch.device) -> str:
     return f"{device.type}, {torch.get_num_threads()} threads"
 
 
+def training_rows(run: Run, pack: Pack) -> np.ndarray:
+    """Pack rows to pre-train on; a method that learns from labels sees only rows that carry one it needs."""
+    rows = pack.rows("train", "unlabelled")
+    tasks = run.method.labels_needed(pack.spec)
+    if not tasks:
+        return rows
+    labels = {task: pack.labels(task)[rows] >= 0 for task in tasks}
+    for task, there in labels.items():
+        if not there.any():
+            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    return rows[np.logical_or.reduce(list(labels.values()))]
+
+
 def mix(*numbers: int) -> int:
     """One 63-bit seed from several numbers, by numpy's SeedSequence."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
@@ -201,7 +212,7 @@ def make_views(
         for source in sources:
             raw = torch.from_numpy(pack.images[modality][source]).permute(0, 3, 1, 2).to(device)
             images[modality].append(random_view(raw, config, run.augment.size, generator))
-    labels = {t.name: torch.from_numpy(pack.column(f"label_{t.name}")[rows]).to(device) for t in pack.spec.tasks}
+    labels = {t.name: torch.from_numpy(pack.labels(t.name)[rows]).to(device) for t in pack.spec.tasks}
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
 
 
