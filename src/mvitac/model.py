@@ -33,7 +33,7 @@ Images = np.ndarray | Tensor | Image.Image | Sequence[Any]
 
 
 class Model(nn.Module):
-    """Encoders modality -> trunk, projectors modality -> head, in eval mode, with their preprocessing."""
+    """Encoders modality -> trunk, projectors modality -> head, classifiers of tasks, in eval mode, with preprocessing."""
 
     def __init__(self, method: Method, run: Run, spec: DataSpec, stored: int) -> None:
         """``stored``: side in pixels at which the training pack stores images, to which raw ones are squashed first."""
@@ -41,6 +41,9 @@ class Model(nn.Module):
         self.run, self.spec, self.stored = run, spec, stored
         self.encoders = nn.ModuleDict(method.encoders())
         self.projectors = nn.ModuleDict(method.projectors())
+        own = method.classifiers()
+        self.tasks = tuple(own)
+        self.classifiers = nn.ModuleList(own.values())
         self.eval()
 
     @torch.no_grad()
@@ -56,6 +59,14 @@ class Model(nn.Module):
         if modality not in self.projectors:
             raise ValueError(f"this model has no shared space for {modality}: its method is {self.run.method.name!r}")
         return nn.functional.normalize(self.projectors[modality](features), dim=1)
+
+    @torch.no_grad()
+    def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
+        """Class probabilities [B, K] by the classifier trained along with the encoders (supervised methods only)."""
+        if task not in self.tasks:
+            raise unknown("task of this model's own classifiers", task, self.tasks or ("none",))
+        joined = torch.cat([features[m] for m in self.encoders], dim=1)
+        return self.classifiers[self.tasks.index(task)](joined).softmax(dim=1)
 
     def embed(
         self, *, vision: Images | None = None, touch: Images | None = None, shared: bool = False

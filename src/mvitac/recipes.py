@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from mvitac.augment import Augment, ViewAugment
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.calandra import CalandraConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.encoders import SCRATCH, EncoderConfig
+from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.registry import unknown
+from mvitac.registry import default, unknown
 from mvitac.run import Optim, Run
 
 
@@ -105,6 +106,21 @@ def smoke(data: DatasetConfig) -> Run:
 
 
 RECIPES: dict[str, Callable[[DatasetConfig], Run]] = {f.__name__: f for f in (paper, authors, modern, demo, smoke)}
+
+
+def with_method(run: Run, method: str) -> Run:
+    """``run`` with another method: its own defaults, but for what the run's recipe changed in fields that both have.
+
+    So a method that is compared with MViTac gets the head and the momentum that the recipe's budget asks for.
+    """
+    if method == run.method.name:
+        return run
+    usual = default(MethodConfig, run.method.name)
+    changed = {f.name: getattr(run.method, f.name) for f in fields(usual)}
+    changed = {name: value for name, value in changed.items() if value != getattr(usual, name)}
+    chosen = default(MethodConfig, method)
+    mine = {f.name for f in fields(chosen)}
+    return replace(run, method=replace(chosen, **{name: value for name, value in changed.items() if name in mine}))
 
 
 def recipe(name: str, data: DatasetConfig | None = None) -> Run:

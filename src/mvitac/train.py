@@ -61,7 +61,7 @@ def train(
     _check_out(out, resume)
     device = pick_device(run.device)
     pack = pack or run.data.open(quiet=quiet)
-    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)  # a pair with a hole in it is no pair
+    rows = training_rows(run, pack)
     run.check(pack.spec, len(rows), pack.size)
     again = (out / "run.json").exists()
     if again:
@@ -70,11 +70,9 @@ def train(
         return out  # resumed after its end
 
     torch.manual_seed(run.seed)
-    method = run.method.build(pack.spec, run.encoder).to(device)
-    method.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    for task in run.method.labels_needed(pack.spec):
-        if not (pack.labels(task)[rows] >= 0).any():
-            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    method = run.method.build(pack.spec, run.encoder)
+    method.prepare(torch.from_numpy(rows))
+    method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _try(method, run, pack)
     optimiser = build_optimiser(run.optim, method)
     num_steps, start = run.num_steps(len(rows)), 0
@@ -144,6 +142,19 @@ def describe(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"{device.type}, {torch.get_num_threads()} threads"
+
+
+def training_rows(run: Run, pack: Pack) -> np.ndarray:
+    """Pack rows to pre-train on; a method that learns from labels sees only rows that carry one it needs."""
+    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)  # a pair with a hole in it is no pair
+    tasks = run.method.labels_needed(pack.spec)
+    if not tasks:
+        return rows
+    labels = {task: pack.labels(task)[rows] >= 0 for task in tasks}
+    for task, there in labels.items():
+        if not there.any():
+            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    return rows[np.logical_or.reduce(list(labels.values()))]
 
 
 def mix(*numbers: int) -> int:
