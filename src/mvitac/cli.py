@@ -23,6 +23,7 @@ what the features are worth.
   probe RUN...         linear probes beside their controls
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
+  export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
 
 First steps:
   mvitac demo                                        # no data needed
@@ -41,6 +42,7 @@ COMMANDS = {
     "probe": "learn:probe",
     "report": "learn:report",
     "publish": "robot:publish",
+    "export": "robot:export",
 }
 """Command -> module of ``commands``:function, imported when called."""
 
