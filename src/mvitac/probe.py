@@ -108,10 +108,22 @@ def borders(pack: Pack, modality: str, rows: np.ndarray, side: int = 16, width: 
 # -- probes -----------------------------------------------------------------------------------------------------------
 
 
-def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray) -> tuple[Any, float]:
+@dataclass(frozen=True)
+class Logistic:
+    """A fitted logistic regression on (z - mean) / std; called, it gives probabilities in ascending label order."""
+
+    model: LogisticRegression
+    mean: np.ndarray
+    std: np.ndarray
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return self.model.predict_proba((z - self.mean) / self.std)
+
+
+def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray) -> tuple[Logistic, float]:
     """Logistic regression on standardised features; C is the best on val, then train and val are fitted together.
 
-    Returns a function from features to class probabilities in ascending label order, and C.
+    Returns it and C.
     """
     mean, std = x.mean(0), x.std(0) + 1e-6
     x, x_val = (x - mean) / std, (x_val - mean) / std
@@ -125,7 +137,7 @@ def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarra
         if set(y_val) - set(y):  # a class only seen in val changes the shape of the weights
             model = LogisticRegression(max_iter=300, tol=1e-3)
         model.set_params(C=c).fit(np.concatenate([x, x_val]), np.concatenate([y, y_val]))
-    return lambda z: model.predict_proba((z - mean) / std), c
+    return Logistic(model, mean, std), c
 
 
 def fit_paper(x: np.ndarray, y: np.ndarray, num_classes: int, seed: int) -> Any:
