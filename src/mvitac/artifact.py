@@ -70,7 +70,7 @@ def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]
         "colour_order": "RGB",
         "channels": {m: model.spec.channels(m) for m in model.encoders},
         "stored": model.stored,
-        "size": model.run.augment.size,
+        "size": model.run.augment.seen,
         "resize": "squash to stored (Pillow bilinear), then to size (antialiased bilinear)",
         "mean": list(IMAGENET_MEAN),
         "std": list(IMAGENET_STD),

@@ -281,7 +281,7 @@ def explain(model: Model, modality: str, found: dict[str, np.ndarray], pack: Pac
     """The preprocessing under which the trained model gives what the export gave, if it is a common slip."""
     raw = torch.from_numpy(pack.images[modality][rows[:8]]).permute(0, 3, 1, 2)
     swapped = raw.unflatten(1, (-1, 3)).flip(2).flatten(1, 2)
-    size = (model.run.augment.size,) * 2
+    size = (model.run.augment.seen,) * 2
     unit = torch.nn.functional.interpolate(raw, size, mode="bilinear", antialias=True).float() / 255
     mean, std = (torch.tensor(v * (raw.shape[1] // 3)).view(-1, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
     with torch.no_grad():

@@ -43,7 +43,7 @@ class Graph(nn.Module):
         )
         # Antialiased bilinear resizing is linear along each axis: one matrix [size, S], read off the identity, in the
         # 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel comes out the same.
-        size, stored = model.run.augment.size, model.stored
+        size, stored = model.run.augment.seen, model.stored
         eye = torch.eye(stored)[None, None]
         rows = F.interpolate(eye, (size, stored), mode="bilinear", antialias=True)[0, 0]
         step = 2.0 ** max(p for p in range(24) if (rows.max() * 2**p).round() < 2**15)

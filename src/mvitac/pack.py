@@ -184,19 +184,6 @@ class Pack:
             mask &= self.column(name).astype(str) == value
         return np.flatnonzero(mask)
 
-    def labels(self, task: str) -> np.ndarray:
-        """[N] int64 labels of the task, -1 where there is none or where the row is not one the task is about."""
-        return self._labels[task]
-
-    @functools.cached_property
-    def _labels(self) -> dict[str, np.ndarray]:
-        found = {}
-        for task in self.spec.tasks:
-            found[task.name] = self.column(f"label_{task.name}").astype(np.int64)
-            for name, value in task.only.items():
-                found[task.name][self.column(name).astype(str) != value] = -1
-        return found
-
     @functools.cached_property
     def touch_groups(self) -> np.ndarray:
         """[N] int64: number of each row's touch group (column touch_group, else group), in which rows are near-copies."""
