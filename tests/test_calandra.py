@@ -28,6 +28,7 @@ from mvitac.datasets.calandra import (
     owners_shuffle,
 )
 from mvitac.datasets.packed import PackConfig
+from mvitac.feed import Feed
 from mvitac.pack import Pack, build
 from mvitac.probe import Session, parts, probe_runs
 from mvitac.recipes import recipe
@@ -410,5 +411,6 @@ def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
     run = recipe("smoke", PackConfig(path=pack.path))
     rows = pack.rows("train")
     run = replace(run, augment=replace(run.augment, size=16))
-    views = make_views(run, pack, rows, 1, torch.Generator(), torch.device("cpu"))
+    cpu = torch.device("cpu")
+    views = make_views(run, pack, rows, 1, torch.Generator(), cpu, Feed(pack, cpu))
     assert np.array_equal(views.labels["success"].numpy() >= 0, about[rows])
