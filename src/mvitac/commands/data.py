@@ -130,3 +130,29 @@ def info(argv: list[str]) -> None:
     console = Console()
     console.print(table)
     console.print(f"source {pack.spec.source}; licence {pack.spec.licence}", soft_wrap=True, highlight=False)
+
+
+def export_lerobot(argv: list[str]) -> None:
+    """mvitac data export-lerobot PACK --out DIR [--fps 10]"""
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    from mvitac.datasets.lerobot_out import write_lerobot
+    from mvitac.pack import Pack
+
+    @dataclass(frozen=True)
+    class Options:
+        """A pack as a LeRobotDataset v3: images as they are (PNG), one episode per touch group."""
+
+        pack: Positional[Path]
+        """Folder of the pack."""
+        out: Path
+        """Folder of the new dataset."""
+        fps: int = 10
+        """Nominal rate of the rows of an episode: a pack knows no time."""
+
+    options = parse(Options, argv, "data export-lerobot")
+    pack = Pack(options.pack)
+    num = write_lerobot(pack, options.out, fps=options.fps)
+    left = f"; {pack.num - num} rows that lack a modality left out" * (num < pack.num)
+    Console().print(f"{options.out}: {num} frames{left}", soft_wrap=True, highlight=False)

@@ -1,6 +1,29 @@
 """Datasets, one file each; importing this package registers them. No torch here: packing workers import it."""
 
-from mvitac.datasets import folder, packed, physiclear, simulated, slip_grasp, slip_gsmini, vt60
+from mvitac.datasets import (
+    folder,
+    hub,
+    lerobot,
+    packed,
+    physiclear,
+    simulated,
+    slip_grasp,
+    slip_gsmini,
+    vt60,
+    webdataset,
+)
 from mvitac.datasets.base import DatasetConfig
 
-__all__ = ["DatasetConfig", "folder", "packed", "physiclear", "simulated", "slip_grasp", "slip_gsmini", "vt60"]
+__all__ = [
+    "DatasetConfig",
+    "folder",
+    "hub",
+    "lerobot",
+    "packed",
+    "physiclear",
+    "simulated",
+    "slip_grasp",
+    "slip_gsmini",
+    "vt60",
+    "webdataset",
+]
