@@ -132,6 +132,58 @@ def info(argv: list[str]) -> None:
     console.print(f"source {pack.spec.source}; licence {pack.spec.licence}", soft_wrap=True, highlight=False)
 
 
+def show(argv: list[str]) -> None:
+    """mvitac data show PACK [--by TASK|COLUMN] [--out FILE.png|FILE.html]"""
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    @dataclass(frozen=True)
+    class Options:
+        """A few pairs of every class or object, for a person to judge."""
+
+        pack: Positional[Path]
+        """Folder of the pack."""
+        by: str = ""
+        """Task or table column, one strip per value; default: the first task, else the group."""
+        split: str = ""
+        """Show rows of train, val, test or unlabelled only."""
+        num: int = 6
+        """Pairs per strip, of different groups where there are so many."""
+        limit: int = 40
+        """Strips at most."""
+        side: int = 96
+        """Height of a picture in pixels."""
+        seed: int = 0
+        """Another number is another draw."""
+        out: Path | None = None
+        """A .png or an .html; default: <pack's name>.png here."""
+
+    options = parse(Options, argv, "data show")
+    out = options.out or Path(f"{options.pack.resolve().name}.png")
+    if out.suffix.lower() not in (".png", ".html"):
+        raise ValueError(f"--out {out}: give a name that ends in .png or .html")
+    if not 16 <= options.side <= 1024:
+        raise ValueError(f"--side {options.side}: give 16 to 1024 pixels")
+    if options.seed < 0:
+        raise ValueError(f"--seed {options.seed}: give a number >= 0")
+    from mvitac import sheet
+    from mvitac.pack import Pack
+    from mvitac.record import check_place, write_atomic
+
+    check_place(out)
+    pack = Pack(options.pack)
+    found, num_all = sheet.strips(
+        pack, options.by, split=options.split, num=options.num, limit=options.limit, seed=options.seed
+    )
+    if out.suffix.lower() == ".html":
+        text = sheet.to_html(pack, found, num_all, side=options.side)
+        write_atomic(out, lambda file: file.write(text.encode()))
+    else:
+        picture = sheet.to_image(pack, found, num_all, side=options.side)
+        write_atomic(out, lambda file: picture.save(file, "PNG"))
+    Console().print(f"{out}: {len(found)} of {num_all} strips", soft_wrap=True, highlight=False)
+
+
 def export_lerobot(argv: list[str]) -> None:
     """mvitac data export-lerobot PACK --out DIR [--fps 10]"""
     from rich.console import Console
