@@ -16,16 +16,16 @@ from mvitac.pack import Pack, Sample, build
 
 
 def test_strips_hold_their_class_and_spread_over_groups(pack: Pack) -> None:
-    found, num_all = sheet.strips(pack, num=6)
+    found, num_all = sheet.strips(pack, num=20)
     assert [strip.name for strip in found] == ["columns", "rows", "checks"]
     assert num_all == 3
     for label, strip in enumerate(found):
         assert (pack.column("label_pattern")[strip.rows] == label).all()
-        assert len(set(pack.column("group")[strip.rows])) == 6
+        assert len(set(pack.column("group")[strip.rows])) == 20
         assert strip.num_rows == 40 and strip.num_groups == 20
-    again = sheet.strips(pack, num=6)[0]
+    again = sheet.strips(pack, num=20)[0]
     assert all((a.rows == b.rows).all() for a, b in zip(found, again, strict=True))
-    assert any((a.rows != b.rows).any() for a, b in zip(found, sheet.strips(pack, num=6, seed=1)[0], strict=True))
+    assert any((a.rows != b.rows).any() for a, b in zip(found, sheet.strips(pack, num=20, seed=1)[0], strict=True))
 
 
 def test_strips_by_column_and_split(pack: Pack) -> None:

@@ -20,7 +20,7 @@ what the features are worth.
   data info PACK       what is in a pack
   data sheet KIND      a picture of what the simulator makes
   data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
-  data export-lerobot PACK   write a pack as a LeRobotDataset v3
+  data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes beside their controls
   report RUN...        one HTML page with curves, tables and pictures

@@ -129,6 +129,10 @@ def info(argv: list[str]) -> None:
         table.add_row(split, str(len(rows)), str(len(set(pack.column("group")[rows]))), *cells)
     console = Console()
     console.print(table)
+    if len(gaps := [m for m in pack.spec.modalities if not pack.has(m).all()]):
+        whole = int(np.logical_and.reduce([pack.has(m) for m in pack.spec.modalities]).sum())
+        lacking = ", ".join(f"{int((~pack.has(m)).sum())} rows without {m}" for m in gaps)
+        console.print(f"{lacking}; {whole} whole pairs", soft_wrap=True, highlight=False)
     console.print(f"source {pack.spec.source}; licence {pack.spec.licence}", soft_wrap=True, highlight=False)
 
 
