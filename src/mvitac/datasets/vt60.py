@@ -1,4 +1,4 @@
-"""``--data vt60``: ten categories of things, photographed and touched by a TacTip, by Corradi et al. (2017).
+"""``--data vt60``: ten categories of things, photographed and touched by a TacTip, by Corradi et al.
 
 As ``git clone https://github.com/Exhor/deep_visuotactile_classification`` brings it, 640 x 480:
 
