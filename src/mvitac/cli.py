@@ -19,6 +19,8 @@ what the features are worth.
   data pack            read any dataset (--data NAME) into a pack
   data info PACK       what is in a pack
   data sheet KIND      a picture of what the simulator makes
+  data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
+  data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes beside their controls
   report RUN...        one HTML page with curves, tables and pictures
@@ -38,6 +40,8 @@ COMMANDS = {
     "data pack": "data:pack",
     "data info": "data:info",
     "data sheet": "data:sheet",
+    "data show": "data:show",
+    "data export-lerobot": "data:export_lerobot",
     "pretrain": "learn:pretrain",
     "probe": "learn:probe",
     "report": "learn:report",

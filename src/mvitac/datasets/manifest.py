@@ -46,6 +46,12 @@ class Manifest:
     labels: tuple[str, ...] = ()
     """Columns that are labels unless others are asked for."""
 
+    @classmethod
+    def of(cls, root: Path, rows: list[dict[str, str]], found: dict[str, list[Place | None]] | None = None) -> Manifest:
+        """The table of ``rows`` that a reader made of what lies below ``root``."""
+        columns = tuple(dict.fromkeys(name for row in rows for name in row))
+        return cls(root, root, columns, rows, digest(rows), found or {})
+
     def check(self, column: str) -> None:
         if column not in self.columns and column not in self.found:
             raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
@@ -94,6 +100,15 @@ def number_of(text: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
+    """The folder ``inside`` a clone of ``url`` at ``path`` (or itself) that holds ``pattern``; else ValueError."""
+    for root in (path / inside, path):
+        if next(root.glob(pattern), None) is not None:
+            return root
+    lacks = f"holds no {inside}/{pattern}" if path.is_dir() else "does not exist"
+    raise ValueError(f"{path} {lacks}: git clone {url}, and give the clone as path")
 
 
 def find_manifest(path: Path) -> Path | None:

@@ -84,3 +84,22 @@ def check_sides(
                     "more groups or another share are needed" if split == BY_GROUP else "a probe needs train and test"
                 )
                 raise ValueError(f"{where}: {what} gives label {task.name!r} no labelled rows in {side}: {hint}")
+
+
+def folds(groups: Sequence[str], strata: Sequence[str], num: int, val_every: int = 2) -> dict[str, list[str]]:
+    """Columns fold1 ... fold<num> with a split per row: every group is test in one of them.
+
+    Groups are dealt in turn, stratum by stratum, so that each fold has its share of every stratum; of the next fold's
+    groups every ``val_every``-th is val.
+    """
+    home = dict(zip(reversed(groups), reversed(strata), strict=True))
+    shuffled = np.random.default_rng(0).permutation(sorted(home)).tolist()
+    order = {name: i for i, name in enumerate(sorted(shuffled, key=lambda name: home[name]))}  # stable: still shuffled
+    columns: dict[str, list[str]] = {}
+    for fold in range(num):
+        sides = {}
+        for name, place in order.items():
+            away = (place % num - fold) % num
+            sides[name] = "test" if away == 0 else "val" if away == 1 and place // num % val_every == 0 else "train"
+        columns[f"fold{fold + 1}"] = [sides[group] for group in groups]
+    return columns
