@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 from collections import Counter
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from mvitac.cli import main
 from mvitac.datasets.calandra import (
     AUTHORS_TEST,
     AUTHORS_TRAIN,
@@ -412,3 +414,19 @@ def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
     run = replace(run, augment=replace(run.augment, size=16))
     views = make_views(run, pack, rows, 1, torch.Generator(), torch.device("cpu"))
     assert np.array_equal(views.labels["success"].numpy() >= 0, about[rows])
+
+
+def test_the_doctor_compares_with_the_published_lists(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two of 38 shards, one grasp damaged: told as what they are, with the shards that are missing."""
+    shutil.copytree(folder, tmp_path / "d")
+    with h5py.File(tmp_path / "d" / "calandra_corl2017_000.h5", "a") as file:
+        del file["data/i3"].attrs["is_gripping"]
+    command = ["data", "check", "--data", "calandra", "--path", str(tmp_path / "d"), "--workers", "1", "--quiet"]
+    assert main([*command, "--json", str(tmp_path / "told.json")]) == 2
+    told = {f["item"]: f for f in json.loads((tmp_path / "told.json").read_text())["findings"]}
+    assert told["published: shards"]["evidence"].startswith("2 found, 38 published; missing 001 003 004")
+    assert told["published: grasps that can be read"]["evidence"] == "25 found, 9296 published"
+    assert "calandra_corl2017_000.h5 i3: attribute is_gripping" in told["unreadable items"]["evidence"]
+    assert "touch_size: 32 x 24" in told["sensors and resolutions"]["evidence"]

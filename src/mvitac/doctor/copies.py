@@ -1,19 +1,22 @@
-"""Copies across splits: identical pixels, and near-copies by the correlation of what differs from the usual picture."""
+"""Copies across splits: identical pixels, and near-copies by the correlation of what is not in every picture."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from mvitac.doctor.finding import Finding, share
 from mvitac.doctor.looks import Looks
 from mvitac.doctor.tables import sides_of
 from mvitac.pack import Pack
 
-NEAR = 0.985
+NEAR = 0.975
 """Correlation of two residual thumbnails from which they count as near-copies."""
 FAINT = 2.0
 """Standard deviation in grey levels below which a residual shows nothing but noise and is not compared."""
-MAX_ASKED, MAX_SEARCHED = 2000, 60_000
+BLUR = 5
+"""Side in thumbnail pixels of the blur that is taken off."""
+MAX_ASKED, MAX_SEARCHED = 2000, 40_000
 
 
 def exact_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
@@ -45,9 +48,10 @@ def exact_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
 def near_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
     """Rows of test and val that nearly repeat a row of another side.
 
-    A thumbnail's brightness minus the median thumbnail of its sensor is what sets it apart (a gel's background, a fixed
-    camera's scene are the same everywhere and say nothing); two of these that correlate above ``NEAR`` show the same
-    thing. The share that does so between *groups inside train* says how much of it is the nature of the data.
+    A thumbnail's brightness minus the median thumbnail of its sensor (a gel's background, a fixed camera's scene) minus
+    its own blur (lamps that drift) is what sets it apart; two of these that correlate above ``NEAR`` show the same
+    thing. The share that does so between *groups inside train* says how much of it is the nature of the data, such as
+    frames without contact.
     """
     sides = sides_of(pack.column("split").astype(str))
     sensors = pack.column("sensor").astype(str) if "sensor" in pack.table.column_names else np.full(pack.num, "")
@@ -85,11 +89,13 @@ def near_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
 
 
 def residuals(one: Looks, sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors [N, S * S] of what sets each thumbnail apart, and which of them [N] show more than noise."""
-    light = one.light.reshape(len(one.thumbs), -1)
+    """Unit vectors [N, F * F] of what sets each thumbnail apart, and which of them [N] show more than noise."""
+    light = one.fine.astype(np.float32)
     for sensor in np.unique(sensors):
         mine = sensors == sensor
         light[mine] -= np.median(light[mine][_some(np.arange(int(mine.sum())), 2000)], axis=0)
+    light -= uniform_filter1d(uniform_filter1d(light, BLUR, axis=1), BLUR, axis=2)
+    light = light.reshape(len(light), -1)
     light -= light.mean(axis=1, keepdims=True)
     clear = light.std(axis=1) > FAINT
     return light / np.maximum(np.linalg.norm(light, axis=1, keepdims=True), 1e-6), clear

@@ -69,6 +69,7 @@ def examine(pack: Pack, counts: list[Count] | None = None) -> list[Finding]:
         copies.exact_copies(pack, looks),
         copies.near_copies(pack, looks),
         tables.numbers(pack),
+        tables.give_aways(pack),
     ]
 
 

@@ -110,15 +110,15 @@ def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def leaks(pack: Pack) -> list[Finding]:
-    """Groups, touch groups and other keys that lie on two sides, for every split column."""
-    findings = []
+    """Groups, touch groups and other keys that lie on two sides, for every split column; sound folds are one finding."""
+    findings, sound = [], []
     names = [n for n in ("group", "touch_group", *KEYS) if n in pack.table.column_names]
     for split, sides in split_columns(pack):
         verdict: Verdict = "ok"
         notes, rows = [], []
         for name in names:
             values = pack.column(name).astype(str)
-            on = {side: set(values[sides == side]) for side in np.unique(sides)}
+            on = {side: set(values[sides == side].tolist()) for side in np.unique(sides)}
             both = sorted({v for a in on for b in on if a < b for v in on[a] & on[b]})
             if both:
                 verdict = "broken" if name in ("group", "touch_group") else "look" if verdict == "ok" else verdict
@@ -129,6 +129,9 @@ def leaks(pack: Pack) -> list[Finding]:
                 for one in both[:4]:  # a row from each side, next to each other on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(mine[sides[mine] == side][0]) for side in np.unique(sides[mine])]
+        if split != "split" and not notes:
+            sound.append(split)
+            continue
         findings.append(
             Finding(
                 item="groups across splits" if split == "split" else f"groups across column {split}",
@@ -139,6 +142,9 @@ def leaks(pack: Pack) -> list[Finding]:
                 rows=tuple(rows),
             )
         )
+    if sound:
+        evidence = f"{some(sound, 8)}: none of {', '.join(names)} lies on two sides"
+        findings.append(Finding(item="groups across split columns", verdict="ok", evidence=evidence))
     return findings
 
 
@@ -160,7 +166,7 @@ def mixture(pack: Pack) -> Finding:
         notes.append(f"{column}: {some([f'{names[i]} {100 * counts[i] / pack.num:.0f} %' for i in order], 4)}")
         if column.endswith("_size"):
             verdict = "look"
-        on = {split: set(values[pack.rows(split)]) for split in ("train", "test")}
+        on = {split: set(values[pack.rows(split)].tolist()) for split in ("train", "test")}
         if alone := sorted(on["test"] - on["train"]):
             verdict = "look"
             notes.append(f"{column} {some(alone)} only in test")
@@ -190,14 +196,8 @@ def mixture(pack: Pack) -> Finding:
 def numbers(pack: Pack) -> Finding:
     """Columns of numbers with gaps, infinities or values far outside the others'."""
     notes, rows, seen = [], [], 0
-    for name in pack.table.column_names:
-        values = pack.column(name)
-        if values.dtype.kind == "O":
-            values = _parsed(values)
-        if values is None or values.dtype.kind not in "fiu" or name.startswith(("label_", "crc_")):
-            continue
+    for name, values in numeric_columns(pack):
         seen += 1
-        values = values.astype(float)
         bad = ~np.isfinite(values)
         if bad.any() and not bad.all():
             notes.append(
@@ -222,6 +222,55 @@ def numbers(pack: Pack) -> Finding:
         advice="repair the cells, or leave the rows out" if notes else "",
         rows=tuple(rows),
     )
+
+
+def give_aways(pack: Pack) -> Finding:
+    """Columns of numbers that alone tell a label: confounds that a control probe should have.
+
+    In the labelled rows outside test: the best answer in each eighth of the values, against always the same answer. A
+    column that holds the label itself (every value one class) says nothing.
+    """
+    notes = []
+    for task in pack.spec.tasks:
+        rows = pack.rows("train", "val", only=task.only)
+        labels = pack.column(f"label_{task.name}").astype(int)[rows]
+        rows, labels = rows[labels >= 0], labels[labels >= 0]
+        if len(rows) < 64:
+            continue
+        majority = np.bincount(labels).max() / len(labels)
+        for name, values in numeric_columns(pack):
+            mine = values[rows]
+            if not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
+                continue
+            part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
+            told = sum(np.bincount(labels[part == one]).max() for one in np.unique(part)) / len(labels)
+            if told > majority + 0.1:
+                notes.append(f"{name} tells {task.name} to {100 * told:.0f} % (majority {100 * majority:.0f} %)")
+    advice = "put them beside every score as a control (--data.controls name=column)" if notes else ""
+    return Finding(
+        item="columns that give a label away",
+        verdict="look" if notes else "ok",
+        evidence="; ".join(notes) or "no column of numbers does",
+        advice=advice,
+    )
+
+
+def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
+    """Whether the values are few and each goes with one label only: the label itself, or a name for it."""
+    names, numbers = np.unique(values, return_inverse=True)
+    return len(names) <= 2 * len(np.unique(labels)) and all(
+        len(set(labels[numbers == i])) == 1 for i in range(len(names))
+    )
+
+
+def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, labels and sums."""
+    for name in pack.table.column_names:
+        values = pack.column(name)
+        values = _parsed(values) if values.dtype.kind == "O" else values
+        counted = name != "id" and not name.startswith(("label_", "crc_"))
+        if counted and values is not None and values.dtype.kind in "fiub":
+            yield name, values.astype(float)
 
 
 def _parsed(values: np.ndarray) -> np.ndarray | None:
