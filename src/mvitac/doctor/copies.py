@@ -11,7 +11,9 @@ from mvitac.doctor.tables import sides_of
 from mvitac.pack import Pack
 
 NEAR = 0.975
-"""Correlation of two residual thumbnails from which they count as near-copies."""
+"""Correlation of two residual thumbnails from which they count as near-copies, whatever the data."""
+NEAR_AT_LEAST = 0.85
+"""The same for data whose groups are much less alike than that."""
 FAINT = 2.0
 """Standard deviation in grey levels below which a residual shows nothing but noise and is not compared."""
 BLUR = 5
@@ -50,11 +52,12 @@ def near_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
 
     A thumbnail's brightness minus the median thumbnail of its sensor (a gel's background, a fixed camera's scene) minus
     its own blur (lamps that drift) is what sets it apart; two of these that correlate above ``NEAR`` show the same
-    thing. The share that does so between *groups inside train* says how much of it is the nature of the data, such as
-    frames without contact.
+    thing. The bar lies halfway between 1 and the most alike rows of two *groups inside train*; the share of those that
+    reach it as well says how much is the nature of the data, such as frames without contact.
     """
     sides = sides_of(pack.column("split").astype(str))
     sensors = pack.column("sensor").astype(str) if "sensor" in pack.table.column_names else np.full(pack.num, "")
+    groups = pack.column("group").astype(str)
     notes, rows, worst = [], [], False
     for name, one in looks.items():
         unit, clear = residuals(one, sensors)
@@ -65,10 +68,10 @@ def near_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
             notes.append(f"{name}: too faint to compare")
             continue
         best, value = _nearest(unit, asked, bank)
-        hit = (value >= NEAR) & (exact[asked] != exact[bank[best]])
-        natural = _some(bank, 500)
-        _, value_in = _nearest(unit, natural, bank, apart=pack.column("group").astype(str))
-        base = float((value_in >= NEAR).mean())
+        _, natural = _nearest(unit, _some(bank, 500), bank, apart=groups)
+        near = float(np.clip((1 + natural.max()) / 2, NEAR_AT_LEAST, NEAR)) if natural.max() > -1 else NEAR
+        base = float((natural >= near).mean())
+        hit = (value >= near) & (exact[asked] != exact[bank[best]])
         notes.append(
             f"{name}: {share(int(hit.sum()), len(asked))} of held-out rows nearly repeat one of train"
             f" ({100 * base:.1f} % between groups of train)"

@@ -228,9 +228,10 @@ def give_aways(pack: Pack) -> Finding:
     """Columns of numbers that alone tell a label: confounds that a control probe should have.
 
     In the labelled rows outside test: the best answer in each eighth of the values, against always the same answer. A
-    column that holds the label itself (every value one class) says nothing.
+    column that holds the label itself (every value one class) says nothing, and one that is a control is known.
     """
     notes = []
+    known = {column for columns in pack.spec.controls.values() for column in columns}
     for task in pack.spec.tasks:
         rows = pack.rows("train", "val", only=task.only)
         labels = pack.column(f"label_{task.name}").astype(int)[rows]
@@ -239,6 +240,8 @@ def give_aways(pack: Pack) -> Finding:
             continue
         majority = np.bincount(labels).max() / len(labels)
         for name, values in numeric_columns(pack):
+            if name in known:
+                continue
             mine = values[rows]
             if not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
                 continue
