@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 from collections import Counter
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from mvitac.cli import main
 from mvitac.datasets.calandra import (
     AUTHORS_TEST,
     AUTHORS_TRAIN,
@@ -172,7 +174,7 @@ def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:
 
 
 def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
-    """A missing attribute, a missing image, a chunk that no longer inflates, and a wrong outcome: four reasons."""
+    """A missing attribute, a missing image, a chunk that no longer inflates, a wrong outcome: four items, four reasons."""
     objects: list[bytes | None] = [b"lemon", None, b"lime", b"potato", b"onion", b"soft_zebra", b"lemon", b"metal_can"]
     path = write_shard(tmp_path, 0, objects)
     with h5py.File(path, "a") as file:
@@ -370,7 +372,7 @@ def test_after_has_no_label(leaking: Path, tmp_path: Path) -> None:
 
 
 def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leaking: Path, tmp_path: Path) -> None:
-    """Same pre-training, same probes: what 'during' does not show is at chance, what 'after' shows is not."""
+    """The same road on both packs: what 'during' does not show is at chance, what 'after' shows is not."""
     shown = {}
     for ask in (("during",), ("after",)):
         pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)
@@ -414,3 +416,19 @@ def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
     cpu = torch.device("cpu")
     views = make_views(run, pack, rows, 1, torch.Generator(), cpu, Feed(pack, cpu))
     assert np.array_equal(views.labels["success"].numpy() >= 0, about[rows])
+
+
+def test_the_doctor_compares_with_the_published_lists(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two of 38 shards, one grasp damaged: told as what they are, with the shards that are missing."""
+    shutil.copytree(folder, tmp_path / "d")
+    with h5py.File(tmp_path / "d" / "calandra_corl2017_000.h5", "a") as file:
+        del file["data/i3"].attrs["is_gripping"]
+    command = ["data", "check", "--data", "calandra", "--path", str(tmp_path / "d"), "--workers", "1", "--quiet"]
+    assert main([*command, "--json", str(tmp_path / "told.json")]) == 2
+    told = {f["item"]: f for f in json.loads((tmp_path / "told.json").read_text())["findings"]}
+    assert told["published: shards"]["evidence"].startswith("2 found, 38 published; missing 001 003 004")
+    assert told["published: grasps that can be read"]["evidence"] == "25 found, 9296 published"
+    assert "calandra_corl2017_000.h5 i3: attribute is_gripping" in told["unreadable items"]["evidence"]
+    assert "touch_size: 32 x 24" in told["sensors and resolutions"]["evidence"]

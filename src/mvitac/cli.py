@@ -18,6 +18,7 @@ what the features are worth.
   data simulate KIND   simulate materials or grasps into a pack
   data pack            read any dataset (--data NAME) into a pack
   data info PACK       what is in a pack
+  data check PACK      what is wrong with a pack, or with --data NAME (doctor)
   data sheet KIND      a picture of what the simulator makes
   data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
   data export-lerobot  write a PACK as a LeRobotDataset v3
@@ -39,6 +40,7 @@ COMMANDS = {
     "data simulate": "data:simulate",
     "data pack": "data:pack",
     "data info": "data:info",
+    "data check": "check:check",
     "data sheet": "data:sheet",
     "data show": "data:show",
     "data export-lerobot": "data:export_lerobot",
@@ -75,8 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             raise unknown("command", name, COMMANDS)
         module, function = COMMANDS[name].split(":")
-        getattr(importlib.import_module(f"mvitac.commands.{module}"), function)(rest)
-        return 0
+        return getattr(importlib.import_module(f"mvitac.commands.{module}"), function)(rest) or 0
     except KeyboardInterrupt:
         return 130
     except (ValueError, OSError, MemoryError) as error:

@@ -1,7 +1,7 @@
 """The pack: what any dataset becomes on disk, read once, then memory-mapped by every run.
 
     <pack>/pack.json         format, counts, digests, spec, source, licence, versions
-           samples.parquet   one row per sample: id, group, split, label_<task>, sensor, ... (row i <-> image i)
+           samples.parquet   one row per sample: id, group, split, label_<task>, sensor, ..., crc_<modality>
                              has_vision, has_touch (bool) where some rows lack an image; zeros stand for it
            vision.npy        uint8 [N, size, size, 3]      absent where the dataset has no camera
            touch.npy         uint8 [N, size, size, 3 or 6]
@@ -20,6 +20,7 @@ import multiprocessing
 import os
 import shutil
 import warnings
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -130,7 +131,10 @@ class Pack:
         self.images: dict[str, np.ndarray] = {m: self._map(m) for m in self.spec.modalities}
         for name, expected in self.digests.items():
             if (verify or name == "samples.parquet") and digest_file(self._file(name)) != expected:
-                raise ValueError(f"{self.path / name} does not match its digest: the pack is damaged, make it again")
+                where = "" if name == "samples.parquet" else self._damaged_rows(name.removesuffix(".npy"))
+                raise ValueError(
+                    f"{self.path / name} does not match its digest{where}: the pack is damaged, make it again"
+                )
         try:
             self.table: pa.Table = pq.read_table(self._file("samples.parquet"))
         except Exception as error:  # arrow raises several kinds for a damaged file
@@ -198,6 +202,18 @@ class Pack:
     def rows_of(self, touch_group: int) -> np.ndarray:
         """Ascending row numbers of touch group number ``touch_group``."""
         return self._rows_by_touch_group[touch_group]
+
+    def _damaged_rows(self, modality: str) -> str:
+        """Which rows of a damaged image file do not match their own sums, for the error; "" if that cannot be said."""
+        file = self._file("samples.parquet")
+        if digest_file(file) != self.digests["samples.parquet"] or f"crc_{modality}" not in pq.read_schema(file).names:
+            return ""
+        table = pq.read_table(file, columns=["id", f"crc_{modality}"])
+        sums = table.column(f"crc_{modality}").to_pylist()
+        rows = [i for i, image in enumerate(self.images[modality]) if zlib.crc32(image) != sums[i]]
+        if not rows:
+            return " in its header"
+        return f" in {len(rows)} of {self.num} rows, first row {rows[0]} (id {table.column('id')[rows[0]].as_py()!r})"
 
     def _file(self, name: str) -> Path:
         path = self.path / name
@@ -467,6 +483,7 @@ def _finish(
     shutil.rmtree(joined, ignore_errors=True)
     joined.mkdir()
     size = int(request["size"])
+    sums: dict[str, list[int]] = {m: [] for m in spec.modalities}  # so that damage can be told by row
     for modality in spec.modalities:
         shape = (len(columns), size, size, spec.channels(modality))
         target = joined / f"{modality}.npy"
@@ -475,9 +492,15 @@ def _finish(
             np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
             for path in paths:
                 with np.load(path, allow_pickle=False) as part:
-                    file.write(np.ascontiguousarray(part[modality]).data)
+                    images = np.ascontiguousarray(part[modality])
+                file.write(images.data)
+                sums[modality] += [zlib.crc32(image) for image in images]
     buffer = io.BytesIO()
     table = _table(columns)
+    for modality in spec.modalities:
+        name = f"crc_{modality}"
+        table = table.drop_columns(name) if name in table.column_names else table  # a manifest made of another pack
+        table = table.append_column(name, pa.array(sums[modality], pa.uint32()))
     _check_table(table, spec)
     pq.write_table(table, buffer)
     write_atomic(joined / "samples.parquet", lambda file: file.write(buffer.getvalue()))

@@ -1,0 +1,43 @@
+"""What one check found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+Verdict = Literal["ok", "look", "broken", "not checkable"]
+MAX_ROWS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One item of the examination."""
+
+    item: str
+    verdict: Verdict
+    evidence: str
+    """One line: what was measured."""
+    advice: str = ""
+    """What to do, unless all is well."""
+    rows: tuple[int, ...] = ()
+    """Suspicious pack rows for the sheet, at most ``MAX_ROWS``."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rows", tuple(int(row) for row in self.rows[:MAX_ROWS]))
+
+
+def exit_code(findings: Iterable[Finding]) -> int:
+    """0 all is well, 1 somebody should look, 2 something is broken."""
+    return max(({"broken": 2, "look": 1}.get(finding.verdict, 0) for finding in findings), default=0)
+
+
+def some(names: Sequence[object], num: int = 3) -> str:
+    """The first few of ``names``, and how many more there are."""
+    shown = ", ".join(str(name) for name in names[:num])
+    return shown + (f" and {len(names) - num} more" if len(names) > num else "")
+
+
+def share(part: int, whole: int) -> str:
+    """'12 of 340 (3.5 %)'."""
+    return f"{part} of {whole} ({100 * part / max(1, whole):.1f} %)"

@@ -1,0 +1,106 @@
+"""The whole examination, of a pack or of a source that is packed as thumbnails for it."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvitac.doctor import copies, pictures, tables
+from mvitac.doctor.finding import Finding
+from mvitac.doctor.looks import look_at
+from mvitac.doctor.sheet import Strips, strips_of
+from mvitac.pack import Count, Pack, Sample, Source, build
+from mvitac.spec import DataSpec
+
+
+class Glance(Source):
+    """Every k-th item of another source, with the size of the images as they came in columns of their own."""
+
+    def __init__(self, source: Source, num: int) -> None:
+        self.source = source
+        items = source.items()
+        chosen = np.arange(len(items)) if not num else np.linspace(0, len(items) - 1, min(num, len(items))).astype(int)
+        self._chosen: list[int] = chosen.tolist()
+        self._items = [items[i] for i in self._chosen]
+
+    def spec(self) -> DataSpec:
+        return self.source.spec()
+
+    def items(self) -> list[str]:
+        return self._items
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"glance": self._chosen, **self.source.fingerprint()}
+
+    def num_samples(self) -> int:
+        return -(-self.source.num_samples() * len(self._items) // max(1, len(self.source.items())))
+
+    def expected(self) -> list[Count]:
+        return self.source.expected()
+
+    def read(self, item: int) -> list[Sample]:
+        samples = []
+        for sample in self.source.read(self._chosen[item]):
+            given = {"vision": sample.vision, "touch": sample.touch}
+            sizes = {f"{m}_size": f"{i.shape[1]} x {i.shape[0]}" for m, i in given.items() if i is not None}
+            samples.append(replace(sample, columns={**sample.columns, **sizes}))
+        return samples
+
+
+def examine(pack: Pack, counts: list[Count] | None = None) -> list[Finding]:
+    """Every check of ``pack``; ``counts`` are what its source says of the owners' lists."""
+    looks = look_at(pack)
+    return [
+        *tables.published(counts or []),
+        tables.unreadable(pack),
+        pictures.constant_frames(pack, looks),
+        pictures.grayscale_mix(pack, looks),
+        pictures.red_and_blue(pack, looks),
+        pictures.swapped_modalities(pack, looks),
+        pictures.time_offset(pack, looks),
+        tables.mixture(pack),
+        tables.missing_labels(pack),
+        *tables.class_balance(pack),
+        *tables.leaks(pack),
+        copies.exact_copies(pack, looks),
+        copies.near_copies(pack, looks),
+        tables.numbers(pack),
+        tables.give_aways(pack),
+    ]
+
+
+def examine_pack(path: Path) -> tuple[list[Finding], Strips]:
+    """The findings on the pack at ``path``, and their suspicious rows as pictures."""
+    try:
+        pack = Pack(path)
+    except ValueError as error:
+        if not (path / "pack.json").is_file():
+            raise
+        found = Finding(
+            item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it as well"
+        )
+        return [found], {}
+    whole = Finding(item="pack", verdict="ok", evidence=f"{pack.num} rows, every digest matches")
+    findings = [whole, *examine(pack)]
+    return findings, strips_of(pack, findings)
+
+
+def examine_source(
+    source: Source, *, num: int = 0, size: int = 64, workers: int = 1, quiet: bool = False
+) -> tuple[list[Finding], Strips]:
+    """The findings on ``source``, read once into a temporary pack of ``size`` px; ``num`` items of it, 0 = all.
+
+    Damaged items are a finding, not an error, unless nothing at all can be read.
+    """
+    glance = Glance(source, num)
+    with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
+        options: dict[str, Any] = {"size": size, "workers": workers, "quiet": quiet}
+        pack = build(glance, Path(folder) / "pack", max_damaged=1.0, **options)
+        findings = examine(pack, glance.expected())
+        read = f"{len(glance.items())} of {len(source.items())} items read, kept at {size} px"
+        findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
+        return findings, strips_of(pack, findings)
