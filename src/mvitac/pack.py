@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import io
 import json
 import multiprocessing
@@ -24,7 +25,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -34,7 +35,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mvitac.record import brief, digest, digest_file, naming, provenance, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json, unknown
-from mvitac.spec import DataSpec
+from mvitac.spec import DataSpec, Task
 
 FORMAT = "mvitac-pack"
 FORMAT_VERSION = 1
@@ -53,8 +54,19 @@ class Sample:
     """At least id (str), group (str), split (one of SPLITS) and a label_<task> (int, -1 = none) per task."""
 
 
+@dataclass(frozen=True)
+class Lost:
+    """A sample that an otherwise good item cannot give: a damaged frame of a recording."""
+
+    name: str
+    why: str
+
+
 class Source(ABC):
     """Something to read samples from; picklable, so that packing can use several processes."""
+
+    items_per_part: int = NUM_PART_ITEMS
+    """Items that a packing process holds in memory before it writes them; fewer where an item is many samples."""
 
     @abstractmethod
     def spec(self) -> DataSpec: ...
@@ -64,8 +76,8 @@ class Source(ABC):
         """Names of the independent units of work, in pack order: a row, a grasp, a recording."""
 
     @abstractmethod
-    def read(self, item: int) -> list[Sample]:
-        """The samples of item number ``item``; ValueError or OSError if it is damaged."""
+    def read(self, item: int) -> Sequence[Sample | Lost]:
+        """The samples of item number ``item``; ValueError or OSError if it is damaged as a whole."""
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:
@@ -137,12 +149,24 @@ class Pack:
             raise unknown("column", name, self.table.column_names)
         return np.array(self.table.column(name).to_numpy(zero_copy_only=False))  # arrow memory is read-only
 
-    def rows(self, *splits: str, only: dict[str, str] | None = None) -> np.ndarray:
-        """Ascending int64 row numbers whose split is among ``splits`` and whose columns equal ``only``."""
-        mask = np.isin(self.column("split"), splits)
+    def rows(self, *splits: str, only: dict[str, str] | None = None, by: str = "split") -> np.ndarray:
+        """Ascending int64 row numbers whose split (column ``by``) is in ``splits`` and whose columns equal ``only``."""
+        mask = np.isin(self.column(by), splits)
         for name, value in (only or {}).items():
             mask &= self.column(name).astype(str) == value
         return np.flatnonzero(mask)
+
+    def labels(self, task: Task, *splits: str) -> np.ndarray:
+        """[N] int64: labels of ``task``, -1 where there is none or the row is, for this task, on no side of ``splits``."""
+        key = (task.name, *splits)
+        if key not in self._labels:
+            known = self.column(f"label_{task.name}").astype(np.int64)
+            self._labels[key] = np.where(np.isin(self.column(task.split), splits), known, -1)
+        return self._labels[key]
+
+    @functools.cached_property
+    def _labels(self) -> dict[tuple[str, ...], np.ndarray]:
+        return {}
 
     @functools.cached_property
     def touch_groups(self) -> np.ndarray:
@@ -197,9 +221,12 @@ def _check_table(table: pa.Table, spec: DataSpec) -> None:
         if name in table.column_names and table.column(name).null_count:
             row = first(table.column(name).is_null().to_numpy())
             raise ValueError(f"column {name} is empty in row {row}: every row needs one")
-    for split in table.column("split").unique().to_pylist():
-        if split not in SPLITS:
-            raise unknown("split", str(split), SPLITS)
+    for column in dict.fromkeys(("split", *(task.split for task in spec.tasks))):
+        if column not in table.column_names:
+            raise unknown("column", column, table.column_names)
+        for split in table.column(column).unique().to_pylist():
+            if split not in SPLITS:
+                raise unknown(column, str(split), SPLITS)
     for name, num in labels.items():
         kind = table.column(name).type
         if not pa.types.is_integer(kind):
@@ -271,7 +298,8 @@ def build(
     else:
         write_json(partial / "request.json", request)
 
-    parts = [range(i, min(i + NUM_PART_ITEMS, len(items))) for i in range(0, len(items), NUM_PART_ITEMS)]
+    step = source.items_per_part
+    parts = [range(i, min(i + step, len(items))) for i in range(0, len(items), step)]
     missing = [i for i in range(len(parts)) if not (partial / f"part-{i:06d}.npz").exists()]
     with _progress(quiet) as progress:
         bar = progress.add_task(f"packing {spec.name}", total=len(items), completed=0)
@@ -336,9 +364,12 @@ def _write_part(job: tuple[Source, DataSpec, range, int, Path]) -> range:
     columns: list[dict[str, Any]] = []
     images: dict[str, list[np.ndarray]] = {m: [] for m in spec.modalities}
     damaged: list[list[Any]] = []
+    lost: list[list[str]] = []
     for number in numbers:
         try:
-            samples = source.read(number)
+            read = source.read(number)
+            samples = [one for one in read if isinstance(one, Sample)]
+            lost += [[one.name, one.why] for one in read if isinstance(one, Lost)]
             fitted = [{m: _check_image(getattr(s, m), m, spec, size) for m in spec.modalities} for s in samples]
             for sample in samples:
                 _check_columns(sample.columns, spec)
@@ -352,7 +383,8 @@ def _write_part(job: tuple[Source, DataSpec, range, int, Path]) -> range:
     arrays = {
         m: np.stack(images[m]) if images[m] else np.zeros((0, size, size, spec.channels(m)), np.uint8) for m in images
     }
-    text = {"columns": np.array(json.dumps(columns)), "damaged": np.array(json.dumps(damaged))}
+    texts = {"columns": columns, "damaged": damaged, "lost": lost}
+    text = {name: np.array(json.dumps(value)) for name, value in texts.items()}
     write_atomic(path, lambda file: np.savez(file, **arrays, **text))  # type: ignore[arg-type]
     return numbers
 
@@ -391,24 +423,21 @@ def _finish(
     spec: DataSpec = from_json(DataSpec, json.loads(json.dumps(request["spec"])), "spec")
     columns: list[dict[str, Any]] = []
     damaged: list[list[Any]] = []
+    lost: list[list[str]] = []
     for path in paths:
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as part:  # numpy leaks what it cannot read
-                for modality in spec.modalities:
-                    part[modality]  # decompressed and checked by its CRC
-                columns += json.loads(str(part["columns"]))
-                damaged += json.loads(str(part["damaged"]))
-        except Exception as error:  # zipfile and numpy raise their own kinds for a damaged file
-            raise ValueError(f"{path} is damaged ({brief(error)}): delete it and run the same command again") from None
-    if len(damaged) > max_damaged * len(items):
-        number, why = damaged[0]
+        columns += json.loads(str(_from_part(path, "columns")))
+        damaged += json.loads(str(_from_part(path, "damaged")))
+        lost += json.loads(str(_from_part(path, "lost")))
+    named = [*([items[number], why] for number, why in damaged), *lost]
+    if len(damaged) > max_damaged * len(items) or len(lost) > max_damaged * (len(columns) + len(lost)):
         for path in paths:  # the damaged parts are read again next time, when they may have been repaired
-            with np.load(path, allow_pickle=False) as part:
-                hurt = str(part["damaged"]) != "[]"
-            if hurt:
+            if any(str(_from_part(path, name)) != "[]" for name in ("damaged", "lost")):
                 path.unlink()
+        what = (
+            f"{len(damaged)} of {len(items)} items" if damaged else f"{len(lost)} of {len(columns) + len(lost)} samples"
+        )
         raise ValueError(
-            f"{len(damaged)} of {len(items)} items cannot be read, first {items[number]}: {why}"
+            f"{what} cannot be read, first {named[0][0]}: {named[0][1]}"
             " (repair it, or allow a fraction with --max-damaged)"
         )
     if not columns:
@@ -417,27 +446,29 @@ def _finish(
     shutil.rmtree(joined, ignore_errors=True)
     joined.mkdir()
     size = int(request["size"])
+    digests: dict[str, str] = {}
     for modality in spec.modalities:
         shape = (len(columns), size, size, spec.channels(modality))
-        target = joined / f"{modality}.npy"
+        name = f"{modality}.npy"
         # Written, not mapped: on a full disk a write is an error one can report, a store into a map kills the process.
-        with naming(target), target.open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
+        with naming(joined / name), (joined / name).open("wb") as file:
+            written = _Hashing(file)
+            np.lib.format.write_array_header_1_0(written, {"descr": "|u1", "fortran_order": False, "shape": shape})
             for path in paths:
-                with np.load(path, allow_pickle=False) as part:
-                    file.write(np.ascontiguousarray(part[modality]).data)
+                written.write(np.ascontiguousarray(_from_part(path, modality)).data)
+        digests[name] = written.hash.hexdigest()
     buffer = io.BytesIO()
     table = _table(columns)
     _check_table(table, spec)
     pq.write_table(table, buffer)
     write_atomic(joined / "samples.parquet", lambda file: file.write(buffer.getvalue()))
-    names = ["samples.parquet", *(f"{m}.npy" for m in spec.modalities)]
+    digests = {"samples.parquet": hashlib.sha256(buffer.getvalue()).hexdigest(), **digests}
     meta = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "num": len(columns),
-        "digests": {name: digest_file(joined / name) for name in names},
-        "damaged": [[items[number], why] for number, why in damaged],
+        "digests": digests,
+        "damaged": named,
         **request,
     }
     write_json(joined / "pack.json", {**meta, "digest": digest(json.loads(json.dumps(meta)))})
@@ -447,6 +478,26 @@ def _finish(
         out.parent.mkdir(parents=True)
     os.rename(joined, out)
     return Pack(out, verify=False)
+
+
+def _from_part(path: Path, name: str) -> np.ndarray:
+    """One array of a part, checked by its CRC."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as part:  # numpy leaks what it cannot read
+            return part[name]
+    except Exception as error:  # zipfile and numpy raise their own kinds for a damaged file
+        raise ValueError(f"{path} is damaged ({brief(error)}): delete it and run the same command again") from None
+
+
+class _Hashing:
+    """A file that takes the sha256 of what is written, so that it need not be read again."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.hash = file, hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        self.hash.update(data)
+        return self._file.write(data)
 
 
 def _table(columns: list[dict[str, Any]]) -> pa.Table:

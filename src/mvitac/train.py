@@ -201,7 +201,7 @@ def make_views(
         for source in sources:
             raw = torch.from_numpy(pack.images[modality][source]).permute(0, 3, 1, 2).to(device)
             images[modality].append(random_view(raw, config, run.augment.size, generator))
-    labels = {t.name: torch.from_numpy(pack.column(f"label_{t.name}")[rows]).to(device) for t in pack.spec.tasks}
+    labels = {t.name: torch.from_numpy(pack.labels(t, "train")[rows]).to(device) for t in pack.spec.tasks}
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
 
 
@@ -255,16 +255,16 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     if held_out:
         bank = {m: pack_features(model, pack, m, train_rows, precision=run.precision) for m in model.encoders}
         for task in pack.spec.tasks:
-            labels = torch.from_numpy(pack.column(f"label_{task.name}"))
-            keep_bank, keep = labels[train_rows] >= 0, labels[panel_rows] >= 0
+            known, asked = (torch.from_numpy(pack.labels(task, split)) for split in ("train", "val"))
+            keep_bank, keep = known[train_rows] >= 0, asked[panel_rows] >= 0
             if not (keep_bank.any() and keep.any()):
                 continue
             for modality in z:
                 values[f"{modality}/knn {task.name}"] = diagnostics.knn_accuracy(
                     bank[modality][keep_bank],
-                    labels[train_rows][keep_bank],
+                    known[train_rows][keep_bank],
                     z[modality][keep],
-                    labels[panel_rows][keep],
+                    asked[panel_rows][keep],
                 )
     if len(model.projectors) == 2:
         device = next(model.parameters()).device
