@@ -35,6 +35,8 @@ class Packets:
 
     dts: np.ndarray
     """[P] int64 decoding times."""
+    places: np.ndarray
+    """[P] int64 where they are in the file."""
     keys: np.ndarray
     """[K] int64 ascending numbers of the packets at which decoding can start."""
 
@@ -90,7 +92,7 @@ def frames(
                 if not pending:
                     break
                 ahead = packets.start_of(pending[-1])
-                if ahead > key and packets.keys[ahead] > run.fed:  # nearer to what is wanted next
+                if ahead > key and packets.keys[ahead] > run.fed + 1:  # nearer to what is wanted next
                     break
             else:
                 while pending:
@@ -113,7 +115,7 @@ class _Run:
     """One start of the decoder, at key packet number ``key`` of ``packets``; ``frames`` numbers what comes out."""
 
     def __init__(self, container: InputContainer, stream: VideoStream, packets: Packets, key: int) -> None:
-        self._context = stream.codec_context
+        self._context, self._packets = stream.codec_context, packets
         self._context.flush_buffers()
         self.fed = int(packets.keys[key])
         """Number of the packet handed to the decoder last."""
@@ -138,12 +140,23 @@ class _Run:
         for packet in self._all():
             if packet is not None:
                 self.fed += packet is not self._ahead[0]
+                if not self._is_next(packet):
+                    self._note("the table of its frames and what is there disagree", _shown(packet))
                 if _shown(packet) >= self._shown:
                     insort(due, _shown(packet))
             for frame in self._decoded(packet):
                 if frame.pts is not None and frame.pts >= self._shown:
                     # Counted among the packets, so that a frame the decoder drops shifts no other.
                     yield self.first + bisect_left(due, frame.pts), frame
+
+    def _is_next(self, packet: Packet) -> bool:
+        """Whether ``packet`` is the one that ``fed`` counts: after damage a demuxer may resume at a later one, unsaid."""
+        if self.fed >= len(self._packets.places) or packet.pos is None:
+            return False
+        return packet.pos - int(self._packets.places[self.fed]) in (
+            0,
+            8,
+        )  # with or without the header of an AVI's chunk
 
     def _all(self) -> Iterator[Packet | None]:
         yield from self._ahead
@@ -219,16 +232,17 @@ def _packets(path: str | Path) -> Packets:
 
 @functools.lru_cache(maxsize=8)
 def _read_packets(path: str, size: int, changed: int) -> Packets:
-    """The packet table: an mp4 carries one for all packets; of other files every packet is visited, none decoded."""
+    """The packet table: mp4 and a whole AVI carry one; of other files every packet is visited, none decoded."""
     with _opened(path) as (container, stream):
-        if "mp4" in container.format.name:
-            found = [(e.timestamp, e.is_keyframe) for e in stream.index_entries if e.size and not e.is_discard]
+        table = stream.index_entries
+        if "mp4" in container.format.name or ("avi" in container.format.name and len(table) == stream.frames):
+            found = [(e.timestamp, e.pos, e.is_keyframe) for e in table if e.size and not e.is_discard]
         else:
-            found = [(p.dts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
-    if not found or any(dts is None for dts, _ in found):
+            found = [(p.dts, p.pos, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
+    if not found or any(dts is None or place is None for dts, place, _ in found):
         raise ValueError(f"{path} holds no frames that can be told apart: it is damaged, or convert it to mp4")
-    dts = np.array([dts for dts, _ in found], np.int64)
-    keys = np.flatnonzero([key for _, key in found])
+    dts, places = (np.array([row[i] for row in found], np.int64) for i in (0, 1))
+    keys = np.flatnonzero([key for _, _, key in found])
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
-    return Packets(dts, keys)
+    return Packets(dts, places, keys)
