@@ -24,6 +24,9 @@ what the features are worth.
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
+  embed PACK           embeddings of every row, as .npz or .parquet
+  index PACK           make a pack searchable
+  find IMAGE           the nearest known touches to a picture, and back
 
 First steps:
   mvitac demo                                        # no data needed
@@ -43,6 +46,9 @@ COMMANDS = {
     "report": "learn:report",
     "publish": "robot:publish",
     "export": "robot:export",
+    "embed": "search:embed",
+    "index": "search:index",
+    "find": "search:find",
 }
 """Command -> module of ``commands``:function, imported when called."""
 
