@@ -24,6 +24,7 @@ what the features are worth.
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
+  live MODEL           cameras or files in, a prediction for every touch out
   embed PACK           embeddings of every row, as .npz or .parquet
   index PACK           make a pack searchable
   find IMAGE           the nearest known touches to a picture, and back
@@ -46,6 +47,7 @@ COMMANDS = {
     "report": "learn:report",
     "publish": "robot:publish",
     "export": "robot:export",
+    "live": "live:live",
     "embed": "search:embed",
     "index": "search:index",
     "find": "search:find",

@@ -134,6 +134,7 @@ def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> 
             "space": "shared" if shared else "features",
             "pack": str(pack.path.absolute()),
             "pack_digest": pack.digest,
+            "weights": model.weights_digest(),
             "classes": {task.name: list(task.classes) for task in pack.spec.tasks},
             "files": {name: digest_file(partial / name) for name in names},
         }
