@@ -25,6 +25,7 @@ what the features are worth.
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
   live MODEL           cameras or files in, a prediction for every touch out
+  explore RUN          a local page: the map of features, neighbours, mistakes
   embed PACK           embeddings of every row, as .npz or .parquet
   index PACK           make a pack searchable
   find IMAGE           the nearest known touches to a picture, and back
@@ -48,6 +49,7 @@ COMMANDS = {
     "publish": "robot:publish",
     "export": "robot:export",
     "live": "live:live",
+    "explore": "explore:explore",
     "embed": "search:embed",
     "index": "search:index",
     "find": "search:find",
