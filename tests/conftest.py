@@ -45,3 +45,14 @@ def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from mvitac.publish import publish
 
     return publish(smoke_run, tmp_path_factory.mktemp("artifact") / "artifact")
+
+
+@pytest.fixture(scope="session")
+def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """That artifact, exported for ONNX Runtime."""
+    from mvitac.artifact import load
+    from mvitac.export import export
+
+    out = tmp_path_factory.mktemp("export") / "onnx"
+    export(load(artifact), pack, out, kind="onnx")
+    return out

@@ -47,13 +47,6 @@ def check(model: Model, graph: Graph, pack: Pack, tolerance: Tolerance = EXACT) 
 
 
 @pytest.fixture(scope="module")
-def onnx(model: Model, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("export") / "onnx"
-    export(model, pack, out, kind="onnx")
-    return out
-
-
-@pytest.fixture(scope="module")
 def openvino(model: Model, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("export") / "openvino"
     export(model, pack, out, kind="openvino", int8=True, tolerance=Tolerance(min_cosine=0.9, accuracy_loss=10))

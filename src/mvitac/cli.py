@@ -27,6 +27,11 @@ what the features are worth.
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
+  live MODEL           cameras or files in, a prediction for every touch out
+  explore RUN          a local page: the map of features, neighbours, mistakes
+  embed PACK           embeddings of every row, as .npz or .parquet
+  index PACK           make a pack searchable
+  find IMAGE           the nearest known touches to a picture, and back
 
 First steps:
   mvitac demo                                        # no data needed
@@ -49,6 +54,11 @@ COMMANDS = {
     "report": "learn:report",
     "publish": "robot:publish",
     "export": "robot:export",
+    "live": "live:live",
+    "explore": "explore:explore",
+    "embed": "search:embed",
+    "index": "search:index",
+    "find": "search:find",
 }
 """Command -> module of ``commands``:function, imported when called."""
 

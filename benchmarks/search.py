@@ -1,0 +1,120 @@
+"""Exact search over a million embeddings: time, memory and agreement beside scikit-learn's brute force.
+
+    python -m benchmarks.search --num 1000000 --dim 512 --out FILE.json
+
+Random unit vectors; batch-1 queries, one at a time, taking turns. Memory is the process's anonymous resident set (the
+memory-mapped bank lives in the page cache and can be dropped by the system at any time), read after each engine's turn in
+a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def anonymous_mb() -> dict[str, float]:
+    """Current anonymous and file-backed resident memory in MB (Linux)."""
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return {k: int(lines[k].split()[0]) / 1024 for k in ("RssAnon", "RssFile", "VmHWM")}
+
+
+def measure(name: str, path: str, num_queries: int, k: int, threads: int, connection: Any) -> None:
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = str(threads)
+    from threadpoolctl import threadpool_limits
+
+    from mvitac.retrieval import nearest
+
+    with threadpool_limits(threads):
+        before = anonymous_mb()
+        bank = np.load(path, mmap_mode="r")
+        queries = np.random.default_rng(1).normal(size=(num_queries, bank.shape[1])).astype(np.float32)
+        queries /= np.linalg.norm(queries, axis=1, keepdims=True)
+        fitted: Any = None
+        if name == "scikit-learn":
+            from sklearn.neighbors import NearestNeighbors
+
+            fitted = NearestNeighbors(n_neighbors=k, algorithm="brute", metric="cosine").fit(bank)
+
+        def search(q: np.ndarray) -> np.ndarray:
+            return fitted.kneighbors(q, return_distance=False) if fitted else nearest(bank, q, k)[0]
+
+        search(queries[:1])
+        peak = anonymous_mb()["RssAnon"]
+        connection.send("ready")
+        times, found = [], []
+        while (message := connection.recv()) != "stop":
+            start = time.perf_counter()
+            found.append(search(queries[message : message + 1])[0].tolist())
+            times.append(time.perf_counter() - start)
+            peak = max(peak, anonymous_mb()["RssAnon"])
+            connection.send("done")
+        start = time.perf_counter()
+        search(queries[: min(32, num_queries)])
+        batch = time.perf_counter() - start
+        peak = max(peak, anonymous_mb()["RssAnon"])
+        connection.send(
+            {
+                "p50_ms": float(1000 * np.percentile(times, 50)),
+                "p99_ms": float(1000 * np.percentile(times, 99)),
+                "ms_per_query_in_batches_of_32": 1000 * batch / min(32, num_queries),
+                "anonymous_mb": peak - before["RssAnon"],
+                "found": found,
+            }
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--num", type=int, default=1_000_000)
+    parser.add_argument("--dim", type=int, default=512)
+    parser.add_argument("--queries", type=int, default=32)
+    parser.add_argument("--k", type=int, default=10)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--bank", type=Path, default=Path("bank.npy"), help="where to keep the random bank")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    if not options.bank.exists():
+        bank = np.lib.format.open_memmap(options.bank, "w+", np.float32, (options.num, options.dim))
+        rng = np.random.default_rng(0)
+        for start in range(0, options.num, 50_000):
+            x = rng.standard_normal((min(50_000, options.num - start), options.dim), np.float32)
+            bank[start : start + len(x)] = x / np.linalg.norm(x, axis=1, keepdims=True)
+        bank.flush()
+    context = multiprocessing.get_context("spawn")
+    ends, workers = {}, []
+    for name in ("mvitac", "scikit-learn"):
+        ends[name], other = context.Pipe()
+        arguments = (name, str(options.bank), options.queries, options.k, options.threads, other)
+        workers.append(context.Process(target=measure, args=arguments))
+        workers[-1].start()
+        assert ends[name].recv() == "ready"
+    for query in range(options.queries):
+        for end in ends.values():
+            end.send(query)
+            end.recv()
+    result: dict[str, Any] = {}
+    for name, end in ends.items():
+        end.send("stop")
+        result[name] = end.recv()
+    for worker in workers:
+        worker.join()
+    found = {name: values.pop("found") for name, values in result.items()}
+    same = np.mean([a == b for a, b in zip(found["mvitac"], found["scikit-learn"], strict=True)])
+    result |= {"same_results": float(same), "num": options.num, "dim": options.dim, "threads": options.threads}
+    result["load"] = os.getloadavg()[0]
+    print(json.dumps(result, indent=1))
+    if options.out:
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

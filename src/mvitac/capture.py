@@ -1,0 +1,361 @@
+"""Frames from cameras, files and the simulator: the newest one wins, and every fault is named.
+
+A ``Source`` opens, reads and closes; a ``Stream`` keeps its newest frame, counts what was dropped and says what is wrong
+with it. Time comes from a clock that is given, so all of it runs on a fake one. Frames are uint8 RGB [H, W, 3].
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mvitac.record import brief
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture and when it was taken (seconds of the stream's clock)."""
+
+    image: np.ndarray
+    time: float
+    number: int
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something a user must know: ``what`` is the kind of fault (or its end), ``text`` the whole sentence."""
+
+    time: float
+    stream: str
+    what: str
+    text: str
+
+
+class Ended(Exception):
+    """A source has no more frames, and never will."""
+
+
+class Source(ABC):
+    """Where frames come from. ``read`` raises OSError where the device is gone, ValueError for one damaged frame."""
+
+    fps: float = 30.0
+    """Nominal rate."""
+    paced: bool = True
+    """Whether the device itself makes ``read`` wait for the next frame."""
+
+    @abstractmethod
+    def open(self) -> None: ...
+
+    @abstractmethod
+    def read(self) -> np.ndarray: ...
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to close
+        pass
+
+
+class Camera(Source):
+    """A UVC camera by index, device path or USB serial number; DIGIT and GelSight Mini are such cameras."""
+
+    def __init__(self, which: str) -> None:
+        self.which = which
+
+    def open(self) -> None:
+        import cv2
+
+        target: int | str = int(self.which) if self.which.isdigit() else self.which
+        if isinstance(target, str) and not target.startswith("/"):
+            links = sorted(Path("/dev/v4l/by-id").glob(f"*{target}*-index0")) if Path("/dev/v4l/by-id").is_dir() else []
+            if not links:
+                raise OSError(f"no camera with serial {target} is plugged in")
+            target = str(links[0].resolve())
+        self.capture = cv2.VideoCapture(target)
+        self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame in a queue is worse than none
+        if not self.capture.isOpened():
+            raise OSError(f"camera {self.which} cannot be opened")
+        self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
+
+    def read(self) -> np.ndarray:
+        good, image = self.capture.read()
+        if not good:
+            raise OSError(f"camera {self.which} gives no frames")
+        return np.ascontiguousarray(image[..., ::-1])  # OpenCV's frames are BGR
+
+    def close(self) -> None:
+        if hasattr(self, "capture"):
+            self.capture.release()
+
+
+class Video(Source):
+    """A video file, at its own rate."""
+
+    paced = False
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def open(self) -> None:
+        import cv2
+
+        self.capture = cv2.VideoCapture(str(self.path))
+        if not self.capture.isOpened():
+            raise OSError(f"{self.path} cannot be read as a video")
+        self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
+
+    def read(self) -> np.ndarray:
+        good, image = self.capture.read()
+        if not good:
+            raise Ended
+        return np.ascontiguousarray(image[..., ::-1])
+
+    def close(self) -> None:
+        if hasattr(self, "capture"):
+            self.capture.release()
+
+
+class Folder(Source):
+    """The pictures of a folder in name order."""
+
+    paced = False
+
+    def __init__(self, path: Path, fps: float = 30.0) -> None:
+        self.path, self.fps = path, fps
+
+    def open(self) -> None:
+        self.left = deque(sorted(p for p in self.path.iterdir() if p.suffix.lower() in PICTURES))
+        if not self.left:
+            raise OSError(f"{self.path} holds no pictures ({', '.join(PICTURES)})")
+
+    def read(self) -> np.ndarray:
+        from PIL import Image
+
+        if not self.left:
+            raise Ended
+        path = self.left.popleft()
+        try:
+            with Image.open(path) as image:
+                return np.array(image.convert("RGB"))
+        except (OSError, SyntaxError) as error:  # Pillow's kinds for a damaged file
+            raise ValueError(f"{path.name}: {brief(error)}") from None
+
+
+class Simulated(Source):
+    """A simulated sensor: one second of nothing, two of a touch of a new material, and so on; camera and gel agree."""
+
+    paced = False
+    rest, hold = 1.0, 2.0
+
+    def __init__(self, modality: str, seed: int = 0, fps: float = 30.0, size: int = 72) -> None:
+        self.modality, self.seed, self.fps, self.size = modality, seed, fps, size
+
+    def open(self) -> None:
+        self.number, self.touch = 0, -1
+        self.noise = np.random.default_rng([self.seed, self.modality == "touch"])
+
+    def read(self) -> np.ndarray:
+        from mvitac.sim import gel, materials
+
+        when = self.number / self.fps
+        touch, phase = divmod(when, self.rest + self.hold)
+        if int(touch) != self.touch:
+            self.touch = int(touch)
+            rng = np.random.default_rng([self.seed, self.touch])
+            sensors = {name: s for name, s in materials.SENSORS.items() if not s.held_out}
+            while True:  # all touches by one sensor, as a robot has one
+                address = int(rng.integers(len(materials.CLASSES))), int(rng.integers(60)), int(rng.integers(5))
+                pair = materials.touch(self.seed, *address, size=self.size)
+                if pair["sensor"] == min(sensors):
+                    break
+            quiet = np.zeros((self.size, self.size), np.float32)
+            blank = gel.render(quiet, sensors[pair["sensor"]], rng, pixel_mm=12.8 / self.size, unit=1)
+            self.pictures = {"vision": (pair["vision"],) * 2, "touch": (blank, pair["touch"])}
+        self.number += 1
+        image = self.pictures[self.modality][phase >= self.rest].astype(np.float32)
+        image += self.noise.normal(0, 1.0, image.shape[:2])[..., None]
+        return np.clip(image + 0.5, 0, 255).astype(np.uint8)
+
+
+def source(text: str, modality: str) -> Source:
+    """A source from its name: ``0``, ``/dev/video2``, ``serial:D20345``, a video, a folder[@fps], or ``sim``[:seed]."""
+    if text == "sim" or text.startswith("sim:"):
+        seed = text.partition(":")[2] or "0"
+        if not seed.isdigit():
+            raise ValueError(f"source {text!r}: give sim or sim:NUMBER")
+        return Simulated(modality, int(seed))
+    if text.isdigit() or text.startswith("/dev/"):
+        return Camera(text)
+    if text.startswith("serial:"):
+        return Camera(text.removeprefix("serial:"))
+    name, at, rate = text.rpartition("@")
+    path, fps = (Path(name), rate) if at and not Path(text).exists() else (Path(text), "30")
+    if path.is_dir():
+        try:
+            return Folder(path, float(fps))
+        except ValueError:
+            raise ValueError(f"source {text!r}: {fps!r} is no frame rate, give e.g. {path}@30") from None
+    if path.is_file() and path.suffix.lower() in VIDEOS:
+        return Video(path)
+    raise ValueError(
+        f"source {text!r}: give a camera number, /dev/videoN, serial:NAME, a video file ({', '.join(VIDEOS)}),"
+        " a folder of pictures[@fps], or sim"
+    )
+
+
+class Stream:
+    """One source's newest frame and its health. ``pump`` belongs to one thread, everything else to any."""
+
+    def __init__(
+        self,
+        name: str,
+        origin: Source,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        tell: Callable[[Event], None] = lambda event: None,
+        stale_after: float = 0.5,
+        frozen_after: float = 1.0,
+        retry_every: float = 1.0,
+    ) -> None:
+        """``stale_after``: age in seconds from which a frame is no longer used; ``frozen_after``: how long pictures may be
+        identical to the last byte; ``retry_every``: pause between tries to open a lost device."""
+        self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
+        self.stale_after, self.frozen_after, self.retry_every = stale_after, frozen_after, retry_every
+        self.fault: str | None = None
+        self.ended = False
+        self.num_frames = self.num_dropped = self.num_damaged = 0
+        self.events: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._newest: Frame | None = None
+        self._taken = True
+        self._open = False
+        self._retry_at = float("-inf")
+        self._lost_at = self._moved_at = self._opened_at = clock()
+        self._stalled = False
+        self._arrivals: deque[float] = deque(maxlen=30)
+
+    def pump(self) -> None:
+        """Read one frame, or try once to open the source; blocks as long as the device does."""
+        if self.ended:
+            return
+        try:
+            if not self._open:
+                if self.clock() < self._retry_at:
+                    return
+                self.origin.open()
+                self._open, self._opened_at = True, self.clock()
+            image = self.origin.read()
+        except Ended:
+            self.ended = True
+            self._say("ended", "has no more frames")
+            return
+        except ValueError as error:
+            self.num_damaged += 1
+            self._say("damaged frame", f"skipped a damaged frame ({brief(error)})")
+            return
+        except OSError as error:
+            self._lost(error)
+            return
+        self._take(image)
+
+    def newest(self, *, take: bool = True) -> Frame | None:
+        """The newest frame, whatever its age; with ``take`` it then counts as used, not as dropped."""
+        with self._lock:
+            self._taken = self._taken or take
+            return self._newest
+
+    def check(self) -> None:
+        """Say so if the device has stopped giving frames; ``pump`` cannot, it is what waits."""
+        now = self.clock()
+        last = self._newest.time if self._newest else self._opened_at
+        if self._open and not self.ended and not self._stalled and now - last > self.stale_after:
+            self._stalled = True
+            self._say("stalled", f"gives no frames since {now - last:.1f} s")
+
+    def age(self) -> float:
+        """Seconds since the newest frame was taken; infinite before the first."""
+        frame = self._newest
+        return self.clock() - frame.time if frame else float("inf")
+
+    def rate(self) -> float:
+        """Frames per second over the last thirty."""
+        arrivals = list(self._arrivals)
+        return (len(arrivals) - 1) / (arrivals[-1] - arrivals[0]) if len(arrivals) > 1 and self._open else 0.0
+
+    def close(self) -> None:
+        self.origin.close()
+        self._open = False
+
+    def _take(self, image: np.ndarray) -> None:
+        now, before = self.clock(), self._newest
+        if self.fault == "unplugged":
+            self._say("back", f"is back after {now - self._lost_at:.1f} s")
+        elif self._stalled:
+            self._say("running again", "gives frames again")
+        self._stalled = False
+        if before is None or before.image.shape != image.shape:
+            if before is not None:
+                self._say("resolution changed", f"changed from {_shape(before.image)} to {_shape(image)}")
+            self._moved_at = now
+        elif not np.array_equal(before.image, image):
+            if self.fault == "frozen":
+                self._say("moving again", f"moves again after {now - self._moved_at:.1f} s")
+            self._moved_at = now
+        elif self.fault != "frozen" and now - self._moved_at >= self.frozen_after:
+            self._say("frozen", f"shows the same picture since {now - self._moved_at:.1f} s")
+        self.num_frames += 1
+        self._arrivals.append(now)
+        with self._lock:
+            self.num_dropped += not self._taken
+            self._newest, self._taken = Frame(image, now, self.num_frames), False
+
+    def _lost(self, error: OSError) -> None:
+        self.origin.close()
+        self._open, self._stalled = False, False
+        self._retry_at = self.clock() + self.retry_every
+        if self.fault != "unplugged":
+            self._lost_at = self.clock()
+            self._arrivals.clear()
+            self._say("unplugged", f"is gone ({brief(error)}): trying again every {self.retry_every:g} s")
+
+    def _say(self, what: str, text: str) -> None:
+        self.events[what] += 1
+        if what in ("unplugged", "frozen", "stalled", "ended"):
+            self.fault = what
+        elif what in ("back", "moving again", "running again"):
+            self.fault = None
+        self.tell(Event(self.clock(), self.name, what, f"{self.name} {text}"))
+
+
+def _shape(image: np.ndarray) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+class CaptureThread(threading.Thread):
+    """Pumps one stream until ``stop``; files are slowed down to their own rate."""
+
+    def __init__(self, stream: Stream, wake: Callable[[], None]) -> None:
+        super().__init__(name=f"capture {stream.name}", daemon=True)
+        self.stream, self.wake, self.stopping = stream, wake, threading.Event()
+
+    def run(self) -> None:
+        due = time.monotonic()
+        while not self.stopping.is_set() and not self.stream.ended:
+            self.stream.pump()
+            self.wake()
+            wait = 0.0
+            if self.stream.fault == "unplugged":
+                wait = min(0.1, self.stream.retry_every)
+            elif not self.stream.origin.paced:
+                due = max(due + 1 / self.stream.origin.fps, time.monotonic() - 0.1)
+                wait = due - time.monotonic()
+            if wait > 0:
+                self.stopping.wait(wait)
+        self.stream.close()

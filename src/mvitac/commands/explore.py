@@ -1,0 +1,55 @@
+"""``mvitac explore``: a local page that shows what a run knows."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mvitac.options import parse
+
+
+def explore(argv: list[str]) -> None:
+    """mvitac explore RUN [RUN2] [--on PACK] [--port N]"""
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    from mvitac.artifact import load
+    from mvitac.pack import Pack
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """Open a local page: the map of features, nearest neighbours of any point or picture, mistakes; two runs side by
+        side."""
+
+        runs: Positional[tuple[str, ...]]
+        """A run's or an artifact's folder, or owner/name on the Hub; two to compare."""
+        on: Path | None = None
+        """Show this pack instead of the data of the first run."""
+        rows: int = 20_000
+        """Most rows to show, evenly spread."""
+        host: str = "127.0.0.1"
+        """Address to listen on; 0.0.0.0 lets everybody on the network in."""
+        port: int | None = None
+        """Port; a free one from 7860 if not given."""
+
+    options = parse(Options, argv, "explore")
+    if not 1 <= len(options.runs) <= 2:
+        raise ValueError(f"{len(options.runs)} runs given: give one, or two to compare")
+    if options.rows < 3:
+        raise ValueError(f"--rows {options.rows}: give at least 3")
+    models = [load(run) for run in options.runs]
+    pack = Pack(options.on) if options.on else models[0].run.data.open()
+    try:
+        from mvitac.explorer import page, serve
+        from mvitac.landscape import Landscape
+
+        names = [Path(run).name if options.runs.count(run) == 1 else f"{run} {i}" for i, run in enumerate(options.runs)]
+        if len(set(names)) < len(names):
+            names = list(options.runs)
+        lands = {name: Landscape(m, pack, limit=options.rows) for name, m in zip(names, models, strict=True)}
+        blocks = page(lands)
+    except ModuleNotFoundError as error:
+        if error.name != "gradio":
+            raise
+        raise ValueError("the explorer needs gradio: pip install 'mvitac[explore]'") from None
+    where = f"http://{options.host}:{options.port or 7860}"
+    Console().print(f"explorer: {where} (or the next free port; Ctrl-C ends it)", soft_wrap=True, highlight=False)
+    serve(blocks, host=options.host, port=options.port)

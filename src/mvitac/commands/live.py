@@ -1,0 +1,210 @@
+"""``mvitac live``: a robot's eyes and fingers in, a prediction for every touch out."""
+
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mvitac.options import parse
+
+if TYPE_CHECKING:
+    from mvitac.realtime import Live
+    from mvitac.runtime import Engine
+
+
+def live(argv: list[str]) -> None:
+    """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
+    from typing import Annotated
+
+    import tyro
+    from rich.console import Console
+    from rich.live import Live as Screen
+
+    from mvitac.capture import CaptureThread, Stream, source
+    from mvitac.realtime import Live, LiveConfig, neighbours
+    from mvitac.record import check_place, write_json
+    from mvitac.recording import Recorder, finish
+    from mvitac.retrieval import Index
+
+    if argv[:1] == ["--finish"] and len(argv) == 2:
+        Console().print(f"{finish(Path(argv[1])).path}", soft_wrap=True, highlight=False)
+        return
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """Predict from live frames: the newest always wins, old ones are never used, every fault is named. Ctrl-C ends it
+        with a summary.
+
+        A SOURCE is a camera number, /dev/videoN, serial:NAME, a video file, a folder of pictures[@fps], or sim[:seed].
+        A recording that a crash cut short: mvitac live --finish DIR
+        """
+
+        model: tyro.conf.Positional[str]
+        """An export's folder (fastest); or a run, an artifact, owner/name on the Hub, which is exported first."""
+        vision: str = "sim"
+        """The camera."""
+        touch: tuple[str, ...] = ("sim",)
+        """The touch sensor, or both of a gripper: left right."""
+        index: Path | None = None
+        """Show the nearest known touches from this index."""
+        record: Path | None = None
+        """Record what comes in as a pack, in this new folder."""
+        record_fps: float = 10.0
+        """Pairs a second to record."""
+        seconds: float | None = None
+        """Stop after so long."""
+        threads: int = 0
+        """CPU threads for the model; 0 = all cores."""
+        stale: float = 0.5
+        """Seconds after which a frame is too old to be used."""
+        json: Path | None = None
+        """Write the summary to this file."""
+        live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
+
+    options = parse(Options, argv, "live")
+    if options.json:
+        check_place(options.json)
+    console = Console()
+    engine = _engine(options.model, options.threads, console)
+    index = Index(options.index) if options.index else None
+    if index and index.meta["weights"] != engine.meta["weights"]:
+        raise ValueError(f"{options.index} was made with another model: index the pack again with {options.model}")
+    given = {"vision": (options.vision,), "touch": options.touch}
+    streams = {}
+    for modality in engine.inputs:
+        names = (
+            [modality] if len(given[modality]) == 1 else [f"{modality} {i + 1}" for i in range(len(given[modality]))]
+        )
+        pairs = zip(names, given[modality], strict=True)
+        streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
+    recorder = None
+    if options.record:
+        recorder = Recorder(options.record, {m: s[2] for m, s in engine.inputs.items()}, fps=options.record_fps)
+    nearest = neighbours(index, options.live.neighbours) if index else None
+    # What happened is printed above the picture, so that it stays in the scrollback and in a log file.
+    loop = Live(
+        engine,
+        streams,
+        options.live,
+        nearest=nearest,
+        record=recorder,
+        tell=lambda event: console.print(f"[yellow]{event.text}[/yellow]", highlight=False),
+    )
+    news = threading.Event()
+    threads = [CaptureThread(stream, news.set) for stream in loop.all]
+    end = time.monotonic() + options.seconds if options.seconds else float("inf")
+    spoken = 0
+    for thread in threads:
+        thread.start()
+    try:
+        with Screen(view(loop), console=console, auto_refresh=False, transient=True) as screen:
+            drawn = 0.0
+            while time.monotonic() < end and not all(s.ended for s in loop.all):
+                news.wait(0.05)
+                news.clear()
+                loop.tick()
+                spoken = _speak(loop, console, spoken)
+                if time.monotonic() - drawn > 0.1:
+                    screen.update(view(loop), refresh=True)
+                    drawn = time.monotonic()
+    except KeyboardInterrupt:
+        console.print("stopped")
+    finally:
+        for thread in threads:
+            thread.stopping.set()
+        for thread in threads:
+            thread.join(2.0)  # a device that hangs must not hang us
+    summary = loop.summary()
+    if recorder:
+        pack = recorder.close()
+        console.print(f"recorded: {pack.path}, {pack.num} pairs" if pack else "nothing was recorded", soft_wrap=True)
+    _conclude(summary, console)
+    if options.json:
+        write_json(options.json, summary)
+
+
+def _engine(model: str, threads: int, console: Any) -> "Engine":
+    """An export as it is; anything else exported once, into the cache."""
+    from mvitac.artifact import load
+    from mvitac.export import export
+    from mvitac.publish import with_readouts
+    from mvitac.record import cache_dir
+    from mvitac.runtime import MANIFEST, Engine
+
+    if (Path(model) / MANIFEST).is_file():
+        return Engine(model, threads=threads)
+    loaded = load(model)
+    folder = cache_dir() / "exports" / loaded.weights_digest()[:32]
+    if not folder.exists():
+        console.print(f"exporting {model} for ONNX Runtime, once")
+        pack = loaded.run.data.open()
+        export(with_readouts(loaded, pack), pack, folder, kind="onnx")
+    return Engine(folder, threads=threads)
+
+
+def _speak(loop: "Live", console: Any, spoken: int) -> int:
+    """One line for a touch that has ended."""
+    touch = loop.last
+    if touch is None or touch.number <= spoken or touch.end is None:
+        return spoken
+    said = ", ".join(_answer(loop, *item) for item in loop.answers(touch).items())
+    console.print(f"touch {touch.number} ({touch.end - touch.start:.1f} s): {said}", highlight=False)
+    return touch.number
+
+
+def _answer(loop: "Live", task: str, answer: tuple[str, float]) -> str:
+    name, confidence = answer
+    sure = "" if confidence >= loop.config.min_confidence else ", unsure"
+    return f"{task} {name} ({100 * confidence:.0f} %{sure})"
+
+
+def view(loop: "Live") -> Any:
+    """The terminal's picture of ``loop``, 80 columns wide."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    streams = Table(box=None, pad_edge=False)
+    for column in ("stream", "fps", "age ms", "dropped", "state"):
+        streams.add_column(column, justify="left" if column in ("stream", "state") else "right")
+    for s in loop.all:
+        state = s.fault or ("calibrating" if s.name in loop.contacts and not _calibrated(loop, s.name) else "good")
+        age = f"{1000 * s.age():.0f}" if s.num_frames else "-"
+        streams.add_row(s.name, f"{s.rate():.1f}", age, str(s.num_dropped), state)
+    lines: list[Any] = [streams]
+    for name, contact in loop.contacts.items():
+        bar = "#" * min(30, round(10 * contact.level))
+        lines.append(Text(f"{name:8} {'CONTACT' if contact.touched else 'free   '} {bar}"))
+    touch = loop.touch or loop.last
+    for task, (name, confidence) in loop.answers(touch).items():
+        sure = "" if confidence >= loop.config.min_confidence else "  unsure"
+        lines.append(Text(f"{task:10} {name:18} {'#' * round(20 * confidence):20} {100 * confidence:3.0f} %{sure}"))
+    if loop.known:
+        lines.append(Text("like: " + "; ".join(loop.known)))
+    age = loop.summary()["age_ms"]
+    if age["p50"] is not None:
+        text = "age p50 {p50:.1f}  p99 {p99:.1f}  max {max:.1f} ms".format(**age)
+        lines.append(Text(f"{text}   predictions {loop.num_predictions}   stale {loop.num_stale}"))
+    return Group(*lines)
+
+
+def _calibrated(loop: "Live", name: str) -> bool:
+    return loop.contacts[name].background is not None
+
+
+def _conclude(summary: dict[str, Any], console: Any) -> None:
+    age = summary["age_ms"]
+    if age["p50"] is not None:
+        console.print("end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**age), highlight=False)
+    console.print(
+        f"{summary['predictions']} predictions in {summary['touches']} touches; {summary['stale']} frames too old to use",
+        highlight=False,
+    )
+    for name, s in summary["streams"].items():
+        console.print(
+            f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged",
+            highlight=False,
+        )
+    if summary["events"]:
+        console.print("events: " + ", ".join(f"{k} {v}" for k, v in summary["events"].items()), highlight=False)

@@ -1,0 +1,149 @@
+"""``mvitac embed``, ``index`` and ``find``: embeddings of whole packs, and the nearest of them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mvitac.options import parse
+
+
+def embed(argv: list[str]) -> None:
+    """mvitac embed PACK --model M --out FILE.npz|FILE.parquet"""
+    import numpy as np
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    from mvitac.artifact import load
+    from mvitac.pack import Pack
+    from mvitac.record import check_place, write_atomic
+    from mvitac.retrieval import check_pack, describe, embeddings
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """Embeddings of every row of a pack, with ids, groups, splits and labels."""
+
+        pack: Positional[Path]
+        """Folder of the pack."""
+        model: str
+        """A run's or an artifact's folder, or owner/name on the Hub."""
+        out: Path
+        """The file: .npz (numpy) or .parquet."""
+        shared: bool = False
+        """The unit vectors of the space that both modalities share, instead of features."""
+
+    options = parse(Options, argv, "embed")
+    if options.out.suffix not in (".npz", ".parquet"):
+        raise ValueError(f"--out {options.out}: give a name that ends in .npz or .parquet")
+    check_place(options.out)
+    model, pack = load(options.model), Pack(options.pack)
+    rows = np.arange(pack.num)
+    table = describe(pack, rows)
+    found = {
+        m: np.concatenate(list(embeddings(model, pack, m, rows, shared=options.shared)))
+        for m in check_pack(model, pack)
+    }
+    if options.out.suffix == ".npz":
+        columns = {name: np.array(table.column(name).to_pylist()) for name in table.column_names}
+        write_atomic(options.out, lambda file: np.savez(file, **columns, **found))  # type: ignore[arg-type]
+    else:
+        for m, x in found.items():
+            table = table.append_column(m, pa.FixedSizeListArray.from_arrays(x.reshape(-1), x.shape[1]))
+        write_atomic(options.out, lambda file: pq.write_table(table, file))
+    shapes = ", ".join(f"{m} {x.shape}" for m, x in found.items())
+    Console().print(f"{options.out}: {shapes}", soft_wrap=True, highlight=False)
+
+
+def index(argv: list[str]) -> None:
+    """mvitac index PACK --model M --out DIR"""
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    from mvitac.artifact import load
+    from mvitac.pack import Pack
+    from mvitac.retrieval import build
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """Index the pairs of a pack, to find the nearest known touches and pictures with mvitac find."""
+
+        pack: Positional[Path]
+        """Folder of the pack."""
+        model: str
+        """A run's or an artifact's folder, or owner/name on the Hub."""
+        out: Path
+        """The new folder."""
+        splits: tuple[str, ...] = ()
+        """Only these splits (train, val, test, unlabelled); none given = all."""
+
+    options = parse(Options, argv, "index")
+    made = build(load(options.model), Pack(options.pack), options.out, options.splits)
+    shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
+    Console().print(f"{options.out}: {shapes}, space: {made.meta['space']}", soft_wrap=True, highlight=False)
+
+
+def find(argv: list[str]) -> None:
+    """mvitac find IMAGE --in INDEX [--from touch] [--to vision]"""
+    from typing import Annotated, Literal
+
+    import numpy as np
+    import tyro
+    from PIL import Image
+    from rich.console import Console
+    from rich.table import Table
+
+    from mvitac.pack import Pack
+    from mvitac.record import brief, check_place, write_atomic
+    from mvitac.retrieval import Index
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        """The nearest known pairs to a picture, by exact cosine in the space that vision and touch share."""
+
+        image: tyro.conf.Positional[tuple[Path, ...]]
+        """Picture files; a two-sensor touch is two files, left then right."""
+        index: Annotated[Path, tyro.conf.arg(name="in")]
+        """Folder of the index."""
+        source: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="from")] = "touch"
+        """What the picture is."""
+        target: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="to")] = "vision"
+        """What to compare it with."""
+        k: int = 5
+        """How many to find."""
+        picture: Path | None = None
+        """Also draw the query and what was found into this PNG (needs the indexed pack where it was)."""
+
+    options = parse(Options, argv, "find")
+    if options.picture:
+        check_place(options.picture)
+    index = Index(options.index)
+    model = index.model()
+    try:
+        parts = []
+        for path in options.image:
+            with Image.open(path) as opened:
+                parts.append(opened.convert("RGB"))
+        query = np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
+    except Exception as error:  # Pillow has a kind for each damage
+        raise ValueError(f"{options.image[0]} cannot be read as a picture ({brief(error)}): give another") from None
+    rows, scores = index.find(model, query, options.source, options.target, options.k)
+    table = Table(title=f"{options.source} -> {options.target} in {options.index}", title_justify="left")
+    for column in ("cosine", "id", "group", *index.meta["classes"]):
+        table.add_column(column)
+    for row, score in zip(rows[0].tolist(), scores[0], strict=True):
+        labels = index.labels(row)
+        own = [str(index.table.column(name)[row]) for name in ("id", "group")]
+        table.add_row(f"{score:.3f}", *own, *(labels.get(task, "") for task in index.meta["classes"]))
+    Console().print(table)
+    if options.picture:
+        pack = Pack(index.meta["pack"], verify=False)
+        if pack.digest != index.meta["pack_digest"]:
+            raise ValueError(f"{pack.path} is another pack than the one that was indexed: index it again")
+        side = 160
+        sheet = Image.new("RGB", (side * (len(rows[0]) + 1), side), "white")
+        tiles = [query, *(pack.images[options.target][index.table.column("row")[r].as_py()] for r in rows[0].tolist())]
+        for i, tile in enumerate(tiles):
+            sheet.paste(
+                Image.fromarray(np.ascontiguousarray(tile[..., :3])).resize((side - 4, side - 4)), (i * side, 2)
+            )
+        write_atomic(options.picture, lambda file: sheet.save(file, "PNG"))

@@ -1,0 +1,270 @@
+"""Live: the newest frames in, contact, a smoothed answer per touch and its age out. No training code.
+
+Each touch sensor's background (no contact) is learned from its first frames and followed slowly while nothing is
+touched; it only decides *whether* there is contact, the model sees frames as they are. Probabilities are averaged over
+one touch and forgotten with it. Time comes from a clock that is given. Shapes: frames uint8 RGB [H, W, 3].
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from mvitac.capture import Event, Frame, Stream
+from mvitac.pack import fit
+from mvitac.runtime import Engine
+
+SIDE = 32
+"""Side of the small gray pictures in which contact is looked for."""
+NUM_AGES = 10_000
+"""Predictions that the percentiles of the age are of: the latest ones, minutes of them, in memory that stays the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveConfig:
+    """How live input is judged."""
+
+    calibration: int = 30
+    """Frames without contact from which a sensor's background and noise are learned."""
+    contact: float = 6.0
+    """Contact is this many times the no-contact noise; it ends at half of that."""
+    least_change: float = 1.0
+    """Grey levels of mean change below which nothing counts as contact, however quiet the sensor."""
+    follow: float = 0.01
+    """How fast the background follows the sensor while nothing is touched (share per frame)."""
+    min_confidence: float = 0.5
+    """Probability below which an answer is shown as unsure."""
+    neighbours: int = 3
+    """Nearest known touches to show, if there is an index."""
+
+    def __post_init__(self) -> None:
+        if self.calibration < 2:
+            raise ValueError(f"calibration {self.calibration}: give at least 2 frames")
+        if not (self.contact > 0 and self.least_change >= 0 and 0 <= self.follow < 1):
+            raise ValueError("contact must be > 0, least_change >= 0 and follow in [0, 1)")
+
+
+class Contact:
+    """Whether one touch sensor is touched: learns its background, then compares."""
+
+    def __init__(self, config: LiveConfig) -> None:
+        self.config = config
+        self.forget()
+
+    def forget(self) -> None:
+        """Calibrate anew, as after a change of resolution or a replugged sensor."""
+        self.first: list[np.ndarray] = []
+        self.background: np.ndarray | None = None
+        self.noise = self.level = 0.0
+        self.touched = self.uneasy = False
+
+    def __call__(self, image: np.ndarray) -> bool | None:
+        """True in contact, False without, None while calibrating. ``level`` is the change in units of the threshold."""
+        small = np.asarray(Image.fromarray(image).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
+        if self.background is None:
+            self.first.append(small)
+            if len(self.first) < self.config.calibration:
+                return None
+            frames, self.first = np.stack(self.first), []
+            middle = np.median(frames, axis=0)
+            changes = np.abs(frames - middle).mean((1, 2))
+            self.noise = float(np.median(changes))
+            self.uneasy = bool(changes.max() > max(self.config.least_change, self.config.contact * self.noise))
+            if self.uneasy:
+                return None  # something moved: learn it again
+            self.background = middle
+        change = float(np.abs(small - self.background).mean())
+        threshold = max(self.config.least_change, self.config.contact * self.noise)
+        self.level = change / threshold
+        self.touched = self.level > (0.5 if self.touched else 1.0)
+        if not self.touched:
+            self.background += self.config.follow * (small - self.background)
+        return self.touched
+
+
+@dataclass
+class Touch:
+    """One touch, from contact to release: the mean of what was predicted."""
+
+    number: int
+    start: float
+    end: float | None = None
+    num_frames: int = 0
+    totals: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def add(self, probabilities: dict[str, np.ndarray]) -> None:
+        self.num_frames += 1
+        for task, p in probabilities.items():
+            self.totals[task] = self.totals.get(task, 0) + p
+
+    def answer(self, task: str, classes: Sequence[str]) -> tuple[str, float]:
+        """The likeliest class so far, and its mean probability."""
+        mean = self.totals[task] / self.num_frames
+        return classes[int(mean.argmax())], float(mean.max())
+
+
+class Live:
+    """Streams -> contact, predictions, ages. ``tick`` once whenever a frame may have come."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        streams: dict[str, Sequence[Stream]],
+        config: LiveConfig = LiveConfig(),
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        nearest: Callable[[dict[str, np.ndarray]], list[str]] | None = None,
+        record: Callable[[dict[str, np.ndarray], dict[str, Any]], None] | None = None,
+        tell: Callable[[Event], None] = lambda event: None,
+    ) -> None:
+        """``streams``: one stream per camera and sensor, by modality; two touch sensors are stacked on channels.
+
+        ``nearest`` turns the engine's outputs into names of known touches; ``record`` gets every pair that was used;
+        ``tell`` hears of every fault as it happens, in whichever thread noticed.
+        ValueError if the engine takes other inputs.
+        """
+        for modality, (_, _, channels) in engine.inputs.items():
+            have = 3 * len(streams.get(modality, ()))
+            if have != channels:
+                raise ValueError(
+                    f"the model takes {channels // 3} {modality} stream(s), {have // 3} given:"
+                    f" give {channels // 3} --{modality} (or export a model with other inputs)"
+                )
+        if extra := set(streams) - set(engine.inputs):
+            raise ValueError(f"the model has no input for {', '.join(sorted(extra))}: leave it out")
+        self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
+        self.nearest, self.record, self.tell = nearest, record, tell
+        self.all = [s for several in streams.values() for s in several]
+        self.leading = (streams.get("touch") or streams["vision"])[0]
+        """A new frame of this stream starts a prediction."""
+        self.contacts = {s.name: Contact(config) for s in streams.get("touch", ())}
+        self.counts: Counter[str] = Counter()
+        self._ages = np.zeros(NUM_AGES)
+        self.max_age = 0.0
+        self.num_predictions = self.num_stale = self.num_touches = 0
+        self.touch: Touch | None = None
+        self.last: Touch | None = None
+        self.known: list[str] = []
+        self.contact: bool | None = None
+        self._seen = -1
+        self._judged: dict[str, int] = {}
+        for stream in self.all:
+            stream.tell = self._heard
+
+    def tick(self) -> bool:
+        """Use the newest frames, if the leading stream has a new one; True if that made a prediction."""
+        for stream in self.all:
+            stream.check()
+        leading = self.leading.newest(take=False)
+        if leading is None or leading.number == self._seen:
+            return False
+        frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
+        self._seen = leading.number
+        now = self.clock()
+        for several, found in zip(self.streams.values(), frames.values(), strict=True):
+            for stream, frame in zip(several, found, strict=True):
+                # An old frame is not the present: rather no answer than one about the past.
+                if frame is None or stream.fault == "frozen" or now - frame.time > stream.stale_after:
+                    self.num_stale += 1
+                    self._release(now)
+                    return False
+        self.contact = self._contact(frames.get("touch", []))
+        images = {
+            m: np.concatenate([fit(f.image, self.engine.inputs[m][0]) for f in found if f], axis=2)
+            for m, found in frames.items()
+        }
+        made = False
+        if self.contact:
+            if self.touch is None:
+                self.num_touches += 1
+                self.touch = Touch(self.num_touches, now)
+            outputs = self.engine(**{m: x[None] for m, x in images.items()})
+            self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
+            if self.nearest:
+                self.known = self.nearest(outputs)
+            age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
+            self._ages[self.num_predictions % NUM_AGES] = age
+            self.max_age = max(self.max_age, age)
+            self.num_predictions += 1
+            made = True
+        else:
+            self._release(now)
+        if self.record:
+            self.record(images, {"time": now, "contact": bool(self.contact), "touch": self.num_touches})
+        return made
+
+    @property
+    def _leading_modality(self) -> str:
+        return "touch" if self.streams.get("touch") else "vision"
+
+    def _contact(self, frames: Sequence[Frame | None]) -> bool | None:
+        """Whether any touch sensor is in contact, None while one is calibrated; without a sensor always True."""
+        if not self.contacts:
+            return True
+        for name, frame in zip(self.contacts, frames, strict=True):
+            if frame is None or self._judged.get(name) == frame.number:
+                continue
+            self._judged[name] = frame.number
+            contact = self.contacts[name]
+            before = contact.background is None, contact.uneasy
+            contact(frame.image)
+            if contact.uneasy and not before[1]:
+                text = f"{name} was touched or moved while its background was learned: release it, it is learned again"
+                self._heard(Event(self.clock(), name, "uneasy calibration", text))
+            if before[0] and contact.background is not None:
+                self._heard(Event(self.clock(), name, "calibrated", f"{name} is calibrated without contact"))
+        states = self.contacts.values()
+        return None if any(c.background is None for c in states) else any(c.touched for c in states)
+
+    def _release(self, now: float) -> None:
+        if self.touch is not None:
+            self.touch.end = now
+            self.last, self.touch, self.known = self.touch, None, []
+
+    def _heard(self, event: Event) -> None:
+        self.counts[event.what] += 1
+        self.tell(event)
+        # Another lens, crop or gel: what was learned of the background no longer holds.
+        if event.what in ("resolution changed", "back") and event.stream in self.contacts:
+            self.contacts[event.stream].forget()
+
+    def answers(self, touch: Touch | None) -> dict[str, tuple[str, float]]:
+        """(class, confidence) by task of a touch."""
+        if touch is None or not touch.num_frames:
+            return {}
+        return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """What a run of live input came to, JSON-ready; ages in ms from capture to prediction."""
+        ages = 1000 * self._ages[: self.num_predictions]
+        p50, p99 = (float(np.percentile(ages, q)) if len(ages) else None for q in (50, 99))
+        return {
+            "predictions": self.num_predictions,
+            "touches": self.num_touches,
+            "age_ms": {"p50": p50, "p99": p99, "max": 1000 * self.max_age if len(ages) else None},
+            "stale": self.num_stale,
+            "streams": {
+                s.name: {"frames": s.num_frames, "dropped": s.num_dropped, "damaged": s.num_damaged} for s in self.all
+            },
+            "events": dict(self.counts),
+        }
+
+
+def neighbours(index: Any, k: int, modality: str = "touch") -> Callable[[dict[str, np.ndarray]], list[str]]:
+    """``Live``'s ``nearest`` from a ``retrieval.Index``: "id (label, ...)" of the k nearest known touches."""
+    from mvitac.retrieval import nearest
+
+    key = f"shared_{modality}" if index.meta["space"] == "shared" else f"embedding_{modality}"
+
+    def find(outputs: dict[str, np.ndarray]) -> list[str]:
+        query = outputs[key] / np.maximum(np.linalg.norm(outputs[key], axis=1, keepdims=True), 1e-12)
+        rows, _ = nearest(index.banks[modality], query, k)
+        return [f"{index.table.column('id')[r]} ({', '.join(index.labels(r).values())})" for r in rows[0].tolist()]
+
+    return find

@@ -1,0 +1,128 @@
+"""Record live input: pairs go to a spool on disk as they come, and become a pack at the end (or later, after a crash)."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvitac.pack import Pack, Sample, Source, build
+from mvitac.record import check_place, digest_file, read_json, write_atomic, write_json
+from mvitac.registry import from_json, to_json
+from mvitac.spec import DataSpec
+
+SPOOL = 64
+"""Pairs per file of the spool: what a crash can lose."""
+
+
+class Recorder:
+    """Call it with every pair; ``close`` makes the pack. At most ``fps`` pairs a second are kept."""
+
+    def __init__(self, out: Path, channels: dict[str, int], *, fps: float = 10.0) -> None:
+        """``channels`` by modality, of the images that will come, uint8 [S, S, C]."""
+        if out.exists():
+            raise ValueError(f"{out} already exists: choose another --record, or delete it first")
+        check_place(out)
+        self.out, self.every = out, 1 / fps
+        self.spool = out.with_name(out.name + ".spool")
+        if self.spool.exists():
+            raise ValueError(
+                f"{self.spool} holds a recording that was not finished: `mvitac live --finish {out}` makes a pack of it"
+            )
+        spec = DataSpec(
+            name="recording",
+            vision_channels=channels.get("vision", 0),
+            touch_channels=channels.get("touch", 0),
+            tasks=(),
+            group_by="contact",
+            licence="as the one who recorded it decides",
+            source="mvitac live",
+        )
+        self.spool.mkdir(parents=True)
+        write_json(self.spool / "spec.json", to_json(spec))
+        self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
+        self.num = 0
+        self._next = float("-inf")
+
+    def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
+        """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch."""
+        if columns["time"] < self._next:
+            return
+        # Counted from the last due time, not from this pair's: else every delay would lower the rate.
+        self._next = max(self._next + self.every, columns["time"])
+        self.waiting.append((images, columns))
+        if len(self.waiting) == SPOOL:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self.waiting:
+            return
+        arrays = {m: np.stack([images[m] for images, _ in self.waiting]) for m in self.waiting[0][0]}
+        columns = {f"column_{name}": np.array([c[name] for _, c in self.waiting]) for name in self.waiting[0][1]}
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays, **columns)  # type: ignore[arg-type]
+        write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
+        self.num += len(self.waiting)
+        self.waiting = []
+
+    def close(self) -> Pack | None:
+        """Write what is left and make the pack; None if nothing was recorded."""
+        self._flush()
+        if not self.num:
+            shutil.rmtree(self.spool)
+            return None
+        return finish(self.out)
+
+
+def finish(out: Path) -> Pack:
+    """The pack ``out`` from its spool, which is then deleted."""
+    spool = Recorded(out.with_name(out.name + ".spool"))
+    pack = build(spool, out, size=spool.size(), quiet=True)
+    shutil.rmtree(spool.path)
+    return pack
+
+
+class Recorded(Source):
+    """A spool as a source of a pack; an item is one of its files."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_dir():
+            raise ValueError(f"{path} does not exist: there is no unfinished recording to make a pack of")
+        self.files = sorted(path.glob("*.npz"))
+
+    def spec(self) -> DataSpec:
+        return from_json(DataSpec, read_json(self.path / "spec.json", "an unfinished recording"), "spec")
+
+    def size(self) -> int:
+        if not self.files:
+            raise ValueError(f"{self.path} holds no pairs: nothing to make a pack of")
+        return next(len(s.touch if s.touch is not None else s.vision) for s in self.read(0))  # type: ignore[arg-type]
+
+    def items(self) -> Sequence[str]:
+        return [path.name for path in self.files]
+
+    def num_samples(self) -> int:
+        return len(self.files) * SPOOL
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"recording": [digest_file(path) for path in self.files]}
+
+    def read(self, item: int) -> list[Sample]:
+        samples = []
+        with np.load(self.files[item], allow_pickle=False) as part:
+            arrays = {name: part[name] for name in part.files}
+        first = int(self.files[item].stem)
+        columns = {n.removeprefix("column_"): x.tolist() for n, x in arrays.items() if n.startswith("column_")}
+        pick: Callable[[str, int], np.ndarray | None] = lambda m, i: arrays[m][i] if m in arrays else None  # noqa: E731
+        for i in range(len(columns["time"])):
+            own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
+            # Frames between touches belong to nothing; each touch is a group of near-copies.
+            group = f"touch-{own['touch']:06d}" if own["contact"] else f"rest-{own['touch']:06d}"
+            own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled"}
+            samples.append(Sample(vision=pick("vision", i), touch=pick("touch", i), columns=own))
+        return samples

@@ -1,0 +1,104 @@
+// The explorer's map: a canvas of points to pan, zoom, hover and click. `props.value` is the JSON that landscape.points makes.
+// 100,000 points are drawn as small squares in one pass; the nearest to the pointer is found by looking at all of them.
+const canvas = element.querySelector("canvas"), tip = element.querySelector(".tip"), legend = element.querySelector(".legend");
+const count = element.querySelector(".count"), context = canvas.getContext("2d");
+let data = { x: [], y: [], colour: [], row: [], legend: [] }, view = { x: 0, y: 0, zoom: 1 }, hovered = -1, drag = null;
+
+function bytes(text) { return Uint8Array.from(atob(text), (c) => c.charCodeAt(0)); }
+
+function load() {
+  const given = JSON.parse(props.value || "{}");
+  if (given.row === undefined) return;
+  const xy = new Uint16Array(bytes(given.xy).buffer);
+  data = { x: xy.subarray(0, xy.length / 2), y: xy.subarray(xy.length / 2), colour: bytes(given.colour),
+           row: new Int32Array(bytes(given.row).buffer), legend: given.legend };
+  legend.replaceChildren(...given.legend.map(([name, colour]) => {
+    const item = document.createElement("span"), dot = document.createElement("i");
+    dot.style.background = colour;
+    item.append(dot, name);
+    return item;
+  }));
+  count.textContent = data.row.length ? `${data.row.length} pairs` : "nothing to show: choose another split or filter";
+  element.dataset.points = data.row.length;
+  hovered = -1;
+  draw();
+}
+
+function place(i) {  // canvas position of point i, in CSS pixels
+  const side = Math.min(canvas.clientWidth, canvas.clientHeight) * 0.92 * view.zoom;
+  return [canvas.clientWidth / 2 + (data.x[i] / 65535 - 0.5 + view.x) * side,
+          canvas.clientHeight / 2 + (data.y[i] / 65535 - 0.5 + view.y) * side];
+}
+
+function draw() {
+  const ratio = window.devicePixelRatio || 1;
+  canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  const size = data.row.length > 20000 ? 2 : data.row.length > 3000 ? 4 : 6;
+  data.legend.forEach(([, colour], c) => {
+    context.fillStyle = colour;
+    for (let i = 0; i < data.row.length; i++) {
+      if (data.colour[i] !== c) continue;
+      const [x, y] = place(i);
+      context.fillRect(x - size / 2, y - size / 2, size, size);
+    }
+  });
+  if (hovered >= 0) {
+    const [x, y] = place(hovered);
+    context.strokeStyle = "#000"; context.lineWidth = 2;
+    context.strokeRect(x - size, y - size, 2 * size, 2 * size);
+  }
+}
+
+function nearest(event) {
+  const box = canvas.getBoundingClientRect(), px = event.clientX - box.left, py = event.clientY - box.top;
+  let best = -1, least = 15 * 15;
+  for (let i = 0; i < data.row.length; i++) {
+    const [x, y] = place(i), d = (x - px) ** 2 + (y - py) ** 2;
+    if (d < least) { least = d; best = i; }
+  }
+  return best;
+}
+
+async function show(event) {
+  const now = nearest(event);
+  if (now === hovered) return;
+  hovered = now;
+  draw();
+  if (now < 0) { tip.style.display = "none"; return; }
+  const row = data.row[now], html = await server.tip(row);
+  if (hovered !== now) return;  // the pointer has moved on
+  tip.innerHTML = html;
+  tip.style.display = "block";
+  const [x, y] = place(now);
+  tip.style.left = `${Math.max(0, Math.min(x + 12, canvas.clientWidth - tip.offsetWidth))}px`;
+  tip.style.top = `${y > canvas.clientHeight / 2 ? y - tip.offsetHeight - 12 : y + 12}px`;
+}
+
+canvas.addEventListener("pointerdown", (e) => { drag = { x: e.clientX, y: e.clientY, moved: false }; canvas.setPointerCapture(e.pointerId); });
+canvas.addEventListener("pointermove", (e) => {
+  if (!drag) return show(e);
+  const side = Math.min(canvas.clientWidth, canvas.clientHeight) * 0.92 * view.zoom;
+  const dx = e.clientX - drag.x, dy = e.clientY - drag.y;
+  if (drag.moved || Math.abs(dx) + Math.abs(dy) > 4) {
+    drag.moved = true;
+    view.x += dx / side; view.y += dy / side; drag.x = e.clientX; drag.y = e.clientY;
+    tip.style.display = "none";
+    draw();
+  }
+});
+canvas.addEventListener("pointerup", (e) => {
+  const clicked = drag && !drag.moved ? nearest(e) : -1;
+  drag = null;
+  if (clicked >= 0) { show(e); trigger("click", { row: data.row[clicked] }); }
+});
+canvas.addEventListener("pointerleave", () => { if (!drag) { hovered = -1; tip.style.display = "none"; draw(); } });
+canvas.addEventListener("wheel", (e) => {
+  e.preventDefault();
+  view.zoom = Math.max(0.5, Math.min(200, view.zoom * Math.exp(-e.deltaY / 400)));
+  draw();
+}, { passive: false });
+canvas.addEventListener("dblclick", () => { view = { x: 0, y: 0, zoom: 1 }; draw(); });
+new ResizeObserver(draw).observe(canvas);
+watch("value", load);
+load();

@@ -1,0 +1,198 @@
+"""The explorer: its facts are arithmetic, its page works in a real browser (skipped where there is no Chromium)."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser
+from PIL import Image
+
+import mvitac
+from mvitac.cli import main
+from mvitac.landscape import Landscape
+from mvitac.pack import Pack
+
+
+@pytest.fixture(scope="module")
+def land(artifact: Path, pack: Pack) -> Landscape:
+    return Landscape(mvitac.load(artifact), pack)
+
+
+def decode(text: str) -> dict[str, Any]:
+    value = json.loads(text)
+    value["xy"] = np.frombuffer(base64.b64decode(value["xy"]), "<u2").reshape(2, -1)
+    value["row"] = np.frombuffer(base64.b64decode(value["row"]), "<i4")
+    value["colour"] = np.frombuffer(base64.b64decode(value["colour"]), np.uint8)
+    return value
+
+
+def test_points_carry_place_colour_and_row(land: Landscape, pack: Pack) -> None:
+    value = decode(land.points("both", "label", "test", "pattern"))
+    rows = pack.rows("test")
+    assert np.array_equal(value["row"], rows)
+    names = [value["legend"][c][0] for c in value["colour"]]
+    assert names == [pack.spec.tasks[0].classes[i] for i in pack.column("label_pattern")[rows]]
+    np.testing.assert_allclose(value["xy"].T / 65535, land.plane("both")[rows], atol=1e-4)
+
+
+def test_the_plane_holds_the_most_variance(land: Landscape) -> None:
+    x = land.x["touch"] - land.x["touch"].mean(0)
+    first, second = land.plane("touch").T
+    scores = np.linalg.svd(x, full_matrices=False)
+    for found, expected in ((first, scores[0][:, 0]), (second, scores[0][:, 1])):
+        assert abs(np.corrcoef(found, expected)[0, 1]) > 0.98  # the ends are clipped
+
+
+def test_errors_are_the_probes(land: Landscape, pack: Pack, artifact: Path) -> None:
+    said = mvitac.load(artifact).predict(vision=pack.images["vision"], touch=pack.images["touch"])["pattern"]
+    wrong = np.flatnonzero(said.argmax(1).numpy() != pack.column("label_pattern"))
+    assert 0 < len(wrong) < pack.num
+    assert np.array_equal(land.shown("all", "pattern", mistakes=True), wrong)
+    value = decode(land.points("both", "error", "all", "pattern"))
+    named = np.array([value["legend"][c][0] for c in value["colour"]])
+    assert np.array_equal(np.flatnonzero(named == "wrong"), wrong)
+    assert "(probe: " in land.describe(int(wrong[0]))
+
+
+def test_neighbours_leave_out_the_point_itself(land: Landscape) -> None:
+    pairs = land.neighbours(land.x["touch"][5:6], "touch", 4, without=5)
+    every = land.x["touch"] @ land.x["touch"][5]
+    every[5] = -2
+    assert [i for i, _ in pairs] == np.argsort(-every, kind="stable")[:4].tolist()
+
+
+def test_a_dropped_picture_is_classified_and_finds_itself(land: Landscape, pack: Pack) -> None:
+    said, pairs = land.query(np.array(pack.images["touch"][17]), "touch", 3)
+    assert pairs[0][0] == 17 and pairs[0][1] == pytest.approx(1, abs=1e-4)
+    assert set(said) == {"pattern", "bright"} and sum(said["pattern"].values()) == pytest.approx(1, abs=1e-4)
+
+
+def test_fewer_rows_are_evenly_spread(artifact: Path, pack: Pack) -> None:
+    few = Landscape(mvitac.load(artifact), pack, limit=50)
+    assert len(few.rows) <= 50 and set(np.diff(few.rows)) == {3}
+
+
+def test_a_run_that_is_not_finished_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoint.pt").touch()
+    assert main(["explore", str(tmp_path / "run")]) == 2
+    assert "the run is not finished" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if not CHROMIUM:
+        pytest.skip("no Chromium on the PATH: the page is not tested (apt-get install chromium)")
+    opened = Browser(tmp_path_factory.mktemp("profile"))
+    yield opened
+    opened.close()
+
+
+def centre_of_a_point(browser: Browser, land: Landscape, index: int) -> tuple[float, float]:
+    """Where scatter.js draws row ``index`` before any zoom."""
+    left, top, width, height = browser.run(
+        "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
+        " return [b.left, b.top, b.width, b.height] })()"
+    )
+    x, y = land.plane("both")[index]
+    side = min(width, height) * 0.92
+    return left + width / 2 + (x - 0.5) * side, top + height / 2 + (y - 0.5) * side
+
+
+POINTS = "document.querySelector('[data-points]').dataset.points"
+CLICK_BOX = "document.querySelector('input[type=checkbox]').click()"
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+@contextlib.contextmanager
+def serving(arguments: list[str], port: int) -> Iterator[None]:
+    """The server in a process of its own, until it answers on ``port``."""
+    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    try:
+        while True:
+            with socket.socket() as one:
+                if one.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.1)
+                assert process.stderr
+                raise AssertionError(process.stderr.read().decode()[-2000:])
+        yield
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def listeners(port: int) -> set[str]:
+    """Addresses on which something listens on ``port`` (Linux; IPv4 and IPv6)."""
+    found = set()
+    for table, loopback in (("tcp", "0100007F"), ("tcp6", "")):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            local, state = line.split()[1], line.split()[3]
+            if state == "0A" and local.endswith(f":{port:04X}"):
+                found.add("127.0.0.1" if local.split(":")[0] == loopback else local)
+    return found
+
+
+def test_the_page_in_a_browser(
+    browser: Browser, land: Landscape, pack: Pack, artifact: Path, smoke_run: Path, tmp_path: Path
+) -> None:
+    """Map, hover, click, filter, two runs side by side, a phone's width; listens on loopback only."""
+    port = free_port()
+    command = ["-m", "mvitac", "explore", str(artifact), str(smoke_run), "--on", str(pack.path), "--port", str(port)]
+    with serving(command, port):
+        assert listeners(port) == {"127.0.0.1"}
+        browser.resize(1200, 900)
+        browser.open(f"http://127.0.0.1:{port}")
+        browser.wait(f"{POINTS} == {len(pack.rows('test'))}")
+        assert browser.run("document.querySelectorAll('.map canvas').length") == 2
+        row = int(pack.rows("test")[0])
+        x, y = centre_of_a_point(browser, land, row)
+        browser.mouse("mouseMoved", x, y)
+        browser.wait("document.querySelector('.tip').style.display == 'block'")
+        shown = browser.run("document.querySelector('.tip').textContent")
+        pictured = browser.run("document.querySelectorAll('.tip img').length")
+        assert pictured == 2 and shown.split(" ·")[0] in pack.column("id")
+        browser.click(x, y)
+        browser.wait("document.querySelectorAll('.grid-wrap img, .gallery-item img').length >= 12")
+        browser.run(CLICK_BOX)
+        wrong = len(land.shown("test", "pattern", mistakes=True))
+        browser.wait(f"{POINTS} == {wrong}")
+        browser.resize(390, 844, mobile=True)
+        browser.wait("document.documentElement.scrollWidth <= 390")
+        browser.wait("document.querySelector('.map canvas').clientWidth > 200")
+        browser.screenshot(tmp_path / "phone.png")
+        with Image.open(tmp_path / "phone.png") as picture:
+            assert picture.size == (390, 844)
+        assert browser.problems == []
+
+
+def test_a_page_with_nothing_to_show_says_so(browser: Browser, artifact: Path, pack: Pack) -> None:
+    """A run in which every answer is right, filtered to its mistakes."""
+    port = free_port()
+    code = (
+        "import mvitac; from mvitac.explorer import page, serve; from mvitac.landscape import Landscape;"
+        f"land = Landscape(mvitac.load({str(artifact)!r}), mvitac.Pack({str(pack.path)!r}));"
+        f"land.guess = dict(land.labels); serve(page({{'run': land}}), port={port})"
+    )
+    with serving(["-c", code], port):
+        browser.open(f"http://127.0.0.1:{port}")
+        browser.wait(f"{POINTS} > 0")
+        browser.run(CLICK_BOX)
+        browser.wait(f"{POINTS} == 0")
+        assert "nothing to show" in browser.run("document.querySelector('.count').textContent")
