@@ -21,6 +21,7 @@ what the features are worth.
   data sheet KIND      a picture of what the simulator makes
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes beside their controls
+  compare              many runs into the paper's tables (--plan NAME or FILE)
   report RUN...        one HTML page with curves, tables and pictures
 
 First steps:
@@ -38,6 +39,7 @@ COMMANDS = {
     "data sheet": "data:sheet",
     "pretrain": "learn:pretrain",
     "probe": "learn:probe",
+    "compare": "compare:compare",
     "report": "learn:report",
 }
 """Command -> module of ``commands``:function, imported when called."""
