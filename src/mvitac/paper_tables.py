@@ -19,7 +19,7 @@ from mvitac.record import write_atomic, write_json
 from mvitac.registry import from_json
 from mvitac.tables import MODALITY_ORDER, PROBE_NAMES, retrieval_means
 
-CONTROLS_LAST = ("imagenet", "untrained", "pixels", "border")
+CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority")
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
     tasks = list(summary)
     sources = [name for label in result["rows"] for name in (label, label + END_TO_END)]
     found = {source for task in summary.values() for m in task.values() for source in m}
-    rest = sorted(found - set(sources), key=lambda s: (s not in CONTROLS_LAST, s == "majority"))
+    own = sorted(found - set(sources) - set(CONTROLS))  # the data's own
+    rest = [*(s for s in CONTROLS[:-1] if s in found), *own, *(s for s in CONTROLS[-1:] if s in found)]
     printed = {row.label: row.printed for row in plan.rows}
     lines = []
     for source in (*sources, *rest):
