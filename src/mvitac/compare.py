@@ -25,12 +25,14 @@ import numpy as np
 import torch
 
 from mvitac.encoders import SCRATCH
+from mvitac.model import load
 from mvitac.pack import Pack
 from mvitac.plans import Plan, Row, slug
 from mvitac.probe import Session, chosen, controls_of, probe_runs
 from mvitac.record import digest, provenance, read_json, write_json
 from mvitac.registry import to_json
 from mvitac.run import Run
+from mvitac.stress import stress
 from mvitac.train import Diverged, describe, pick_device, train, training_rows
 
 
@@ -42,10 +44,12 @@ class Job:
     run: Run
     out: Path
     session: Session
+    stress: bool = False
 
     @property
     def done(self) -> bool:
-        return (self.out / "failed.json").exists() or (self.out / "scores.json").exists()
+        scored = (self.out / "scores.json").exists() and (not self.stress or (self.out / "stress.json").exists())
+        return scored or (self.out / "failed.json").exists()
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
     if not possible:
         raise ValueError(f"plan {plan.name!r} has no row that this data allows: {next(iter(left_out.values()))}")
     jobs = [
-        Job(row.label, replace(plan.run(row, plan.data, seed), device=device), place, session)
+        Job(row.label, replace(plan.run(row, plan.data, seed), device=device), place, session, plan.stress)
         for seed in range(plan.seeds)
         for row in possible
         for place in (out / "runs" / slug(row.label) / f"seed{seed}",)
@@ -111,6 +115,10 @@ def do(job: Job, pack: Pack | None = None) -> str:
     if torch.cuda.is_available():
         write_json(job.out / "memory.json", {"peak_bytes": torch.cuda.max_memory_allocated()})
     result = probe_runs([job.out], job.session, pack)
+    if job.stress:
+        records = stress(load(job.out), pack, *chosen(pack, job.session))
+        own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
+        write_json(job.out / "stress.json", {"records": [{**own, **record} for record in records]})
     write_json(job.out / "scores.json", {"records": result["records"], "retrieval": result["retrieval"]})
     return f"{seconds_of(job.out):.0f} s of training"
 
@@ -191,7 +199,7 @@ def submit(work: Work, options: str) -> str:
 
 def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
     """Everything the tables are made of, from the finished runs; ValueError if there is none."""
-    finished = [job for job in work.jobs if (job.out / "scores.json").exists()]
+    finished = [job for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
     if not finished:
         raise ValueError(f"no run of {out} is finished: nothing to tell yet")
     records: list[dict[str, Any]] = []
@@ -199,7 +207,8 @@ def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
     for job in finished:
         scores = read_json(job.out / "scores.json", "a run's scores")
         method = job.run.method.name
-        for record in scores["records"]:
+        worse = read_json(job.out / "stress.json", "a run's stress")["records"] if job.stress else []
+        for record in scores["records"] + worse:
             records.append({**record, "source": job.label + record["source"].removeprefix(method)})
         retrieval += [{**found, "source": job.label} for found in scores["retrieval"]]
     controls, found = _controls(work, out, session)

@@ -17,6 +17,7 @@ from mvitac.plans import Plan
 from mvitac.probe import END_TO_END, paired_difference, summarise
 from mvitac.record import write_atomic, write_json
 from mvitac.registry import from_json
+from mvitac.stress import STRESSES
 from mvitac.tables import MODALITY_ORDER, PROBE_NAMES, retrieval_means
 
 CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority")
@@ -71,6 +72,8 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
                     paper = None  # what was printed for it is its own classifier's score
                 if source == "majority":
                     paper = plan.printed_majority.get(task)
+                if probe in STRESSES:
+                    paper = None  # nobody printed those
                 against = records.get((task, modality, plan.reference))
                 gap = None
                 if against and source != plan.reference:
@@ -98,6 +101,17 @@ def _by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[tuple[str, s
     return found
 
 
+def stresses_of(result: dict[str, Any]) -> dict[str, list[Line]]:
+    """The lines of every stress (``mvitac.stress``) that was scored; of the controls only majority is comparable."""
+    found = {}
+    for kind in STRESSES:
+        mine = [r for r in result["records"] if r["probe"] == kind]
+        if mine:
+            majority = [r for r in result["records"] if r["source"] == "majority"]
+            found[kind] = lines_of({**result, "records": mine + majority}, kind)
+    return found
+
+
 def write_tables(result: dict[str, Any], out: Path) -> list[Path]:
     """Write result.json, table.md, table.tex, table.csv and table.png into ``out``; returns their paths."""
     lines = lines_of(result)
@@ -115,21 +129,29 @@ def write_tables(result: dict[str, Any], out: Path) -> list[Path]:
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what it is, the table, retrieval, cost."""
     plan: Plan = from_json(Plan, result["plan"], "plan")
-    tasks = _tasks(lines)
     shown = any(cell.printed is not None for line in lines for cell in line.cells.values())
     text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, shown), ""]
+    text += _table(lines, plan.reference, shown)
+    for kind, worse in stresses_of(result).items():
+        text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
+    text += [*_retrieval(result), *_cost(result)]
+    return "\n".join(text).rstrip() + "\n"
+
+
+def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
+    """Lines as a Markdown table, with the printed numbers if ``shown``."""
+    tasks = _tasks(lines)
     heads = ["", "modality"]
     for task in tasks:
-        heads += [f"{task} %", *(["printed"] if shown else []), f"to {plan.reference}"]
-    text += [f"| {' | '.join(heads)} |", f"|---|---{'|---:' * (len(heads) - 2)}|"]
+        heads += [f"{task} %", *(["printed"] if shown else []), f"to {reference}"]
+    text = [f"| {' | '.join(heads)} |", f"|---|---{'|---:' * (len(heads) - 2)}|"]
     for line in lines:
         row = [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
         for task in tasks:
             cell = line.cells.get(task)
             row += [_score(cell), *([_printed(cell)] if shown else []), _gap(cell)]
         text.append(f"| {' | '.join(row)} |")
-    text += ["", *_retrieval(result), *_cost(result)]
-    return "\n".join(text).rstrip() + "\n"
+    return [*text, ""]
 
 
 def _tasks(lines: Sequence[Line]) -> list[str]:
@@ -259,8 +281,9 @@ def comma(result: dict[str, Any]) -> str:
     writer = csv.writer(buffer, lineterminator="\n")
     heads = ("row", "control", "probe", "modality", "task", "accuracy", "low", "high", "seeds", "printed")
     writer.writerow((*heads, "difference", "difference_low", "difference_high", "p"))
-    for probe in plan.probes:
-        for line in lines_of(result, probe):
+    tables = {**{probe: lines_of(result, probe) for probe in plan.probes}, **stresses_of(result)}
+    for probe, lines in tables.items():
+        for line in lines:
             for task, cell in line.cells.items():
                 values = (line.source, int(line.control), probe, line.modality, task, cell.mean, cell.low, cell.high)
                 writer.writerow((*values, cell.seeds, cell.printed, *(cell.difference or ("",) * 4)))

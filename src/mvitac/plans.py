@@ -65,6 +65,8 @@ class Plan:
     """Tasks to score; none given = all of the data's."""
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
     """Modalities to score; none given = all."""
+    stress: bool = False
+    """Also score few labels, noisy test images and a modality missing at test time (``mvitac.stress``)."""
     printed_on: str = ""
     """Name of the dataset that the paper's numbers are about."""
     printed_majority: dict[str, float] = field(default_factory=dict)

@@ -46,6 +46,8 @@ def compare(argv: list[str]) -> None:
         """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
         imagenet: Path | None = None
         """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
+        stress: bool = plan.stress
+        """Also score 1 % and 10 % of the labels, noisy test images, and a modality missing at test time."""
         dry_run: bool = False
         """Print the plan, what is finished and what is left, and stop."""
         tables_only: bool = False
@@ -83,6 +85,7 @@ def compare(argv: list[str]) -> None:
         data=options.data,
         recipe=given.get("--recipe", plan.recipe),
         seeds=options.seeds,
+        stress=options.stress,
         set={**plan.set, **extra},
     )
     session = Session(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities, imagenet=options.imagenet)
