@@ -22,7 +22,8 @@ from mvitac.recipes import with_method
 from mvitac.registry import default, from_json, to_json
 from mvitac.run import Optim
 from mvitac.spec import DataSpec
-from mvitac.train import build_optimiser, train
+from mvitac.step import build_optimiser
+from mvitac.train import train
 
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
 NAMES = sorted(MethodConfig.choices)

@@ -19,10 +19,14 @@ what the features are worth.
   data pack            read any dataset (--data NAME) into a pack
   data info PACK       what is in a pack
   data sheet KIND      a picture of what the simulator makes
+  data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
+  data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes beside their controls
   compare              many runs into the paper's tables (--plan NAME or FILE)
   report RUN...        one HTML page with curves, tables and pictures
+  publish RUN OUT      weights, probes, model card: one folder, or on the Hub
+  export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
 
 First steps:
   mvitac demo                                        # no data needed
@@ -37,10 +41,14 @@ COMMANDS = {
     "data pack": "data:pack",
     "data info": "data:info",
     "data sheet": "data:sheet",
+    "data show": "data:show",
+    "data export-lerobot": "data:export_lerobot",
     "pretrain": "learn:pretrain",
     "probe": "learn:probe",
     "compare": "compare:compare",
     "report": "learn:report",
+    "publish": "robot:publish",
+    "export": "robot:export",
 }
 """Command -> module of ``commands``:function, imported when called."""
 

@@ -23,6 +23,7 @@ from mvitac.augment import plain_view
 from mvitac.encoders import SCRATCH
 from mvitac.methods.base import Method
 from mvitac.pack import Pack, fit
+from mvitac.readout import Readout
 from mvitac.record import brief, digest, read_json, write_atomic
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
@@ -44,6 +45,8 @@ class Model(nn.Module):
         own = method.classifiers()
         self.tasks = tuple(own)
         self.classifiers = nn.ModuleList(own.values())
+        # No part of the state dict: a run's weights are the same with and without the probes that were published.
+        self.readouts: dict[str, Readout] = {}
         self.eval()
 
     @torch.no_grad()
@@ -90,6 +93,26 @@ class Model(nn.Module):
             features = self.features(modality, images)
             result[modality] = self.project(modality, features) if shared else features
         return result
+
+    def predict(self, *, vision: Images | None = None, touch: Images | None = None) -> dict[str, Tensor]:
+        """Class probabilities [N, K] by task, from the probes that a published artifact carries.
+
+        Given both modalities, the probe on both answers. ``classes`` names the columns. ValueError as for ``embed``, and
+        where there is no probe.
+        """
+        given = self.embed(vision=vision, touch=touch)
+        asked = "both" if len(given) == 2 else next(iter(given))
+        if len({len(x) for x in given.values()}) > 1:
+            raise ValueError(f"predict: got {len(given['vision'])} vision and {len(given['touch'])} touch images")
+        chosen = [r for r in self.readouts.values() if r.question.modality == asked]
+        if not chosen:
+            raise ValueError(f"this model has no probe on {asked}: load an artifact written by `mvitac publish`")
+        return {r.question.task: r(torch.cat([given[m].cpu() for m in r.question.modalities], dim=1)) for r in chosen}
+
+    @property
+    def classes(self) -> dict[str, tuple[str, ...]]:
+        """Class names by task, in the order of ``predict``'s columns."""
+        return {r.question.task: r.question.classes for r in self.readouts.values()}
 
     def weights_digest(self) -> str:
         """Content address of the weights and of the view they expect, for caches."""

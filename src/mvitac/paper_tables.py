@@ -176,7 +176,7 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     if shown:
         text.append(
             f'"printed" is the paper\'s number on {plan.printed_on}'
-            + ("." if plan.printed_on == result["data"] else ", which is other data: compare orders, never values.")
+            + ("." if _papers(result, plan) else ", which is other data: compare orders, never values.")
         )
     if result["leaks"]:
         text.append(f"**LEAK: {result['leaks']}.**")
@@ -185,6 +185,11 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     if result["unfinished"]:
         text.append(f"**Not finished: {', '.join(result['unfinished'])}.**")
     return [line for part in text for line in (part, "")][:-1]
+
+
+def _papers(result: dict[str, Any], plan: Plan) -> bool:
+    """Whether the paper's numbers are about this data, whose name may go on with its split: touch-and-go (official)."""
+    return result["data"].split(" ")[0] == plan.printed_on
 
 
 def _score(cell: Cell | None) -> str:
@@ -300,6 +305,7 @@ def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
     """
     from matplotlib.figure import Figure
 
+    plan: Plan = from_json(Plan, result["plan"], "plan")
     tasks = _tasks(lines)
     sources = list(dict.fromkeys(line.source for line in lines if line.modality != "none"))[::-1]
     figure = Figure(figsize=(3.2 + 3.6 * len(tasks), 1.6 + 0.36 * len(sources)), dpi=110, layout="constrained")
@@ -316,7 +322,7 @@ def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
             y = sources.index(line.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[line.modality]
             axis.plot([100 * cell.low, 100 * cell.high], [y, y], color=COLOURS[line.modality], lw=1.6)
             axis.plot(100 * cell.mean, y, "o", ms=4.5, color=COLOURS[line.modality], label=line.modality)
-            if cell.printed is not None and result["data"] == result["plan"]["printed_on"]:
+            if cell.printed is not None and _papers(result, plan):
                 axis.plot(100 * cell.printed, y, "x", ms=6, color=COLOURS[line.modality], alpha=0.6, label="printed")
         axis.set_title(task, fontsize=10, loc="left")
         axis.set_xlabel("accuracy %", fontsize=9)

@@ -32,35 +32,33 @@ def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence
     of one seed, so that differences are paired."""
     seed, records = model.run.seed, []
     noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
-    for task in tasks:
-        rows = parts(pack, task)
+    for task, modality in ((task, modality) for task in tasks for modality in modalities):
+        names = list(pack.spec.modalities) if modality == "both" else [modality]
+        if not set(names) <= set(model.encoders):
+            continue
+        rows = parts(pack, task, modality)
         learned = np.concatenate([rows.train, rows.val])
-        clean = {m: features(model, pack, m, np.concatenate([learned, rows.test])) for m in model.encoders}
-        for m in model.encoders:
+        clean = {m: features(model, pack, m, np.concatenate([learned, rows.test])) for m in names}
+        for m in names:
             known = noisy.setdefault(m, {})
-            missing = np.array([row for row in rows.test if int(row) not in known], np.int64)
-            if len(missing):
-                known.update(zip(missing.tolist(), _noisy_features(model, pack, m, missing, seed), strict=True))
+            new = np.array([row for row in rows.test if int(row) not in known], np.int64)
+            if len(new):
+                known.update(zip(new.tolist(), _noisy_features(model, pack, m, new, seed), strict=True))
 
-        def score(modality: str, kind: str, x: np.ndarray, rows: Parts = rows, task: Task = task) -> None:
+        def score(kind: str, x: np.ndarray, rows: Parts = rows, task: Task = task, modality: str = modality) -> None:
             result = probe_features(x, pack, task, rows, "linear", seed)
             records.append({"task": task.name, "modality": modality, "probe": kind, **result})
 
-        for modality in modalities:
-            names = list(model.encoders) if modality == "both" else [modality]
-            if not set(names) <= set(model.encoders) or (modality == "both" and len(names) < 2):
-                continue
-            x = np.concatenate([clean[m] for m in names], axis=1)
-            for kind, share in SHARES.items():
-                keep, few = _few(rows, pack.labels(task.name), share, seed)
-                score(modality, kind, x[keep], few)
-            test = np.concatenate([np.stack([noisy[m][int(row)] for row in rows.test]) for m in names], axis=1)
-            score(modality, NOISE, np.concatenate([x[: len(learned)], test]))
-            if modality == "both":
-                for lost, kind in MISSING.items():
-                    blind = {m: z.copy() for m, z in clean.items()}
-                    blind[lost][len(learned) :] = clean[lost][: len(learned)].mean(0)
-                    score(modality, kind, np.concatenate([blind[m] for m in names], axis=1))
+        x = np.concatenate([clean[m] for m in names], axis=1)
+        for kind, share in SHARES.items():
+            keep, few = _few(rows, pack.labels(task.name), share, seed)
+            score(kind, x[keep], few)
+        test = np.concatenate([np.stack([noisy[m][int(row)] for row in rows.test]) for m in names], axis=1)
+        score(NOISE, np.concatenate([x[: len(learned)], test]))
+        for lost, kind in MISSING.items() if modality == "both" else ():
+            blind = {m: z.copy() for m, z in clean.items()}
+            blind[lost][len(learned) :] = clean[lost][: len(learned)].mean(0)
+            score(kind, np.concatenate([blind[m] for m in names], axis=1))
     return records
 
 

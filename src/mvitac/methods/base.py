@@ -50,6 +50,29 @@ class Method(nn.Module, ABC):
         return
 
 
+class Contrastive(Method):
+    """A method whose losses need nothing of a batch but its embeddings, each [B, E], row i being pair i.
+
+    Saying so in three parts lets the loop embed a batch in chunks (gradient caching) or on many processes (all-gathered
+    negatives) and contrast all of it at once (``step.py``).
+    """
+
+    @abstractmethod
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        """Embeddings that gradients flow into."""
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        """Embeddings that none flows into, such as those of momentum towers."""
+        return {}
+
+    @abstractmethod
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The losses of ``forward`` from all ``queries`` and ``keys``, by name."""
+
+    def forward(self, batch: Views) -> dict[str, Tensor]:
+        return self.contrast(self.queries(batch) | self.keys(batch))
+
+
 @dataclass(frozen=True, kw_only=True)
 class MethodConfig(Registered, ABC):
     """Base of every method's config, which lies beside its method."""

@@ -12,12 +12,13 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import torch
 from torch import Tensor, nn
 
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Head, build_trunk
 from mvitac.losses import info_nce
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
 
@@ -99,7 +100,7 @@ class Tower(nn.Module):
         return self.intra(features), self.inter(features)
 
 
-class MViTac(Method):
+class MViTac(Contrastive):
     """Query towers, their momentum copies, four losses."""
 
     views = 2
@@ -111,24 +112,31 @@ class MViTac(Method):
         self.query = nn.ModuleDict({m: Tower(config, encoder, spec.channels(m)) for m in spec.modalities})
         self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.query.items()})
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
-        tau = self.config.temperature
-        query = {m: self.query[m](views[0]) for m, views in batch.images.items()}
-        key = {m: self.key[m](views[1]) for m, views in batch.images.items()}
-        losses: dict[str, Tensor] = {}
-        if "vision" in query:
-            (z_vv_q, z_vt_q), (z_vv_k, z_tv_k) = query["vision"], key["vision"]  # eq. 4, 9 and eq. 5, 13
-            losses["vv"] = info_nce(z_vv_q, z_vv_k, tau)  # eq. 8
-        if "touch" in query:
-            (z_tt_q, z_tv_q), (z_tt_k, z_vt_k) = query["touch"], key["touch"]  # eq. 6, 12 and eq. 7, 10
-            losses["tt"] = info_nce(z_tt_q, z_tt_k, tau)
-        if len(losses) == 2:  # with one modality, eq. 14 keeps its intra loss
-            losses["vt"] = info_nce(z_vt_q, z_vt_k, tau)  # eq. 11  # type: ignore[possibly-unbound]
-            losses["tv"] = info_nce(z_tv_q, z_tv_k, tau)  # type: ignore[possibly-unbound]
-        # eq. 14; a loss that is left out of it is still told, as a witness of what the others do to it
-        weight = {"vv": 1.0, "tt": 1.0, "vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
-        total = sum(weight[name] * loss for name, loss in losses.items() if name in self.config.losses)
-        return {"loss": total, **losses}  # type: ignore[dict-item]
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        z: dict[str, Tensor] = {}
+        if "vision" in batch.images:
+            z["vv_q"], z["vt_q"] = self.query["vision"](batch.images["vision"][0])  # eq. 4, 9
+        if "touch" in batch.images:
+            z["tt_q"], z["tv_q"] = self.query["touch"](batch.images["touch"][0])  # eq. 6, 12
+        return z
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        z: dict[str, Tensor] = {}
+        if "vision" in batch.images:
+            z["vv_k"], z["tv_k"] = self.key["vision"](batch.images["vision"][1])  # eq. 5, 13
+        if "touch" in batch.images:
+            z["tt_k"], z["vt_k"] = self.key["touch"](batch.images["touch"][1])  # eq. 7, 10
+        return z
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+        parts = [part for part in ("vv", "tt", "vt", "tv") if f"{part}_q" in z and f"{part}_k" in z]
+        losses = {
+            part: info_nce(z[f"{part}_q"], z[f"{part}_k"], self.config.temperature) for part in parts
+        }  # eq. 8, 11
+        weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
+        # A loss that is left out of the sum is still told, as a witness of what the others do to it.
+        weighted = [weight.get(part, 1.0) * losses[part] for part in parts if part in self.config.losses]
+        return {"loss": torch.stack(weighted).sum(), **losses}  # eq. 14, or what is left of it with one modality
 
     def encoders(self) -> dict[str, nn.Module]:
         return {m: tower.trunk for m, tower in self.query.items()}  # type: ignore[misc]
