@@ -295,6 +295,15 @@ def test_paired_difference_of_equals_is_not_significant() -> None:
     assert paired_difference(a, a) == (0.0, 0.0, 0.0, 1.0)
 
 
+def test_equal_seeds_are_paired() -> None:
+    """Seeds differ by 50 points, but ours has one more right under each: certain where seeds are the same, not where not."""
+    theirs = [record([2] * 30, 0), record([7] * 30, 1)]
+    ours = [record([3] * 30, 0), record([8] * 30, 1)]
+    assert paired_difference(ours, theirs)[1:3] == pytest.approx((0.1, 0.1))
+    others = [{**r, "seed": r["seed"] + 5} for r in ours]
+    assert paired_difference(others, theirs)[1] < 0
+
+
 def test_paired_difference_doubts_seeds_too() -> None:
     """Better by chance of one seed of two: the interval over seeds reaches below zero."""
     a = [record([9] * 30, 0), record([3] * 30, 1)]
