@@ -24,6 +24,7 @@ what the features are worth.
   data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes beside their controls
+  compare              many runs into the paper's tables (--plan NAME or FILE)
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
@@ -51,6 +52,7 @@ COMMANDS = {
     "data export-lerobot": "data:export_lerobot",
     "pretrain": "learn:pretrain",
     "probe": "learn:probe",
+    "compare": "compare:compare",
     "report": "learn:report",
     "publish": "robot:publish",
     "export": "robot:export",

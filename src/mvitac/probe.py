@@ -33,6 +33,8 @@ PROBES = ("linear", "paper", "knn")
 Probe = Literal["linear", "paper", "knn"]
 STRENGTHS = (0.001, 0.01, 0.1, 1.0)
 """Inverse regularisation C that logistic regression may choose from."""
+END_TO_END = ", end to end"
+"""Added to a source's name where its own classifiers are scored, which it trained along with its encoders."""
 NUM_DRAWS = 2000
 """Bootstrap draws behind every interval."""
 MIN_GALLERY = 10
@@ -206,7 +208,7 @@ def probe_features(x: np.ndarray, pack: Pack, task: Task, rows: Parts, kind: str
     """One probe of ``kind`` on features ``x`` [train + val + test rows in this order, D]."""
     labels = pack.column(f"label_{task.name}").astype(int)
     num_train, num_val, num = len(rows.train), len(rows.val), len(task.classes)
-    y, y_val, y_test = labels[rows.train], labels[rows.val], labels[rows.test]
+    y, y_val = labels[rows.train], labels[rows.val]
     learn, choose, test = x[:num_train], x[num_train : num_train + num_val], x[num_train + num_val :]
     whole, y_whole = np.concatenate([learn, choose]), np.concatenate([y, y_val])
     extra: dict[str, Any] = {}
@@ -221,8 +223,7 @@ def probe_features(x: np.ndarray, pack: Pack, task: Task, rows: Parts, kind: str
         probabilities = fit_knn(whole, y_whole, num)(test)
     else:
         raise unknown("probe", kind, PROBES)
-    groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
-    return {**score(y_test, probabilities, groups, num), **extra}
+    return {**score_rows(pack, task, rows.test, probabilities), **extra}
 
 
 # -- a whole probing session ------------------------------------------------------------------------------------------
@@ -272,11 +273,11 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
             "these runs were trained on different data: probe them apart, or give one pack for all with --on"
         )
     pack = packs[0]
-    tasks, modalities = _chosen(pack, session)
+    tasks, modalities = chosen(pack, session)
     for path, model in zip(paths, models, strict=True):
         check_place(path / "probe.json")
         for modality in pack.spec.modalities:
-            if modality not in model.encoders or model.spec.channels(modality) != pack.spec.channels(modality):
+            if model.spec.channels(modality) != pack.spec.channels(modality):
                 raise ValueError(
                     f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
                     f" it was trained on {model.spec.name!r}"
@@ -294,6 +295,8 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         source = f"{model.run.method.name} ({model.run.recipe})" if several else model.run.method.name
         own = {"source": source, "seed": model.run.seed, "run": str(path)}
         mine = [{**own, **r} for r in _probe_model(model, pack, tasks, modalities, session.probes)]
+        for record in mine:
+            record["source"] += END_TO_END if record["probe"] == "own" else ""
         found = [{**own, **r} for r in cross_modal(model, pack)]
         write_json(
             path / "probe.json", {"data": pack.spec.name, "pack": pack.digest, "records": mine, "retrieval": found}
@@ -301,7 +304,7 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         records += mine
         retrieval += found
     if session.controls:
-        controls, found = _controls([m.run for m in models], pack, tasks, modalities, session)
+        controls, found = controls_of([m.run for m in models], pack, tasks, modalities, session)
         records += controls
         retrieval += found
     return {
@@ -316,7 +319,8 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
     }
 
 
-def _chosen(pack: Pack, session: Session) -> tuple[list[Task], list[str]]:
+def chosen(pack: Pack, session: Session) -> tuple[list[Task], list[str]]:
+    """The tasks and modalities of ``session`` on this data; ValueError names what it lacks."""
     known = {task.name: task for task in pack.spec.tasks}
     if not known:
         raise ValueError(f"dataset {pack.spec.name!r} has no labels: nothing to probe")
@@ -335,16 +339,34 @@ def _chosen(pack: Pack, session: Session) -> tuple[list[Task], list[str]]:
 def _probe_model(
     model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str], probes: Sequence[str]
 ) -> list[dict[str, Any]]:
+    # A supervised reference may have learned from one modality only; the others are no business of its.
+    modalities = [m for m in modalities if set(pack.spec.modalities if m == "both" else (m,)) <= set(model.encoders)]
+    if not modalities:
+        return []
     asked = [parts(pack, task, modality) for task in tasks for modality in modalities]
     needed = np.unique(np.concatenate([np.concatenate([p.train, p.val, p.test]) for p in asked]))
-    own = {m: needed[pack.has(m)[needed]] for m in pack.spec.modalities if m in modalities or "both" in modalities}
+    own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
     by_modality = {m: features(model, pack, m, rows) for m, rows in own.items()}
 
     def matrix(modality: str, rows: np.ndarray) -> np.ndarray:
         names = pack.spec.modalities if modality == "both" else (modality,)
         return np.concatenate([by_modality[m][np.searchsorted(own[m], rows)] for m in names], axis=1)
 
-    return _probe_all(matrix, pack, tasks, modalities, probes, model.run.seed)
+    records = _probe_all(matrix, pack, tasks, modalities, probes, model.run.seed)
+    whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
+    for task in (task for task in tasks if task.name in model.tasks and whole in modalities):
+        rows = parts(pack, task, whole).test
+        z = {m: torch.from_numpy(matrix(m, rows)) for m in model.encoders}
+        result = score_rows(pack, task, rows, model.classify(task.name, z).numpy())
+        records.append({"task": task.name, "modality": whole, "probe": "own", **result})
+    return records
+
+
+def score_rows(pack: Pack, task: Task, rows: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
+    """Scores of class ``probabilities`` [len(rows), K] of pack ``rows``."""
+    labels = pack.column(f"label_{task.name}").astype(int)[rows]
+    groups = np.unique(pack.column("group")[rows].astype(str), return_inverse=True)[1]
+    return score(labels, probabilities, groups, len(task.classes))
 
 
 def _probe_all(
@@ -362,9 +384,10 @@ def _probe_all(
     return records
 
 
-def _controls(
+def controls_of(
     runs: Sequence[Run], pack: Pack, tasks: Sequence[Task], modalities: Sequence[str], session: Session
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Records of every control beside ``runs``, and the retrieval of those that have a shared space."""
     records: list[dict[str, Any]] = []
     retrieval: list[dict[str, Any]] = []
 
@@ -376,9 +399,8 @@ def _controls(
         everything = np.concatenate([rows.train, rows.val, rows.test])
         labels = pack.column(f"label_{task.name}").astype(int)
         common = np.bincount(labels[np.concatenate([rows.train, rows.val])], minlength=len(task.classes)).argmax()
-        groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
         constant = np.eye(len(task.classes))[np.full(len(rows.test), common)]
-        result = score(labels[rows.test], constant, groups, len(task.classes))
+        result = score_rows(pack, task, rows.test, constant)
         add("majority", None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column)[everything].astype(float) for column in columns], axis=1)
@@ -464,6 +486,37 @@ def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
     means = np.take_along_axis(per_seed, seeds, axis=1).mean(1)
     low, high = np.percentile(means, [2.5, 97.5])
     return float(correct.sum(1).mean() / sizes.sum()), float(low), float(high)
+
+
+def paired_difference(
+    ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]
+) -> tuple[float, float, float, float]:
+    """Accuracy of ``ours`` minus that of ``theirs`` over the same test groups: mean, 95 % interval, two-sided p.
+
+    Bootstrap over test groups, the same ones drawn for both, and over seeds: together where both have the same seeds
+    (equal seeds share batches and views), apart otherwise. p is twice the share of draws on the other side of zero, at
+    least 2 / (draws + 1). One group says nothing about others: p is 1.
+    """
+    sizes = np.array(ours[0]["group_sizes"], float)
+    assert all(list(r["group_sizes"]) == list(sizes) for r in (*ours, *theirs)), "scored on different test rows"
+    a, b = (np.array([r["group_correct"] for r in found], float) for found in (ours, theirs))  # [S, G]
+    mean = float((a.sum(1).mean() - b.sum(1).mean()) / sizes.sum())
+    if len(sizes) < 2:
+        return mean, -1.0, 1.0, 1.0
+    rng = np.random.default_rng(0)
+    drawn_a = rng.integers(0, len(a), (NUM_DRAWS, len(a)))
+    together = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
+    drawn_b = drawn_a if together else rng.integers(0, len(b), (NUM_DRAWS, len(b)))
+    groups = rng.integers(0, len(sizes), (NUM_DRAWS, len(sizes)))
+    weights = np.stack([np.bincount(g, minlength=len(sizes)) for g in groups])  # [draws, G]
+    total = np.maximum(weights @ sizes, 1)[:, None]
+    gaps = [
+        np.take_along_axis(weights @ x.T / total, drawn, axis=1).mean(1) for x, drawn in ((a, drawn_a), (b, drawn_b))
+    ]
+    draws = gaps[0] - gaps[1]
+    low, high = np.percentile(draws, [2.5, 97.5])
+    tail = min(int((draws <= 0).sum()), int((draws >= 0).sum()))
+    return mean, float(low), float(high), min(1.0, 2 * (tail + 1) / (NUM_DRAWS + 1))
 
 
 def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:

@@ -38,7 +38,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
     for name, task in result["summary"].items():
         modalities = columns_of(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
-        title = f"{result['data']}: {name} ({PROBE_NAMES[probe]}; {seeds} seed{'s' * (seeds != 1)})"
+        title = f"{result['data']}: {name} ({PROBE_NAMES.get(probe, probe)}; {seeds} seed{'s' * (seeds != 1)})"
         table = Table(title=title, title_justify="left", title_style="bold")
         table.add_column("accuracy %")
         for modality in modalities:

@@ -66,9 +66,11 @@ def probe(argv: list[str]) -> None:
     import tyro
     from rich.console import Console
 
+    from mvitac.model import load
     from mvitac.pack import Pack
-    from mvitac.probe import Session, probe_runs, summarise
+    from mvitac.probe import Session, chosen, probe_runs, summarise
     from mvitac.record import check_place, write_json
+    from mvitac.stress import STRESSES, stress
     from mvitac.tables import print_retrieval, print_summary
 
     @dataclass(frozen=True, kw_only=True)
@@ -80,6 +82,8 @@ def probe(argv: list[str]) -> None:
         session: Annotated[Session, tyro.conf.arg(name="")] = Session()
         on: Path | None = None
         """Probe on this pack instead of the data the runs were trained on."""
+        stress: bool = False
+        """Also learn from 1 % and 10 % of the labels, and score noisy test images and a modality missing at test time."""
         json: Path | None = None
         """Also write everything that is printed, and more, to this file."""
 
@@ -88,11 +92,24 @@ def probe(argv: list[str]) -> None:
         check_place(options.json)
         if options.json.is_dir():
             raise ValueError(f"--json {options.json} is a folder: give another name, of a file")
-    result = probe_runs(options.runs, options.session, Pack(options.on) if options.on else None)
+    pack = Pack(options.on) if options.on else None
+    result = probe_runs(options.runs, options.session, pack)
+    worse = []
+    for path in options.runs if options.stress else ():
+        model = load(path)
+        where = pack or model.run.data.open()
+        own = {"source": model.run.method.name, "seed": model.run.seed, "run": str(path)}
+        worse += [{**own, **r} for r in stress(model, where, *chosen(where, options.session))]
     console = Console()
     for kind in options.session.probes:
         print_summary({**result, "summary": summarise(result["records"], kind)}, console, probe=kind)
+    for kind in STRESSES:
+        mine = [r for r in worse if r["probe"] == kind]
+        if mine:
+            majority = [r for r in result["records"] if r["source"] == "majority"]
+            print_summary({**result, "summary": summarise(mine + majority, kind)}, console, probe=kind)
     print_retrieval(result, console)
+    result["records"] += worse
     if options.json:
         write_json(options.json, result)
         console.print(f"written: {options.json}", soft_wrap=True, highlight=False)

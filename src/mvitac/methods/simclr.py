@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Head, Projected, build_trunk, num_features
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.spec import DataSpec
 
 
@@ -51,7 +51,7 @@ def nt_xent(a: Float[Tensor, "B D"], b: Float[Tensor, "B D"], temperature: float
         return F.cross_entropy(logits, torch.arange(2 * num, device=z.device).roll(num))
 
 
-class SimCLR(Method):
+class SimCLR(Contrastive):
     """A tower per modality."""
 
     views = 2
@@ -65,11 +65,11 @@ class SimCLR(Method):
             head = Head(num_features(trunk), config.hidden, config.out, norm=config.head_norm)
             self.towers[modality] = Projected(trunk, head)
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
-        losses: dict[str, Tensor] = {}
-        for modality, tower in self.towers.items():
-            first, second = batch.images[modality]
-            losses[modality] = nt_xent(tower(first), tower(second), self.config.temperature)
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return {f"{m}_{i}": tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+        losses = {m: nt_xent(z[f"{m}_0"], z[f"{m}_1"], self.config.temperature) for m in self.towers}
         return {"loss": torch.stack(list(losses.values())).sum(), **losses}
 
     def encoders(self) -> dict[str, nn.Module]:

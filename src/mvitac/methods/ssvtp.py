@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Projected, build_trunk, num_features
 from mvitac.losses import info_nce
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.spec import DataSpec
 
 
@@ -42,7 +42,7 @@ class SSVTPConfig(MethodConfig):
         return SSVTP(self, spec, encoder)
 
 
-class SSVTP(Method):
+class SSVTP(Contrastive):
     """Two towers, one symmetric loss."""
 
     def __init__(self, config: SSVTPConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
@@ -53,8 +53,10 @@ class SSVTP(Method):
             trunk = build_trunk(encoder, spec.channels(modality))
             self.towers[modality] = Projected(trunk, nn.Linear(num_features(trunk), config.out))
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
-        z = {m: tower(batch.images[m][0]) for m, tower in self.towers.items()}
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return {m: tower(batch.images[m][0]) for m, tower in self.towers.items()}
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         vt = info_nce(z["vision"], z["touch"], self.config.temperature)
         tv = info_nce(z["touch"], z["vision"], self.config.temperature)
         return {"loss": (vt + tv) / 2, "vt": vt, "tv": tv}

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Projected, build_trunk, num_features
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.spec import DataSpec
 
 
@@ -60,7 +60,7 @@ def covariance(z: Float[Tensor, "B D"]) -> Float[Tensor, ""]:
     return (cov.square().sum() - cov.diagonal().square().sum()) / z.shape[1]
 
 
-class VICReg(Method):
+class VICReg(Contrastive):
     """A tower with a 3-layer expander per modality."""
 
     views = 2
@@ -77,10 +77,13 @@ class VICReg(Method):
             expander = nn.Sequential(*layers, nn.Linear(hidden, hidden, bias=False))
             self.towers[modality] = Projected(trunk, expander)
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return {f"{m}_{i}": tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         losses: dict[str, Tensor] = {}
-        for modality, tower in self.towers.items():
-            first, second = (tower(view).float() for view in batch.images[modality])
+        for modality in self.towers:
+            first, second = (z[f"{modality}_{i}"].float() for i in (0, 1))
             with torch.autocast(first.device.type, enabled=False):
                 s = F.mse_loss(first, second)
                 v = (variance(first) + variance(second)) / 2

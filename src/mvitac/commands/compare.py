@@ -1,0 +1,117 @@
+"""``mvitac compare``: many runs into the paper's tables."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mvitac.options import parse, selectors
+
+
+def compare(argv: list[str]) -> None:
+    """mvitac compare --plan table1|table2|ablation|FILE [--data D] [--recipe R] [--seeds N] [--jobs N] [--dry-run]"""
+    given, rest = selectors(argv, ("--plan", "--data", "--recipe"))
+    from typing import Annotated
+
+    import tyro
+    from rich.console import Console
+
+    from mvitac.compare import do_all, forecast, gather, lay_out, submit
+    from mvitac.datasets import DatasetConfig
+    from mvitac.paper_tables import write_tables
+    from mvitac.plans import PLANS, find_plan, setting
+    from mvitac.probe import Session
+    from mvitac.recipes import RECIPES
+    from mvitac.record import check_place, write_json
+    from mvitac.registry import default, to_json, unknown
+
+    plan = find_plan(given.get("--plan", "table1"))
+    if "--recipe" in given and given["--recipe"] not in RECIPES:
+        raise unknown("recipe", given["--recipe"], RECIPES)
+    usual = "grasps" if plan.name == "table2" else "materials"
+    chosen = (
+        default(DatasetConfig, given["--data"]) if "--data" in given else plan.data or default(DatasetConfig, usual)
+    )
+
+    @dataclass(frozen=True, kw_only=True)
+    class Options:
+        data: Annotated[type(chosen), tyro.conf.arg(name="data")] = chosen  # type: ignore[valid-type]
+        out: Path = Path("runs") / f"compare-{plan.name}-{chosen.name}"
+        """Folder of the comparison: runs, controls, tables. The same command goes on where it stopped."""
+        seeds: int = plan.seeds
+        """Runs per row, seeds 0 .. seeds - 1."""
+        set: tuple[str, ...] = ()
+        """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own come after."""
+        jobs: int | None = None
+        """Runs at a time; none = one per GPU, one on a machine without."""
+        device: str = "auto"
+        """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
+        imagenet: Path | None = None
+        """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
+        stress: bool = plan.stress
+        """Also score 1 % and 10 % of the labels, noisy test images, and a modality missing at test time."""
+        dry_run: bool = False
+        """Print the plan, what is finished and what is left, and stop."""
+        tables_only: bool = False
+        """Make the tables of what is finished and train nothing."""
+        slurm: str | None = None
+        """Submit the unfinished runs as a SLURM array (extra: slurm) with these submitit parameters, e.g.
+        slurm_partition=gpu,timeout_min=600,gpus_per_node=1, and stop; the same command without it makes the tables."""
+
+    Options.__doc__ = f"""Many runs into one table: methods x settings x seeds, beside controls and the paper's numbers.
+
+    First choose, then change single fields below:
+      --plan {"|".join(PLANS)}|FILE.toml|FILE.json  (default table1)
+      --data {"|".join(DatasetConfig.choices)}  (default: the plan's, else materials; grasps for table2)
+      --recipe {"|".join(RECIPES)}  (default: the plan's, {plan.recipe})
+
+    A plan of your own, in TOML (in JSON the same fields):
+      recipe = "demo"
+      seeds = 3
+      reference = "MViTac"            # the row the others are tested against
+      set = {{ steps = 300 }}           # fields of every run
+      data = {{ name = "pack", path = "packs/materials" }}
+      [[rows]]
+      label = "MViTac"
+      [[rows]]
+      label = "colder"
+      method = "mvitac"               # the default
+      set = {{ "method.temperature" = 0.2, "optim.lr" = 1e-3 }}
+    """
+    options = parse(Options, rest, "compare")
+    if options.jobs is not None and not 1 <= options.jobs <= 1024:
+        raise ValueError(f"jobs {options.jobs}: give 1 to 1024 runs at a time")
+    extra = dict(setting(text) for text in options.set)
+    plan = replace(
+        plan,
+        data=options.data,
+        recipe=given.get("--recipe", plan.recipe),
+        seeds=options.seeds,
+        stress=options.stress,
+        set={**plan.set, **extra},
+    )
+    session = Session(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities, imagenet=options.imagenet)
+    if not options.dry_run:
+        check_place(options.out / "plan.json")
+    console = Console()
+    say = lambda text: console.print(text, soft_wrap=True, highlight=False, markup=False)  # noqa: E731
+    pack = options.data.open()
+    work = lay_out(plan, pack, options.out, session, options.device)
+    for line in forecast(work):
+        say(line)
+    if options.dry_run:
+        return
+    write_json(options.out / "plan.json", to_json(plan))
+    if options.slurm is not None:
+        say(submit(work, options.slurm))
+        return
+    if not options.tables_only:
+        do_all(work, options.jobs or _num_gpus(), say)
+    written = write_tables(gather(work, options.out, session), options.out)
+    say(written[0].read_text())
+    for path in written:
+        say(f"written: {path}")
+
+
+def _num_gpus() -> int:
+    import torch
+
+    return max(1, torch.cuda.device_count())

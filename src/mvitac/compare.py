@@ -1,0 +1,320 @@
+"""``mvitac compare``: a plan -> runs -> one result. What is finished is skipped, what was cut is resumed.
+
+    <out>/plan.json                      what was asked for
+          runs/<row>/seed<k>/            a run like any other, with scores.json beside it
+          controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet where asked
+          result.json  table.*           the tables (``paper_tables``)
+
+A run whose loss stops being a number is a result too: it is kept as failed.json and told in the table.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import statistics
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mvitac.encoders import SCRATCH
+from mvitac.model import load
+from mvitac.pack import Pack
+from mvitac.plans import Plan, Row, slug
+from mvitac.probe import Session, chosen, controls_of, probe_runs
+from mvitac.record import digest, provenance, read_json, write_json
+from mvitac.registry import to_json
+from mvitac.run import Run
+from mvitac.stress import stress
+from mvitac.train import Diverged, describe, pick_device, train, training_rows
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one row: where it goes, and how it is scored."""
+
+    label: str
+    run: Run
+    out: Path
+    session: Session
+    stress: bool = False
+
+    @property
+    def done(self) -> bool:
+        scored = (self.out / "scores.json").exists() and (not self.stress or (self.out / "stress.json").exists())
+        return scored or (self.out / "failed.json").exists()
+
+
+@dataclass(frozen=True)
+class Work:
+    """A plan on one dataset: the jobs to do, and the rows that cannot be part of it, with the reason."""
+
+    plan: Plan
+    pack: Pack
+    jobs: list[Job]
+    left_out: dict[str, str]
+
+
+def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "auto") -> Work:
+    """The jobs of ``plan`` on the data of its rows, seeds outermost; ValueError if not one row is possible.
+
+    Rows that need what the data lacks (labels, a camera) and rows that are the same run as an earlier one are left out.
+    """
+    assert plan.data is not None
+    chosen(pack, session)
+    session = replace(session, controls=False)
+    possible: list[Row] = []
+    left_out: dict[str, str] = {}
+    seen: dict[str, str] = {}
+    for row in plan.rows:
+        run = plan.run(row, plan.data, 0)
+        try:
+            run.check(pack.spec, len(training_rows(run, pack)), pack.size)
+            run.method.build(pack.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+        except ValueError as error:
+            left_out[row.label] = str(error)
+            continue
+        if (key := replace(run, recipe="").digest()) in seen:
+            left_out[row.label] = f"the same run as {seen[key]!r} under recipe {plan.recipe!r}"
+            continue
+        seen[key] = row.label
+        possible.append(row)
+    if not possible:
+        raise ValueError(f"plan {plan.name!r} has no row that this data allows: {next(iter(left_out.values()))}")
+    jobs = [
+        Job(row.label, replace(plan.run(row, plan.data, seed), device=device), place, session, plan.stress)
+        for seed in range(plan.seeds)
+        for row in possible
+        for place in (out / "runs" / slug(row.label) / f"seed{seed}",)
+    ]
+    return Work(plan, pack, jobs, left_out)
+
+
+# -- doing it ---------------------------------------------------------------------------------------------------------
+
+
+def do(job: Job, pack: Pack | None = None) -> str:
+    """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant."""
+    if job.done:
+        return "finished before"
+    pack = pack or job.run.data.open(quiet=True)
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
+    try:
+        train(job.run, job.out, resume=True, quiet=True, pack=pack)
+    except Diverged as error:
+        write_json(job.out / "failed.json", {"error": str(error)})
+        return f"diverged: {error}"
+    if torch.cuda.is_available():
+        write_json(job.out / "memory.json", {"peak_bytes": torch.cuda.max_memory_allocated()})
+    result = probe_runs([job.out], job.session, pack)
+    if job.stress:
+        records = stress(load(job.out), pack, *chosen(pack, job.session))
+        own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
+        write_json(job.out / "stress.json", {"records": [{**own, **record} for record in records]})
+    write_json(job.out / "scores.json", {"records": result["records"], "retrieval": result["retrieval"]})
+    return f"{seconds_of(job.out):.0f} s of training"
+
+
+def do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
+    """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several."""
+    todo = [job for job in work.jobs if not job.done]
+    total = len(work.jobs)
+    if num_jobs == 1 or len(todo) < 2:
+        for job in todo:
+            say(f"{job.label}, seed {job.run.seed} ...")
+            line = do(job, work.pack)
+            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.label}, seed {job.run.seed}: {line}")
+        return
+    context = multiprocessing.get_context("spawn")
+    devices = context.Queue()
+    for i in range(num_jobs):
+        gpus = torch.cuda.device_count()
+        devices.put(f"cuda:{i % gpus}" if gpus > 1 else "auto")
+    threads = max(1, (os.cpu_count() or 1) // num_jobs)
+    with ProcessPoolExecutor(num_jobs, context, initializer=_start, initargs=(devices, threads)) as pool:
+        futures = {pool.submit(_do_here, job): job for job in todo}
+        for done in as_completed(futures):
+            job = futures[done]
+            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.label}, seed {job.run.seed}: {done.result()}")
+
+
+_device = "auto"
+
+
+def _start(devices: Any, threads: int) -> None:
+    """Begin a worker: one device for its life, and no life after its parent's, which might be started again."""
+    global _device
+    _device = devices.get()
+    torch.set_num_threads(threads)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def _do_here(job: Job) -> str:
+    return do(replace(job, run=replace(job.run, device=_device)) if _device != "auto" else job)
+
+
+def submit(work: Work, options: str) -> str:
+    """Hand the unfinished jobs to SLURM as one array by submitit and return its id; nothing waits for them here.
+
+    ``options``: comma-separated name=value of submitit's ``update_parameters``, e.g. "slurm_partition=gpu,timeout_min=600".
+    """
+    try:
+        import submitit  # type: ignore[import-not-found]
+    except ImportError:
+        raise ValueError(
+            "--slurm needs submitit, which is not installed: pip install 'mvitac[slurm]', or leave --slurm out"
+        ) from None
+    parameters: dict[str, Any] = {}
+    for pair in options.split(","):
+        name, equals, value = pair.partition("=")
+        if not equals:
+            raise ValueError(f"--slurm {pair}: give name=value pairs, e.g. slurm_partition=gpu,timeout_min=600")
+        parameters[name] = int(value) if value.isdigit() else value
+    todo = [job for job in work.jobs if not job.done]
+    if not todo:
+        return "nothing to submit: all runs are finished"
+    executor = submitit.AutoExecutor(folder=work.jobs[0].out.parents[2] / "slurm")
+    executor.update_parameters(name=f"mvitac-{work.plan.name}", **parameters)
+    handles = executor.map_array(do, todo)
+    return f"{len(handles)} runs submitted as {handles[0].job_id.split('_')[0]}"
+
+
+# -- what came of it --------------------------------------------------------------------------------------------------
+
+
+def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
+    """Everything the tables are made of, from the finished runs; ValueError if there is none."""
+    finished = [job for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
+    if not finished:
+        raise ValueError(f"no run of {out} is finished: nothing to tell yet")
+    records: list[dict[str, Any]] = []
+    retrieval: list[dict[str, Any]] = []
+    for job in finished:
+        scores = read_json(job.out / "scores.json", "a run's scores")
+        method = job.run.method.name
+        worse = read_json(job.out / "stress.json", "a run's stress")["records"] if job.stress else []
+        for record in scores["records"] + worse:
+            records.append({**record, "source": job.label + record["source"].removeprefix(method)})
+        retrieval += [{**found, "source": job.label} for found in scores["retrieval"]]
+    controls, found = _controls(work, out, session)
+    rows = {row.label: row for row in work.plan.rows}
+    return {
+        "plan": to_json(work.plan),
+        "data": work.pack.spec.name,
+        "pack": work.pack.digest,
+        "group_by": work.pack.spec.group_by,
+        "leaks": leaks(work.pack),
+        "records": records + controls,
+        "retrieval": retrieval + found,
+        "rows": [label for label in rows if label not in work.left_out],
+        "left_out": work.left_out,
+        "failed": {
+            f"{job.label}, seed {job.run.seed}": read_json(job.out / "failed.json", "a failure")["error"]
+            for job in work.jobs
+            if (job.out / "failed.json").exists()
+        },
+        "unfinished": [f"{job.label}, seed {job.run.seed}" for job in work.jobs if not job.done],
+        "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
+        "device": describe(pick_device(work.jobs[0].run.device)),
+        **provenance(),
+    }
+
+
+def _labels(jobs: Sequence[Job]) -> Iterator[str]:
+    yield from dict.fromkeys(job.label for job in jobs)
+
+
+def _controls(work: Work, out: Path, session: Session) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The controls beside the reference row, made once."""
+    if not session.controls:
+        return [], []
+    beside = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
+    key = digest([to_json(session), work.pack.digest, [run.digest() for run in beside]])
+    path = out / "controls.json"
+    if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
+        return kept["records"], kept["retrieval"]
+    tasks, modalities = chosen(work.pack, session)
+    records, retrieval = controls_of(beside, work.pack, tasks, modalities, session)
+    write_json(path, {"key": key, "records": records, "retrieval": retrieval})
+    return records, retrieval
+
+
+def leaks(pack: Pack) -> str:
+    """A sentence if groups (instances, objects, recordings) lie in train and in test, else ""."""
+    groups = pack.column("group").astype(str)
+    train_groups, test_groups = (set(groups[pack.rows(split)]) for split in ("train", "test"))
+    shared = len(train_groups & test_groups)
+    if not shared:
+        return ""
+    return f"{shared} of {len(test_groups)} test {pack.spec.group_by}s are also in train: this split leaks"
+
+
+def seconds_of(path: Path) -> float:
+    """Seconds of training that a run's log tells, over all its resumptions; steps lost to a kill are not in it."""
+    total, before = 0.0, 0
+    batch_size = read_json(path / "run.json", "a run's record")["run"]["batch_size"]
+    for line in (path / "log.jsonl").read_text().splitlines():
+        entry = json.loads(line)
+        if entry.get("pairs_per_s"):
+            total += (entry["step"] - before) * batch_size / entry["pairs_per_s"]
+        before = entry["step"]
+    return total
+
+
+def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
+    """Steps, pairs, images and median seconds of one run of a row, and its peak GPU memory where it was measured."""
+    run = jobs[0].run
+    rows = len(training_rows(run, pack))
+    method = run.method.build(pack.spec, replace(run.encoder, weights=SCRATCH))
+    steps = run.num_steps(rows)
+    peaks = [read_json(p, "peak memory")["peak_bytes"] for job in jobs if (p := job.out / "memory.json").exists()]
+    return {
+        "row": label,
+        "seeds": len(jobs),
+        "steps": steps,
+        "pairs": steps * run.batch_size,
+        "images": steps * run.batch_size * method.views * len(method.encoders()),
+        "trained_parameters": sum(p.numel() for p in method.parameters() if p.requires_grad),
+        "seconds": statistics.median(seconds_of(job.out) for job in jobs),
+        "peak_gpu_bytes": int(np.max(peaks)) if peaks else None,
+    }
+
+
+def forecast(work: Work) -> list[str]:
+    """The plan in words: runs, what is finished, steps and pairs, and the time left where finished runs tell it."""
+    rows = {label: next(job for job in work.jobs if job.label == label) for label in _labels(work.jobs)}
+    lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds = {len(work.jobs)} runs"]
+    known = [seconds_of(job.out) for job in work.jobs if (job.out / "scores.json").exists()]
+    for label, job in rows.items():
+        num = len(training_rows(job.run, work.pack))
+        steps = job.run.num_steps(num)
+        mine = [j for j in work.jobs if j.label == label]
+        lines.append(
+            f"  {label}: {job.run.method.name}, {steps} steps x {job.run.batch_size} pairs of {num} rows,"
+            f" {sum(j.done for j in mine)} of {len(mine)} finished"
+        )
+    lines += [f"  left out: {label} ({reason})" for label, reason in work.left_out.items()]
+    left = sum(not job.done for job in work.jobs)
+    if known and left:
+        hours = left * statistics.median(known) / 3600
+        lines.append(f"{left} runs left, about {hours:.1f} h of training one after another (median of finished runs)")
+    elif left:
+        lines.append(f"{left} runs left; run one for a forecast of the time")
+    else:
+        lines.append("all runs are finished")
+    return lines

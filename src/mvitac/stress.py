@@ -1,0 +1,93 @@
+"""What features are worth when things are worse: few labels, noisy images, one modality missing at test time.
+
+All by the linear probe, as further records under their own probe names (``STRESSES``). What a probe learns from is always
+clean; only the amount of labels or the test images change. Compare within one name only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from mvitac.model import Model
+from mvitac.pack import Pack
+from mvitac.probe import Parts, features, parts, probe_features
+from mvitac.spec import Task
+
+SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}
+"""Share of the labelled train rows and of the val rows a probe sees; at least one row of each class."""
+NOISE = "noisy images"
+NOISE_LEVELS = 20.0
+"""Standard deviation of the noise on each 8-bit channel of test images."""
+MISSING = {"vision": "vision missing", "touch": "touch missing"}
+"""modality -> name; a probe on both modalities meets test rows whose features of this one are train's mean."""
+STRESSES = (*SHARES, NOISE, *MISSING.values())
+
+
+def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]) -> list[dict[str, Any]]:
+    """Records of every stress, task and modality that ``model`` has; the same draws of rows and noise for every model
+    of one seed, so that differences are paired."""
+    seed, records = model.run.seed, []
+    noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
+    for task, modality in ((task, modality) for task in tasks for modality in modalities):
+        names = list(pack.spec.modalities) if modality == "both" else [modality]
+        if not set(names) <= set(model.encoders):
+            continue
+        rows = parts(pack, task, modality)
+        learned = np.concatenate([rows.train, rows.val])
+        clean = {m: features(model, pack, m, np.concatenate([learned, rows.test])) for m in names}
+        for m in names:
+            known = noisy.setdefault(m, {})
+            new = np.array([row for row in rows.test if int(row) not in known], np.int64)
+            if len(new):
+                known.update(zip(new.tolist(), _noisy_features(model, pack, m, new, seed), strict=True))
+
+        def score(kind: str, x: np.ndarray, rows: Parts = rows, task: Task = task, modality: str = modality) -> None:
+            result = probe_features(x, pack, task, rows, "linear", seed)
+            records.append({"task": task.name, "modality": modality, "probe": kind, **result})
+
+        x = np.concatenate([clean[m] for m in names], axis=1)
+        for kind, share in SHARES.items():
+            keep, few = _few(rows, pack.labels(task.name), share, seed)
+            score(kind, x[keep], few)
+        test = np.concatenate([np.stack([noisy[m][int(row)] for row in rows.test]) for m in names], axis=1)
+        score(NOISE, np.concatenate([x[: len(learned)], test]))
+        for lost, kind in MISSING.items() if modality == "both" else ():
+            blind = {m: z.copy() for m, z in clean.items()}
+            blind[lost][len(learned) :] = clean[lost][: len(learned)].mean(0)
+            score(kind, np.concatenate([blind[m] for m in names], axis=1))
+    return records
+
+
+def _few(rows: Parts, labels: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, Parts]:
+    """Places to keep in [train, val, test], and the parts that are left: ``share`` of train and of val, all of test."""
+    rng = np.random.default_rng([seed, round(1000 * share)])
+
+    def some(part: np.ndarray) -> np.ndarray:
+        order = rng.permutation(len(part))
+        _, first = np.unique(labels[part[order]], return_index=True)  # one of each class, then whatever comes
+        rest = np.setdiff1d(np.arange(len(part)), first)
+        wanted = max(len(first), round(share * len(part)))
+        return np.sort(order[np.concatenate([first, rest])[:wanted]])
+
+    train, val = some(rows.train), some(rows.val)
+    num_train, num_val = len(rows.train), len(rows.val)
+    test = num_train + num_val + np.arange(len(rows.test))
+    return np.concatenate([train, num_train + val, test]), Parts(rows.train[train], rows.val[val], rows.test)
+
+
+def _noisy_features(model: Model, pack: Pack, modality: str, rows: np.ndarray, seed: int) -> np.ndarray:
+    """Features [len(rows), D] of images with Gaussian noise, the same noise for the same (seed, row)."""
+    device, found = next(model.parameters()).device, []
+    for chunk in np.array_split(rows, max(1, len(rows) // 256)):
+        images = np.stack([_noisy(pack.images[modality][row], seed, int(row)) for row in chunk])
+        found.append(model.features(modality, torch.from_numpy(images).permute(0, 3, 1, 2).to(device)).cpu().numpy())
+    return np.concatenate(found)
+
+
+def _noisy(image: np.ndarray, seed: int, row: int) -> np.ndarray:
+    noise = np.random.default_rng([seed, row]).normal(0, NOISE_LEVELS, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)

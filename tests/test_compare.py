@@ -1,0 +1,403 @@
+"""A plan becomes a table: finished runs are skipped, killed ones resumed to the same bits, p is what it says."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy import toy_pack
+
+from mvitac import compare as module
+from mvitac.cli import main
+from mvitac.compare import cost, do, do_all, gather, lay_out, leaks, seconds_of
+from mvitac.datasets.packed import PackConfig
+from mvitac.pack import Pack
+from mvitac.paper_tables import lines_of, write_tables
+from mvitac.plans import ABLATION, PLANS, TABLE1, TABLE2, Plan, Row, changed, find_plan, setting, slug
+from mvitac.probe import Session, paired_difference
+from mvitac.recipes import RECIPES, recipe
+
+ROWS = (
+    Row(label="MViTac", printed={"touch": {"pattern": 57.6}}),
+    Row(label="colder", set={"method.temperature": 0.5}),
+    Row(label="supervised, touch", method="supervised", set={"method.modalities": ["touch"]}),
+)
+
+
+def small(pack: Pack, **changes: object) -> Plan:
+    plan = Plan(name="small", rows=ROWS, recipe="smoke", seeds=2, set={"steps": 4, "eval_every": 0})
+    return replace(plan, data=PackConfig(path=pack.path), **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """Six runs, straight through, and their result."""
+    out = tmp_path_factory.mktemp("compare") / "out"
+    work = lay_out(small(pack), pack, out, Session())
+    do_all(work, 1, lambda line: None)
+    result = gather(work, out, Session())
+    write_tables(result, out)
+    return out, result
+
+
+# -- plans ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PLANS)
+@pytest.mark.parametrize("recipe_name", RECIPES)
+def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
+    plan = replace(PLANS[name], recipe=recipe_name)
+    for row in plan.rows:
+        run = plan.run(row, PackConfig(), 7)
+        assert run.seed == 7 and run.method.name == row.method
+        for field, value in row.set.items():
+            found: object = run
+            for part in field.split("."):
+                found = getattr(found, part)
+            assert found == (tuple(value) if isinstance(value, list) else value), (row.label, field)
+
+
+def test_the_plans_hold_the_papers_tables() -> None:
+    """Tables I and II as printed (tactile / tactile + visual)."""
+    printed = {row.label: row.printed for row in TABLE1.rows}
+    assert list(printed["MViTac"]["touch"].values()) == [57.6, 86.2, 82.1]
+    assert list(printed["MViTac"]["both"].values()) == [74.9, 91.8, 84.1]
+    assert list(printed["TAG (CMC)"]["touch"].values()) == [54.7, 77.3, 79.4]
+    assert list(printed["TAG (CMC)"]["both"].values()) == [68.6, 87.1, 82.4]
+    assert list(printed["SSVTP"]["touch"].values()) == [46.1, 79.7, 75.8]
+    assert list(printed["SSVTP"]["both"].values()) == [70.7, 88.6, 83.6]
+    assert list(printed["supervised, touch only"]["touch"].values()) == [57.4, 89.1, 79.3]
+    assert list(printed["supervised, both"]["both"].values()) == [48.0, 85.9, 80.0]
+    assert list(TABLE1.printed_majority.values()) == [18.6, 66.1, 56.3]
+    second = {row.label: row.printed["both"]["success"] for row in TABLE2.rows if row.printed}
+    assert second == {"TAG (CMC)": 56.3, "MViTac": 60.3, "Calandra et al., supervised": 73.1}
+    run = TABLE2.run(TABLE2.rows[3], PackConfig(), 0)
+    assert run.augment.touch.grayscale == run.augment.vision.grayscale == 0
+
+
+def test_table1_has_one_budget(pack: Pack, tmp_path: Path) -> None:
+    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, Session())
+    assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 22  # smoke changes no tau
+    assert {(job.run.steps, job.run.batch_size, job.run.optim.lr) for job in work.jobs} == {(4, 16, 2e-3)}
+    assert [job.run.seed for job in work.jobs] == [0] * 11 + [1] * 11
+
+
+def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) -> None:
+    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path, Session())
+    assert "no grayscale" in work.left_out and "the same run as 'MViTac'" in work.left_out["no grayscale"]
+    assert "grayscale .2" not in work.left_out
+    digests = [job.run.digest() for job in work.jobs]
+    assert len(set(digests)) == len(digests)
+
+
+def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
+    pack = toy_pack(tmp_path / "touch-only", vision_channels=0)
+    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path / "out", Session())
+    assert "learns from pairs" in work.left_out["TAG (CMC)"]
+    assert "unknown modality" in work.left_out["supervised, vision only"]
+    assert {job.label for job in work.jobs} >= {"MViTac", "MoCo per modality", "supervised, touch only"}
+    with pytest.raises(ValueError, match="no row that this data allows"):
+        lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", Session())
+
+
+def test_a_plan_from_a_file(tmp_path: Path) -> None:
+    text = """
+    seeds = 2
+    reference = "a"
+    set = { steps = 5 }
+    data = { name = "pack", path = "packs/x" }
+    [[rows]]
+    label = "a"
+    [[rows]]
+    label = "b"
+    method = "cmc"
+    set = { "method.num_negatives" = 9, "augment.touch.scale" = [0.3, 1.0] }
+    """
+    (tmp_path / "mine.toml").write_text(text)
+    plan = find_plan(str(tmp_path / "mine.toml"))
+    assert plan.name == "mine" and plan.data == PackConfig(path=Path("packs/x"))
+    run = plan.run(plan.rows[1], plan.data, 1)
+    assert (run.steps, run.method.num_negatives, run.augment.touch.scale) == (5, 9, (0.3, 1.0))  # type: ignore
+    as_json = {"rows": [{"label": "a"}], "reference": "a"}
+    (tmp_path / "other.json").write_text(json.dumps(as_json))
+    assert find_plan(str(tmp_path / "other.json")).rows == (Row(label="a"),)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("rows = []", "has no rows"),
+        ("rows = [", "not valid TOML"),
+        ('[[rows]]\nlabel = "a"', "unknown reference row 'MViTac'"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "a"', "is there twice"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "differ only in signs"),
+        ('reference = "a"\nseeds = 0\n[[rows]]\nlabel = "a"', "seeds 0"),
+    ],
+)
+def test_damaged_plans_are_one_line(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "p.toml").write_text(text)
+    with pytest.raises(ValueError, match=says):
+        find_plan(str(tmp_path / "p.toml"))
+
+
+@pytest.mark.parametrize("given", ["tabel1", "nowhere.toml"])
+def test_unknown_plans(given: str) -> None:
+    with pytest.raises(ValueError, match="table1"):
+        find_plan(given)
+
+
+def test_changed_fields_are_checked() -> None:
+    run = recipe("smoke")
+    assert changed(run, {"optim.lr": 1, "steps": 7}).optim.lr == 1.0
+    for name in ("optim.lrr", "steps.more", "nothing", "method.name", "optim"):
+        with pytest.raises(ValueError, match=r"optim|steps|nothing|method"):
+            changed(run, {name: 3})
+    with pytest.raises(ValueError, match="expected int"):
+        changed(run, {"steps": "many"})
+    with pytest.raises(ValueError, match="row 'MViTac': temperature"):
+        Plan(name="x", rows=(Row(label="MViTac", set={"method.temperature": -1.0}),)).run(
+            Row(label="MViTac", set={"method.temperature": -1.0}), PackConfig(), 0
+        )
+    assert setting("optim.lr=1e-3") == ("optim.lr", 1e-3)
+    assert setting("encoder.weights=scratch") == ("encoder.weights", "scratch")
+    with pytest.raises(ValueError, match="field=value"):
+        setting("steps")
+    assert slug("Calandra et al., supervised") == "calandra-et-al.-supervised"
+
+
+# -- runs and tables --------------------------------------------------------------------------------------------------
+
+
+def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
+    out, result = done
+    assert {p.name for p in out.glob("table.*")} == {"table.md", "table.tex", "table.csv", "table.png"}
+    lines = {(line.source, line.modality): line for line in lines_of(result)}
+    touch = lines["MViTac", "touch"].cells["pattern"]
+    own = [
+        r
+        for r in result["records"]
+        if (r["source"], r["modality"], r["task"]) == ("MViTac", "touch", "pattern") and r["probe"] == "linear"
+    ]
+    assert len(own) == 2 and touch.mean == pytest.approx(np.mean([r["accuracy"] for r in own]))
+    assert touch.printed == pytest.approx(0.576) and touch.difference is None
+    assert ("supervised, touch", "vision") not in lines and ("supervised, touch", "touch") in lines
+    assert lines["supervised, touch, end to end", "touch"].cells["pattern"].difference is not None
+    assert {"majority", "untrained", "pixels", "border", "noise only"} <= {line.source for line in lines.values()}
+    text = (out / "table.md").read_text()
+    assert f"| MViTac | touch | {100 * touch.mean:.1f} [" in text
+    assert "equal budget: every run saw 64 pairs in 4 steps" in text and "LEAK" not in text
+    rows = list(csv.DictReader((out / "table.csv").read_text().splitlines()))
+    assert len(rows) == sum(len(line.cells) for line in lines.values())
+    found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
+    assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"].mean
+    tex = (out / "table.tex").read_text()
+    assert tex.count(r"\\") == len(lines) + 1 and "[57.6]" in tex
+    assert json.loads((out / "result.json").read_text())["rows"] == ["MViTac", "colder", "supervised, touch"]
+
+
+def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, result = done
+    monkeypatch.setattr(module, "train", None)  # calling it would raise
+    monkeypatch.setattr(module, "controls_of", None)
+    work = lay_out(small(pack), pack, out, Session())
+    do_all(work, 1, lambda line: None)
+    assert gather(work, out, Session()) == json.loads(json.dumps(result))
+
+
+def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: Path) -> None:
+    wild = Row(label="wild", set={"optim.name": "sgd", "optim.lr": 1e30, "log_every": 1})
+    work = lay_out(small(pack, rows=(ROWS[0], wild), seeds=1), pack, tmp_path, Session(controls=False))
+    do_all(work, 1, lambda line: None)
+    result = gather(work, tmp_path, Session(controls=False))
+    assert "not finite" in result["failed"]["wild, seed 0"]
+    assert "Diverged: wild, seed 0" in write_tables(result, tmp_path)[0].read_text()
+    assert {record["source"] for record in result["records"]} == {"MViTac"}
+
+
+def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], pack: Pack, tmp_path: Path) -> None:
+    out, _ = done
+    work = lay_out(small(pack, set={"steps": 5, "eval_every": 0}), pack, out, Session())
+    job = work.jobs[0]
+    (scores := job.out / "scores.json").rename(tmp_path / "scores.json")
+    try:
+        with pytest.raises(ValueError, match="holds a different run"):
+            do(job, pack)
+    finally:
+        (tmp_path / "scores.json").rename(scores)
+
+
+def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> None:
+    out, result = done
+    by_row = {c["row"]: c for c in result["cost"]}
+    assert by_row["MViTac"]["images"] == 4 * 16 * 2 * 2 and by_row["supervised, touch"]["images"] == 4 * 16
+    assert by_row["MViTac"]["pairs"] == by_row["supervised, touch"]["pairs"] == 64
+    assert all(0 < c["seconds"] < 60 for c in result["cost"])
+    fake = out.parent / "fake"
+    fake.mkdir()
+    (fake / "run.json").write_text(json.dumps({"run": {"batch_size": 16}}))
+    steps = [{"step": 10, "pairs_per_s": 80.0}, {"step": 10, "eval": {}}, {"step": 30, "pairs_per_s": 160.0}]
+    (fake / "log.jsonl").write_text("\n".join(map(json.dumps, steps)))
+    assert seconds_of(fake) == pytest.approx(10 * 16 / 80 + 20 * 16 / 160)
+    work = lay_out(small(pack), pack, out, Session())
+    assert cost("MViTac", work.jobs[:1], pack)["trained_parameters"] > 100_000
+
+
+def test_leaking_splits_are_flagged(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert leaks(pack) == ""
+    real = Pack.column
+
+    def column(self: Pack, name: str) -> np.ndarray:
+        values = real(self, name)
+        if name == "split":
+            rows = np.flatnonzero(values == "test")
+            values[rows[::2]] = "train"
+        return values
+
+    monkeypatch.setattr(Pack, "column", column)
+    assert "test instances are also in train" in leaks(pack)
+
+
+# -- significance -----------------------------------------------------------------------------------------------------
+
+
+def record(correct: list[int], seed: int, sizes: int = 10) -> dict:
+    return {"group_sizes": [sizes] * len(correct), "group_correct": correct, "seed": seed}
+
+
+def test_paired_difference_sees_a_small_steady_gain() -> None:
+    """Groups differ wildly, but ours has one more right in each: paired, that is certain."""
+    rng = np.random.default_rng(0)
+    theirs = rng.integers(0, 9, 40)
+    a, b = [record((theirs + 1).tolist(), 0)], [record(theirs.tolist(), 0)]
+    mean, low, high, p = paired_difference(a, b)
+    assert (mean, low, high) == pytest.approx((0.1, 0.1, 0.1)) and p < 0.002
+    assert paired_difference(b, a)[0] == pytest.approx(-0.1)
+
+
+def test_paired_difference_of_equals_is_not_significant() -> None:
+    """Of 100 pairs of equally good guessers, about 5 differ at p < .05."""
+    rng = np.random.default_rng(1)
+    significant = 0
+    for _ in range(100):
+        a, b = ([record(rng.binomial(10, 0.5, 30).tolist(), s) for s in range(1)] for _ in range(2))
+        significant += paired_difference(a, b)[3] < 0.05
+    assert significant <= 12
+    assert paired_difference(a, a) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_equal_seeds_are_paired() -> None:
+    """Seeds differ by 50 points, but ours has one more right under each: certain where seeds are the same, not where not."""
+    theirs = [record([2] * 30, 0), record([7] * 30, 1)]
+    ours = [record([3] * 30, 0), record([8] * 30, 1)]
+    assert paired_difference(ours, theirs)[1:3] == pytest.approx((0.1, 0.1))
+    others = [{**r, "seed": r["seed"] + 5} for r in ours]
+    assert paired_difference(others, theirs)[1] < 0
+
+
+def test_paired_difference_doubts_seeds_too() -> None:
+    """Better by chance of one seed of two: the interval over seeds reaches below zero."""
+    a = [record([9] * 30, 0), record([3] * 30, 1)]
+    b = [record([5] * 30, 0), record([5] * 30, 1)]
+    mean, low, high, p = paired_difference(a, b)
+    assert mean == pytest.approx(0.1) and low < 0 < high and p > 0.05
+    assert paired_difference([record([3], 0)], [record([9], 0)])[1:] == (-1.0, 1.0, 1.0)  # one group
+
+
+# -- the command: killed and resumed, several at once -----------------------------------------------------------------
+
+
+def command(pack: Pack, plan: Path, out: Path, *more: str) -> list[str]:
+    choice = ["--plan", str(plan), "--data", "pack", "--data.path", str(pack.path), "--out", str(out)]
+    return [sys.executable, "-m", "mvitac", "compare", *choice, *more]
+
+
+def write_plan(path: Path, num_rows: int, seeds: int, steps: int) -> Path:
+    rows = [{"label": f"tau {i}", "set": {"method.temperature": 0.1 + 0.1 * i}} for i in range(num_rows)]
+    common = {"steps": steps, "eval_every": 0, "checkpoint_every": 1, "log_every": 1}
+    plan = {"rows": rows, "reference": "tau 0", "recipe": "smoke", "seeds": seeds, "set": common, "tasks": ["pattern"]}
+    path.write_text(json.dumps({**plan, "modalities": ["touch"]}))
+    return path
+
+
+def table(out: Path) -> tuple[str, str]:
+    """The whole CSV, and the Markdown without the times it took."""
+    text = (out / "table.md").read_text()
+    return (out / "table.csv").read_text(), text[: text.index("| cost of one run")]
+
+
+def kill_and_resume(pack: Pack, base: Path, num_rows: int, seeds: int, steps: int, goals: tuple[int, ...]) -> None:
+    """SIGKILL the command whenever ``goals`` log lines are written in all, then let it end, and compare the tables."""
+    plan = write_plan(base / "plan.json", num_rows, seeds, steps)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run(command(pack, plan, base / "straight"), check=True, env=environment, stdout=subprocess.DEVNULL)
+    out = base / "killed"
+    for goal in goals:
+        process = subprocess.Popen(command(pack, plan, out), env=environment, stdout=subprocess.DEVNULL)
+        while process.poll() is None:
+            if sum(len(log.read_text().splitlines()) for log in out.glob("runs/*/*/log.jsonl")) >= goal:
+                process.send_signal(signal.SIGKILL)
+                assert process.wait() == -signal.SIGKILL
+            time.sleep(0.005)
+        assert not (out / "table.md").exists()
+    shown = subprocess.run(command(pack, plan, out), check=True, env=environment, capture_output=True, text=True).stdout
+    assert f"[{num_rows * seeds}/{num_rows * seeds}]" in shown
+    assert table(out) == table(base / "straight")
+
+
+@pytest.mark.slow
+def test_killed_twice_and_resumed_gives_the_same_table(pack: Pack, tmp_path: Path) -> None:
+    kill_and_resume(pack, tmp_path, num_rows=3, seeds=2, steps=6, goals=(9, 23))
+
+
+def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = write_plan(tmp_path / "plan.json", 2, 1, 2)
+    words = command(pack, plan, tmp_path / "out")[3:]
+    assert main([*words, "--dry-run"]) == 0
+    assert "2 rows x 1 seeds = 2 runs" in capsys.readouterr().out and not (tmp_path / "out").exists()
+    assert main([*words, "--tables-only"]) == 2
+    assert "no run of" in capsys.readouterr().err
+    assert main([*words, "--set", "steps=1", "--seeds", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert "[2/2] tau 1, seed 0" in shown and "| tau 0 | touch |" in shown
+    assert main([*words, "--set", "steps=1", "--tables-only"]) == 0
+    assert "all runs are finished" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--plan", "tabel1"], "did you mean 'table1'"),
+        (["--recipe", "dmeo"], "did you mean 'demo'"),
+        (["--set", "steps"], "field=value"),
+        (["--set", "stepz=3"], "unknown field of a run 'stepz'"),
+        (["--jobs", "0"], "jobs 0"),
+        (["--seeds", "0"], "seeds 0"),
+    ],
+)
+def test_slips_are_one_line(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    start = ["compare", "--data", "pack", "--data.path", str(pack.path), "--out", str(tmp_path / "out")]
+    assert main([*start, *words]) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_slurm_without_submitit_is_one_line(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "submitit", None)  # as if it were not installed
+    plan = write_plan(tmp_path / "plan.json", 1, 1, 2)
+    assert main([*command(pack, plan, tmp_path / "out")[3:], "--slurm", "slurm_partition=gpu"]) == 2
+    assert "pip install 'mvitac[slurm]'" in capsys.readouterr().err

@@ -1,0 +1,132 @@
+"""Stress scores change what they say they change, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_compare import small
+
+from mvitac import stress as module
+from mvitac.cli import main
+from mvitac.compare import do_all, gather, lay_out
+from mvitac.datasets.packed import PackConfig
+from mvitac.model import Model, load
+from mvitac.pack import Pack
+from mvitac.paper_tables import write_tables
+from mvitac.probe import Session, features, parts, probe_features, probe_runs
+from mvitac.recipes import recipe
+from mvitac.run import Optim
+from mvitac.stress import MISSING, NOISE, STRESSES, stress
+from mvitac.train import train
+
+
+@pytest.fixture(scope="module")
+def trained(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sixty supervised steps: features that know the pattern by touch and by vision."""
+    from mvitac.methods.supervised import SupervisedConfig
+
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=60, batch_size=30, eval_every=0)
+    run = replace(run, method=SupervisedConfig(), optim=Optim(name="adamw", lr=3e-3))
+    return train(run, tmp_path_factory.mktemp("stress") / "run", quiet=True)
+
+
+@pytest.fixture(scope="module")
+def records(trained: Path, pack: Pack) -> dict[tuple[str, str, str], dict]:
+    found = stress(load(trained), pack, pack.spec.tasks, ["touch", "vision", "both"])
+    return {(r["task"], r["modality"], r["probe"]): r for r in found}
+
+
+def test_every_stress_of_every_modality(records: dict) -> None:
+    tasks = ("pattern", "bright")
+    anywhere = {(t, m, k) for t in tasks for m in ("touch", "vision", "both") for k in STRESSES[:3]}
+    assert set(records) == anywhere | {(t, "both", k) for t in tasks for k in MISSING.values()}
+    assert len({tuple(r["group_sizes"]) for r in records.values()}) == 1  # all on the same test rows
+
+
+def test_a_missing_modality_leaves_what_the_other_says(trained: Path, pack: Pack, records: dict) -> None:
+    """Zeroed in the probe's own units: exactly the score of the both-probe with its columns at train's mean."""
+    model, task = load(trained), pack.spec.tasks[0]
+    rows = parts(pack, task)
+    everything, num = np.concatenate([rows.train, rows.val, rows.test]), len(rows.train) + len(rows.val)
+    z = {m: features(model, pack, m, everything).copy() for m in model.encoders}
+    z["vision"][num:] = z["vision"][:num].mean(0)
+    x = np.concatenate([z["vision"], z["touch"]], axis=1)
+    expected = probe_features(x, pack, task, rows, "linear", 0)
+    assert records["pattern", "both", "vision missing"]["group_correct"] == expected["group_correct"]
+    assert records["pattern", "both", "vision missing"]["accuracy"] > 0.5  # touch alone knows much of it
+
+
+def test_few_labels_take_their_share_and_one_of_each_class(pack: Pack) -> None:
+    rows, labels = parts(pack, pack.spec.tasks[0]), pack.labels("pattern")
+    for share in (0.01, 0.1, 0.5):
+        keep, few = module._few(rows, labels, share, seed=3)
+        assert set(labels[few.train]) == set(labels[few.val]) == {0, 1, 2}
+        assert len(few.train) == max(3, round(share * len(rows.train)))
+        assert set(few.train) <= set(rows.train) and set(few.val) <= set(rows.val)
+        everything = np.concatenate([rows.train, rows.val, rows.test])
+        assert np.array_equal(everything[keep], np.concatenate([few.train, few.val, rows.test]))
+    assert not np.array_equal(
+        module._few(rows, labels, 0.1, seed=4)[1].train, module._few(rows, labels, 0.1, 3)[1].train
+    )
+
+
+def test_noise_is_that_strong_the_same_for_all_and_on_test_images_only(
+    trained: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = np.full((64, 64, 3), 128, np.uint8)
+    noise = module._noisy(image, 0, 5).astype(float) - 128
+    assert noise.std() == pytest.approx(20, rel=0.03) and abs(noise.mean()) < 0.6
+    assert np.array_equal(module._noisy(image, 0, 5), module._noisy(image, 0, 5))
+    assert not np.array_equal(module._noisy(image, 0, 5), module._noisy(image, 0, 6))
+    rows: list[int] = []
+    real = module._noisy
+    monkeypatch.setattr(module, "_noisy", lambda image, seed, row: rows.append(row) or real(image, seed, row))
+    stress(load(trained), pack, pack.spec.tasks, ["touch"])
+    assert set(rows) == set(pack.rows("test"))
+
+
+def test_without_noise_it_is_the_plain_probe(trained: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "NOISE_LEVELS", 0.0)
+    found = stress(load(trained), pack, pack.spec.tasks, ["touch", "both"])
+    plain = probe_runs([trained], Session(controls=False))["records"]
+    for record in (r for r in found if r["probe"] == NOISE):
+        same = [r for r in plain if all(r[k] == record[k] for k in ("task", "modality")) and r["probe"] == "linear"]
+        assert record["group_correct"] == same[0]["group_correct"]
+
+
+def test_strong_noise_hurts(records: dict, trained: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "NOISE_LEVELS", 200.0)
+    found = stress(load(trained), pack, pack.spec.tasks[:1], ["touch"])
+    drowned = next(r for r in found if r["probe"] == NOISE)
+    assert drowned["accuracy"] < records["pattern", "touch", NOISE]["accuracy"]
+
+
+def test_touch_only_models_miss_nothing(pack: Pack) -> None:
+    from mvitac.methods.supervised import SupervisedConfig
+
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), method=SupervisedConfig(modalities=("touch",)))
+    torch.manual_seed(0)
+    model = Model(run.method.build(pack.spec, run.encoder), run, pack.spec, pack.size)
+    found = stress(model, pack, pack.spec.tasks[:1], ["touch", "vision", "both"])
+    assert {r["modality"] for r in found} == {"touch"} and {r["probe"] for r in found} == set(STRESSES[:3])
+
+
+def test_in_a_comparison_and_on_the_command_line(
+    pack: Pack, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = small(pack, seeds=1, stress=True, tasks=("pattern",), set={"steps": 1, "eval_every": 0})
+    session = Session(tasks=("pattern",))
+    work = lay_out(plan, pack, tmp_path, session)
+    do_all(work, 1, lambda line: None)
+    text = write_tables(gather(work, tmp_path, session), tmp_path)[0].read_text()
+    block = text[text.index("**vision missing**") : text.index("**touch missing**")]
+    assert "| MViTac | both |" in block and "| touch |" not in block and "untrained" not in block
+    assert main(["probe", str(trained), "--stress", "--tasks", "pattern", "--json", str(tmp_path / "p.json")]) == 0
+    assert "10 % of labels" in capsys.readouterr().out
+    kinds = {r["probe"] for r in json.loads((tmp_path / "p.json").read_text())["records"]}
+    assert kinds >= {"linear", *STRESSES}
