@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -15,6 +17,9 @@ def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
     """Smooth uint8 pictures, as photographs are."""
     noise = torch.rand(num, channels, 6, 6, generator=torch.Generator().manual_seed(3))
     return (F.interpolate(noise, (side, side), mode="bicubic").clamp(0, 1) * 255).to(torch.uint8)
+
+
+ROUTES = (augment._one_by_one, augment._batched)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -42,14 +47,35 @@ def test_same_generator_same_view() -> None:
     )
 
 
-def test_both_routes_replay_the_same_parameters() -> None:
-    """The batched grid sample (GPU route) shows the crop of the one-by-one route to within resampling error."""
-    raw = images(16, side=40)
-    drawn = draw(ViewAugment(scale=(0.3, 1.0)), 16, 40, generator())
-    one_by_one, batched = augment._crop_cpu(raw, drawn, 40), augment._crop_gpu(raw, drawn, 40)
-    assert (one_by_one - batched).abs().mean() < 0.01
+@pytest.mark.parametrize("size", [24, 40, 56])
+@pytest.mark.parametrize("channels", [3, 6])
+def test_both_routes_replay_the_same_parameters(size: int, channels: int) -> None:
+    """Crop, flip, jitter and grayscale of the batched route are the one-by-one route's to within a level's rounding."""
+    raw = images(16, channels, side=40)
+    drawn = draw(ViewAugment(scale=(0.3, 1.0), grayscale=0.3, jitter=0.2), 16, 40, generator())
+    one_by_one, batched = (f(raw, drawn, size, torch.float32) for f in (augment._one_by_one, augment._batched))
+    off = 255 * (denormalise(one_by_one) - denormalise(batched)).abs()
+    assert off.max() < 2.5 and off.mean() < 0.5
     wrong = Drawn(drawn.boxes.roll(1, 0), drawn.flip, drawn.grayscale, drawn.gains)
-    assert (one_by_one - augment._crop_gpu(raw, wrong, 40)).abs().mean() > 0.05  # the bound can fail
+    other = denormalise(augment._batched(raw, wrong, size, torch.float32))
+    assert 255 * (denormalise(one_by_one) - other).abs().mean() > 5  # the bound can fail
+
+
+def test_both_routes_have_the_same_statistics() -> None:
+    """Mean and spread of every channel over many random views of the same pictures."""
+    raw = images(8, side=40).repeat(40, 1, 1, 1)
+    config = ViewAugment()
+    a, b = (route(raw, draw(config, 320, 40, generator(i)), 24, torch.float32) for i, route in enumerate(ROUTES))
+    torch.testing.assert_close(a.mean((0, 2, 3)), b.mean((0, 2, 3)), atol=0.06, rtol=0)
+    torch.testing.assert_close(a.std((0, 2, 3)), b.std((0, 2, 3)), atol=0.04, rtol=0)
+
+
+@pytest.mark.parametrize("route", [augment._one_by_one, augment._batched])
+def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> None:
+    drawn = draw(ViewAugment(), 8, 40, generator())
+    exact, rounded = (route(images(), drawn, 24, dtype) for dtype in (torch.float32, torch.bfloat16))
+    assert torch.equal(exact.bfloat16(), rounded)
+    assert rounded.is_contiguous(memory_format=torch.channels_last)
 
 
 def test_flip_is_exact() -> None:

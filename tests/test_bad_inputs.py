@@ -226,6 +226,8 @@ OPTIONS: list[tuple[str, str, list[str]]] = [
     ("epochs-of-a-lifetime", PRETRAIN + "--steps None --epochs 1e300", ["epochs", "1e+300", "at most"]),
     ("batch-larger-than-data", PRETRAIN + "--batch-size 100", ["72 rows", "batch_size is 100", "72 or less"]),
     ("views-larger-than-stored", PRETRAIN + "--augment.size 64", ["64 px", "32 px", "--augment.size 32"]),
+    ("whole-larger-than-stored", PRETRAIN + "--augment.whole 64", ["64 px", "32 px", "--augment.whole 32"]),
+    ("whole-tiny", PRETRAIN + "--augment.whole 4", ["whole 4", "8 to 1024"]),
     ("seed-beyond-64-bits", PRETRAIN + "--seed 99999999999999999999", ["seed 99999999999999999999", "give"]),
     ("heads-beyond-memory", PRETRAIN + "--method.out 99999999999", ["99999999999", "give"]),
     ("scale-reversed", PRETRAIN + "--augment.touch.scale 0.9 0.1", ["(0.9, 0.1)", "low <= high"]),

@@ -30,6 +30,7 @@ from mvitac.datasets.calandra import (
     owners_shuffle,
 )
 from mvitac.datasets.packed import PackConfig
+from mvitac.feed import Feed
 from mvitac.pack import Pack, build
 from mvitac.probe import Session, parts, probe_runs
 from mvitac.recipes import recipe
@@ -173,7 +174,7 @@ def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:
 
 
 def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
-    """A missing attribute, a missing image, a chunk that no longer inflates, a wrong outcome: four items, four reasons."""
+    """A missing attribute, a missing image, a chunk that no longer inflates, and a wrong outcome: four reasons."""
     objects: list[bytes | None] = [b"lemon", None, b"lime", b"potato", b"onion", b"soft_zebra", b"lemon", b"metal_can"]
     path = write_shard(tmp_path, 0, objects)
     with h5py.File(path, "a") as file:
@@ -371,7 +372,7 @@ def test_after_has_no_label(leaking: Path, tmp_path: Path) -> None:
 
 
 def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leaking: Path, tmp_path: Path) -> None:
-    """The same road on both packs: what 'during' does not show is at chance, what 'after' shows is not."""
+    """Same pre-training, same probes: what 'during' does not show is at chance, what 'after' shows is not."""
     shown = {}
     for ask in (("during",), ("after",)):
         pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)
@@ -412,7 +413,8 @@ def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
     run = recipe("smoke", PackConfig(path=pack.path))
     rows = pack.rows("train")
     run = replace(run, augment=replace(run.augment, size=16))
-    views = make_views(run, pack, rows, 1, torch.Generator(), torch.device("cpu"))
+    cpu = torch.device("cpu")
+    views = make_views(run, pack, rows, 1, torch.Generator(), cpu, Feed(pack, cpu))
     assert np.array_equal(views.labels["success"].numpy() >= 0, about[rows])
 
 

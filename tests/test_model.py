@@ -12,6 +12,7 @@ from PIL import Image
 from toy import toy_pack
 
 import mvitac
+from mvitac.augment import plain_view
 from mvitac.datasets.packed import PackConfig
 from mvitac.model import Model, pack_features
 from mvitac.pack import Pack
@@ -39,6 +40,19 @@ def test_embed_equals_the_probes_features(model: Model, pack: Pack) -> None:
         expected = pack_features(model, pack, modality, rows)
         found = model.embed(**{modality: pack.images[modality][rows]})[modality]
         assert torch.equal(found, expected)
+
+
+def test_whole_images_are_seen_at_their_own_size(model: Model, pack: Pack) -> None:
+    crops = replace(model.run.augment, size=16, whole=24)
+    smaller = Model(
+        model.run.method.build(pack.spec, model.run.encoder), replace(model.run, augment=crops), pack.spec, 32
+    )
+    images = torch.from_numpy(pack.images["touch"][[0, 1, 2, 3]]).permute(0, 3, 1, 2)
+    expected = smaller.encoders["touch"](plain_view(images, 24)).detach()
+    assert torch.equal(smaller.features("touch", images), expected)
+    as_crops = Model(model.run.method.build(pack.spec, model.run.encoder), model.run, pack.spec, 32)
+    as_crops.load_state_dict(smaller.state_dict())
+    assert as_crops.weights_digest() != smaller.weights_digest()  # cached features of one are not the other's
 
 
 def test_embed_takes_arrays_tensors_and_pictures_alike(model: Model, pack: Pack) -> None:

@@ -16,7 +16,7 @@ from mvitac.encoders import SCRATCH, EncoderConfig
 from mvitac.methods.mvitac import MViTac, MViTacConfig
 from mvitac.run import Optim
 from mvitac.spec import DataSpec
-from mvitac.train import build_optimiser
+from mvitac.step import build_optimiser
 
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
 CONFIG = MViTacConfig(hidden=24, out=12)

@@ -13,8 +13,9 @@ from toy import toy_pack
 
 from mvitac import probe
 from mvitac.datasets.packed import PackConfig
+from mvitac.model import fresh
 from mvitac.pack import Pack
-from mvitac.probe import Session, interval, parts, probe_features, probe_runs, summarise
+from mvitac.probe import Session, cross_modal, interval, parts, probe_features, probe_runs, summarise
 from mvitac.recipes import recipe
 from mvitac.tables import markdown
 from mvitac.train import train
@@ -174,6 +175,10 @@ def test_seeds_widen_the_interval() -> None:
     assert (low, high) == pytest.approx((0.5, 0.9))
 
 
+def test_one_group_says_nothing_about_others() -> None:
+    assert interval([{"group_sizes": [10], "group_correct": [9]}]) == (0.9, 0.0, 1.0)
+
+
 def test_summary_shows_a_controls_only_probe(result: dict) -> None:
     knn = summarise(result["records"], "knn")
     assert "majority" in knn["pattern"]["none"] and "pixels" in knn["pattern"]["touch"]
@@ -195,6 +200,14 @@ def test_retrieval_of_the_untrained_is_chance(result: dict) -> None:
     for record in result["retrieval"]:
         assert record["chance R@5"] == pytest.approx(5 / record["num_groups"])
         assert 0 <= record["R@1"] <= record["R@5"] <= record["R@10"] <= 1
+
+
+def test_retrieval_needs_enough_groups_to_choose_from(result: dict, tmp_path: Path) -> None:
+    assert len(result["retrieval"]) == 2 * len({(r["source"], r["seed"]) for r in result["retrieval"]})
+    few = toy_pack(tmp_path / "few", num=60)
+    run = recipe("smoke", PackConfig(path=few.path))
+    assert len(set(few.column("group")[few.rows("test")])) < 10
+    assert cross_modal(fresh(run, few.spec, few.size), few) == []
 
 
 def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ HOSTILE = '<script>alert("1")</script> & $x_1$'
 
 @dataclass(frozen=True)
 class Noise(Source):
-    """Random pictures: eighteen groups of four rows, every third group test, all with hostile names."""
+    """Random pictures: thirty-six groups of two rows, every third group test, all with hostile names."""
 
     vision: int = 3
     touch: int = 3
@@ -72,7 +72,7 @@ class Noise(Source):
         return [str(i) for i in range(72)]
 
     def read(self, item: int) -> list[Sample]:
-        rng, group = np.random.default_rng(item), item // 4
+        rng, group = np.random.default_rng(item), item // 2
         split = "test" if group % 3 == 2 else "train"
         columns = {"id": str(item), "group": f"{group}{HOSTILE}", "split": split}
         labels = {"label_kind": group % 2} if self.labelled else {}

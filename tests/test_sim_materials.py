@@ -9,9 +9,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, background, press, pressure, relax, render
+from mvitac.sim import gel
+from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, area_resize, background, press, pressure, relax, render
 from mvitac.sim.materials import CLASSES, draw_instance, touch
-from mvitac.sim.relief import KINDS, Relief, draw_tables
+from mvitac.sim.relief import KINDS, Relief, draw_tables, noise
 
 LIST = "import sys; from mvitac.sim.materials import touch; import hashlib; p = touch(3, 7, 2, 1, size=32); "
 PRINT = "print(hashlib.sha256(p['vision'].tobytes() + p['touch'].tobytes()).hexdigest())"
@@ -185,3 +186,27 @@ def test_wrong_shapes_and_kinds_are_named():
         press(np.zeros((4, 4, 3), np.float32), force_n=1.0, stiffness=1.0, pixel_mm=0.1)
     with pytest.raises(ValueError, match="force_n >= 0"):
         press(np.zeros((4, 4), np.float32), force_n=-1.0, stiffness=1.0, pixel_mm=0.1)
+
+
+def test_the_fast_lattice_is_the_plain_formula_bit_for_bit():
+    """The generator is frozen: whoever makes it faster may not change a pixel."""
+    table = draw_tables(np.random.default_rng(1))[0]
+    rng = np.random.default_rng(2)
+    u, v = rng.uniform(-200, 200, (2, 90, 70)).astype(np.float32)
+    i, j = np.floor(u).astype(int), np.floor(v).astype(int)
+    a, b = u - np.floor(u), v - np.floor(v)
+    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
+
+    def corner(di: int, dj: int) -> np.ndarray:
+        return table[(i + di) % 64, (j + dj) % 64]
+
+    near = corner(0, 0) + a * (corner(1, 0) - corner(0, 0))
+    far = corner(0, 1) + a * (corner(1, 1) - corner(0, 1))
+    assert (noise(u, v, table) == near + b * (far - near)).all()
+
+
+def test_halving_is_the_area_average_bit_for_bit():
+    picture = np.random.default_rng(0).normal(80, 60, (48, 64, 3)).astype(np.float32)
+    rows, columns = gel._area_weights(48, 24), gel._area_weights(64, 32)
+    general = np.einsum("hH,HWc->hWc", rows, picture).transpose(0, 2, 1).dot(columns.T).transpose(0, 2, 1)
+    assert (area_resize(picture, 24, 32) == general).all()

@@ -20,9 +20,13 @@ what the features are worth.
   data info PACK       what is in a pack
   data check PACK      what is wrong with a pack, or with --data NAME (doctor)
   data sheet KIND      a picture of what the simulator makes
+  data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
+  data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes beside their controls
   report RUN...        one HTML page with curves, tables and pictures
+  publish RUN OUT      weights, probes, model card: one folder, or on the Hub
+  export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
 
 First steps:
   mvitac demo                                        # no data needed
@@ -38,9 +42,13 @@ COMMANDS = {
     "data info": "data:info",
     "data check": "check:check",
     "data sheet": "data:sheet",
+    "data show": "data:show",
+    "data export-lerobot": "data:export_lerobot",
     "pretrain": "learn:pretrain",
     "probe": "learn:probe",
     "report": "learn:report",
+    "publish": "robot:publish",
+    "export": "robot:export",
 }
 """Command -> module of ``commands``:function, imported when called."""
 

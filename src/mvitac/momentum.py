@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+
+def rising(m: float, end: float | None, progress: float) -> float:
+    """m at ``progress`` (0 to 1) of a run: constant, or rising to ``end`` along a half cosine (BYOL, MoCo v3)."""
+    return m if end is None else end - (end - m) * (math.cos(math.pi * progress) + 1) / 2
 
 
 class Momentum(nn.Module):
@@ -29,6 +35,6 @@ class Momentum(nn.Module):
         torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage] - one call for all tensors
             [k for k, _ in floating], [q.detach() for _, q in floating], 1 - m
         )
-        for k, q in zip(mine, theirs, strict=True):
-            if not k.is_floating_point():
-                k.copy_(q)
+        counters = [(k, q) for k, q in zip(mine, theirs, strict=True) if not k.is_floating_point()]
+        if counters:
+            torch._foreach_copy_([k for k, _ in counters], [q for _, q in counters])  # pyright: ignore[reportPrivateImportUsage]

@@ -91,7 +91,7 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     usable = []
     for task in pack.spec.tasks:
         try:
-            parts(pack, task)
+            parts(pack, task, "both")
         except ValueError:  # no labelled rows to learn from or to be scored on
             continue
         usable.append(task.name)
@@ -145,7 +145,7 @@ def _head(study: Study, title: str) -> str:
         "recipe": ", ".join(dict.fromkeys(r.run.recipe for r in runs)),
         "seeds" if len(seeds) > 1 else "seed": ", ".join(map(str, seeds)),
         "trunk": ", ".join(dict.fromkeys(r.run.encoder.trunk for r in runs)),
-        "input": ", ".join(dict.fromkeys(f"{r.run.augment.size} px" for r in runs)),
+        "input": ", ".join(dict.fromkeys(f"{r.run.augment.seen} px" for r in runs)),
     }
     items = "".join(f"<li>{escape(name)} <b>{escape(value)}</b></li>" for name, value in chips.items())
     text = "; ".join(verdicts(study)) or "nothing is scored on this data, there is only something to look at"
@@ -170,7 +170,7 @@ def verdicts(study: Study) -> list[str]:
             ", ".join([f"{WORDS[modality]} reaches {100 * own['mean']:.1f} % on {task}{by}", *others, *beside])
         )
     found = tables.retrieval_means(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
-    if found and found["chance R@5"] < 1:  # with five groups or fewer, all are among the first five
+    if found:
         clauses.append(
             f"a touch finds its {study.pack.spec.group_by} among the first five by camera in {100 * found['R@5']:.1f} %"
             f" (chance {100 * found['chance R@5']:.1f})"

@@ -89,8 +89,16 @@ class Run:
     """What a query must find. same-image: another view of its own row (paper). same-touch: a view of another row of its
     touch group (another frame of the contact, another press of the thing), so that lamp, background, sensor and place,
     which differ between the two, cannot give the answer away; a row alone in its group is its own partner."""
-    precision: Literal["fp32", "bf16"] = "fp32"
-    """Arithmetic of the networks; losses, weights and the optimiser stay fp32."""
+    precision: Literal["fp32", "tf32", "bf16"] = "fp32"
+    """Arithmetic of the networks; losses, weights and the optimiser stay fp32. fp32 is never TF32 in silence; tf32 lets a
+    GPU round products to 10 bits."""
+    chunk: int = 0
+    """Pairs embedded at a time (gradient caching): a batch of any size in the memory of this many, for about a quarter
+    more arithmetic; BatchNorm sees one chunk at a time. 0 = the whole batch at once."""
+    recompute: bool = False
+    """Recompute activations in the backward pass instead of keeping them (activation checkpointing)."""
+    compile: bool = False
+    """torch.compile the forward pass, in one graph: pays on GPUs."""
     seed: int = 0
     """Decides initial weights, batches, views and dropout."""
     device: str = "auto"
@@ -107,6 +115,8 @@ class Run:
             raise ValueError(f"batch_size {self.batch_size}: contrast needs at least 2 pairs")
         if not (self.epochs > 0 and math.isfinite(self.epochs)):
             raise ValueError(f"epochs {self.epochs}: give a positive number")
+        if self.chunk and not (2 <= self.chunk <= self.batch_size and self.batch_size % self.chunk == 0):
+            raise ValueError(f"chunk {self.chunk}: give a divisor of batch_size {self.batch_size}, at least 2, or 0")
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
         if not 0 <= self.seed < 1 << 63:
@@ -144,6 +154,11 @@ class Run:
             raise ValueError(
                 f"views of {self.augment.size} px cannot be cut from images stored at {stored_size} px:"
                 f" give --augment.size {stored_size} or less, or pack the data at a larger --data.size"
+            )
+        if self.augment.seen > stored_size:
+            raise ValueError(
+                f"whole images of {self.augment.seen} px were stored at {stored_size} px:"
+                f" give --augment.whole {stored_size} or less, or pack the data at a larger --data.size"
             )
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")

@@ -12,7 +12,8 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -23,14 +24,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor
 
 from mvitac import diagnostics
+from mvitac.allocator import keep_freed_memory
 from mvitac.augment import random_view
 from mvitac.batch import Views
+from mvitac.distributed import World, join, local_device, synchronise_norms
+from mvitac.feed import Feed, ahead
 from mvitac.methods.base import Method
 from mvitac.model import Model, load_run, pack_features
 from mvitac.pack import Pack
 from mvitac.record import brief, check_place, naming, provenance, write_atomic, write_json
 from mvitac.registry import to_json
-from mvitac.run import Optim, Run
+from mvitac.run import Run
+from mvitac.step import Part, Step
 
 Sink = Callable[[int, dict[str, float]], None]
 
@@ -59,65 +64,75 @@ def train(
     """
     out = Path(out)
     _check_out(out, resume)
-    device = pick_device(run.device)
-    pack = pack or run.data.open(quiet=quiet)
-    rows = pack.rows("train", "unlabelled")
+    world = join()
+    device = pick_device(local_device(run.device))
+    if world.rank:
+        world.wait()  # rank 0 simulates or packs what is not there yet, the others find it
+    pack = pack or run.data.open(quiet=quiet or not world.writes)
+    if not world.rank:
+        world.wait()
+    rows = training_rows(run, pack)
     run.check(pack.spec, len(rows), pack.size)
+    _check_world(run, world)
     again = (out / "run.json").exists()
     if again:
         _check_same(run, pack, out)
     if again and (out / "model.safetensors").exists():
         return out  # resumed after its end
 
+    if device.type == "cpu":
+        keep_freed_memory()
     torch.manual_seed(run.seed)
-    method = run.method.build(pack.spec, run.encoder).to(device)
-    method.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    for task in run.method.labels_needed(pack.spec):
-        if not (pack.labels(task)[rows] >= 0).any():
-            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    method = run.method.build(pack.spec, run.encoder)
+    method.prepare(torch.from_numpy(rows))
+    method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _try(method, run, pack)
-    optimiser = build_optimiser(run.optim, method)
+    synchronise_norms(method, world)
+    step = Step(run, method, device, world)
     num_steps, start = run.num_steps(len(rows)), 0
     if (out / "checkpoint.pt").exists():
-        start = _restore(out / "checkpoint.pt", run, method, optimiser, num_steps)
-    if not again:
+        start = _restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
+    world.same_everywhere([*method.parameters(), *method.buffers()])  # and no one writes before all have looked
+    if not again and world.writes:
         record = {"run": to_json(run), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
         write_json(out / "run.json", {**record, "device": describe(device), **provenance()})
     every = run.checkpoint_every or max(1, num_steps // 10)
     method.train()
 
-    with _Log(out, start, num_steps, quiet, sinks) as log, _stop_signals() as stopped:
-        for step, batch_rows in enumerate(batches(run, pack, rows, start, num_steps), start=start):
-            epoch = step // run.steps_per_epoch(len(rows))
-            for group in optimiser.param_groups:
-                group["lr"] = run.optim.rate(step, num_steps, epoch)
-            generator = torch.Generator().manual_seed(mix(run.seed, step))
-            batch = make_views(run, pack, batch_rows, method.views, generator, device)
-            torch.manual_seed(mix(run.seed, step) + 1)  # dropout
-            with torch.autocast(device.type, torch.bfloat16, enabled=run.precision == "bf16"):
-                losses = method(batch)
-            optimiser.zero_grad(set_to_none=True)
-            losses["loss"].backward()
-            optimiser.step()
-            method.after_step((step + 1) / num_steps)
+    log_here = _Log(out, start, num_steps, quiet, sinks) if world.writes else nullcontext()
+    with log_here as log, _stop_signals() as stopped:
+        for at, parts in enumerate(
+            feed_parts(run, pack, rows, method.views, device, world, start, num_steps), start=start
+        ):
+            rate = run.optim.rate(at, num_steps, at // run.steps_per_epoch(len(rows)))
+            losses = step(parts, lr=rate, seed=mix(run.seed, at) + 1, progress=(at + 1) / num_steps)
 
-            done = step + 1
-            if done % run.log_every == 0 or done == num_steps:
-                values = {name: float(value.detach()) for name, value in losses.items()}
+            done = at + 1
+            report = done % run.log_every == 0 or done == num_steps
+            if report:
+                values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
                 _check_finite(values, done, run)
-                log.step(done, values, optimiser.param_groups[0]["lr"], run.batch_size)
+                if log:
+                    log.step(done, values, rate, run.batch_size)
+            stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
+            if log is None:
+                if stopping and done < num_steps:
+                    raise Interrupted(f"stopped after step {done} of {num_steps}")
+                continue
             log.advance(done)
             if done == num_steps or (run.eval_every and done % run.eval_every == 0):
                 log.evaluation(done, evaluate(Model(method, run, pack.spec, pack.size), pack, run))
                 method.train()
-            if done == num_steps or done % every == 0 or stopped():
-                state = {"method": method.state_dict(), "optimiser": optimiser.state_dict(), "step": done}
+            if done == num_steps or done % every == 0 or stopping:
+                state = {"method": method.state_dict(), "optimiser": step.optimiser.state_dict(), "step": done}
                 buffer = io.BytesIO()  # written in one go: torch.save itself hides a full disk behind its own error
                 torch.save({**state, "run": run.digest()}, buffer)
                 write_atomic(out / "checkpoint.pt", lambda file, buffer=buffer: file.write(buffer.getbuffer()))
-            if stopped() and done < num_steps:
+            if stopping and done < num_steps:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
-    Model(method, run, pack.spec, pack.size).save(out / "model.safetensors")
+    if world.writes:
+        Model(method, run, pack.spec, pack.size).save(out / "model.safetensors")
+    world.wait()
     return out
 
 
@@ -146,18 +161,22 @@ def describe(device: torch.device) -> str:
     return f"{device.type}, {torch.get_num_threads()} threads"
 
 
+def training_rows(run: Run, pack: Pack) -> np.ndarray:
+    """Pack rows to pre-train on; a method that learns from labels sees only rows that carry one it needs."""
+    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)  # a pair with a hole in it is no pair
+    tasks = run.method.labels_needed(pack.spec)
+    if not tasks:
+        return rows
+    labels = {task: pack.labels(task)[rows] >= 0 for task in tasks}
+    for task, there in labels.items():
+        if not there.any():
+            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    return rows[np.logical_or.reduce(list(labels.values()))]
+
+
 def mix(*numbers: int) -> int:
     """One 63-bit seed from several numbers, by numpy's SeedSequence."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
-
-
-def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
-    """Over the method's trainable parameters only (momentum copies have none)."""
-    parameters = [p for p in method.parameters() if p.requires_grad]
-    if config.name == "sgd":
-        return torch.optim.SGD(parameters, config.lr, momentum=config.betas[0], weight_decay=config.weight_decay)
-    kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[config.name]
-    return kind(parameters, config.lr, config.betas, config.eps, config.weight_decay)
 
 
 def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) -> Iterator[np.ndarray]:
@@ -188,19 +207,64 @@ def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
     return order[np.argsort(occurrence, kind="stable")]
 
 
+def feed_parts(
+    run: Run,
+    pack: Pack,
+    rows: np.ndarray,
+    num_views: int,
+    device: torch.device,
+    world: World,
+    start: int,
+    num_steps: int,
+) -> Iterator[list[Part]]:
+    """The parts of each step's batch that this process embeds: chunk by chunk of its own share of the rows.
+
+    Views depend on (seed, step, part) alone, so two processes see what one process sees with a chunk of half the batch.
+    """
+    feed = Feed(pack, device)
+    share = run.batch_size // world.size
+    per_process = share // (run.chunk or share)
+    num_parts = per_process * world.size
+
+    def part(step: int, batch: np.ndarray, number: int) -> Views:
+        seed = mix(run.seed, step) if num_parts == 1 else mix(run.seed, step, number)
+        chunk = np.split(batch, num_parts)[number]
+        return make_views(run, pack, chunk, num_views, torch.Generator().manual_seed(seed), device, feed)
+
+    numbers = range(per_process * world.rank, per_process * (world.rank + 1))
+    steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
+    if device.type == "cuda" and per_process == 1:
+        for made in ahead((part(step, batch, numbers[0]) for step, batch in steps), device):
+            yield [partial(_same, made)]
+        return
+    for step, batch in steps:
+        yield [partial(part, step, batch, number) for number in numbers]
+
+
+def _same(views: Views) -> Views:
+    return views
+
+
 def make_views(
-    run: Run, pack: Pack, rows: np.ndarray, num_views: int, generator: torch.Generator, device: torch.device
+    run: Run,
+    pack: Pack,
+    rows: np.ndarray,
+    num_views: int,
+    generator: torch.Generator,
+    device: torch.device,
+    feed: Feed,
 ) -> Views:
-    """Random views of the pack's ``rows`` on ``device``."""
+    """Random views of the pack's ``rows`` on ``device``, in the precision the networks read them in."""
     sources = [rows] * num_views
     if run.positives == "same-touch":
         sources[1:] = [partners(pack, rows, generator) for _ in range(num_views - 1)]
+    dtype = torch.bfloat16 if run.precision == "bf16" else torch.float32
     images: dict[str, list[Tensor]] = {}
     for modality in pack.spec.modalities:
         config, images[modality] = getattr(run.augment, modality), []
         for source in sources:
-            raw = torch.from_numpy(pack.images[modality][source]).permute(0, 3, 1, 2).to(device)
-            images[modality].append(random_view(raw, config, run.augment.size, generator))
+            view = random_view(feed(modality, source), config, run.augment.size, generator, dtype)
+            images[modality].append(view)
     labels = {t.name: torch.from_numpy(pack.labels(t.name)[rows]).to(device) for t in pack.spec.tasks}
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
 
@@ -208,11 +272,12 @@ def make_views(
 def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
     """For each of ``rows`` a random other row of its touch group in the same split, or itself if it is alone there."""
     groups, split = pack.touch_groups, pack.column("split")
+    whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]))
-        others = others[(others != row) & (split[others] == split[row])]
+        others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found
@@ -237,14 +302,16 @@ NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
 def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """kNN accuracy of each task and the collapse panel on held-out groups (split val); never looks at test.
 
-    Without a val split the panel is over training rows and there is no kNN score.
+    Without a val split the panel is over training rows and there is no kNN score. Only rows with both modalities count.
     """
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
 
     def some(rows: np.ndarray, num: int) -> np.ndarray:
         return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
-    train_rows, val_rows = some(pack.rows("train", "unlabelled"), NUM_EVAL_TRAIN), pack.rows("val")
+    whole = pack.spec.modalities
+    train_rows = some(pack.rows("train", "unlabelled", having=whole), NUM_EVAL_TRAIN)
+    val_rows = pack.rows("val", having=whole)
     held_out = len(val_rows) > 1
     panel_rows = some(val_rows, NUM_EVAL_VAL) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: pack_features(model, pack, m, panel_rows, precision=run.precision) for m in model.encoders}
@@ -295,6 +362,14 @@ def _check_out(out: Path, resume: bool) -> None:
         raise ValueError(f"{out} exists and is not a run: choose another --out")
 
 
+def _check_world(run: Run, world: World) -> None:
+    if run.batch_size % (world.size * max(1, run.chunk)):
+        raise ValueError(
+            f"batch_size {run.batch_size} is not the same whole number of {'chunks' if run.chunk else 'pairs'} for each of"
+            f" {world.size} processes: give a multiple of {world.size * max(1, run.chunk)}"
+        )
+
+
 def _check_same(run: Run, pack: Pack, out: Path) -> None:
     old, record = load_run(out)
     if old.digest() != run.digest() or record.get("pack") != pack.digest:
@@ -312,7 +387,7 @@ def _try(method: Method, run: Run, pack: Pack) -> None:
             model.features(modality, blank)
         except Exception as error:  # each family of trunks has its own words for it
             raise ValueError(
-                f"trunk {run.encoder.trunk} cannot see views of {run.augment.size} px ({brief(error)}):"
+                f"trunk {run.encoder.trunk} cannot see images of {run.augment.seen} px ({brief(error)}):"
                 " give another --augment.size or --encoder.trunk"
             ) from None
 

@@ -129,4 +129,86 @@ def info(argv: list[str]) -> None:
         table.add_row(split, str(len(rows)), str(len(set(pack.column("group")[rows]))), *cells)
     console = Console()
     console.print(table)
+    if len(gaps := [m for m in pack.spec.modalities if not pack.has(m).all()]):
+        whole = int(np.logical_and.reduce([pack.has(m) for m in pack.spec.modalities]).sum())
+        lacking = ", ".join(f"{int((~pack.has(m)).sum())} rows without {m}" for m in gaps)
+        console.print(f"{lacking}; {whole} whole pairs", soft_wrap=True, highlight=False)
     console.print(f"source {pack.spec.source}; licence {pack.spec.licence}", soft_wrap=True, highlight=False)
+
+
+def show(argv: list[str]) -> None:
+    """mvitac data show PACK [--by TASK|COLUMN] [--out FILE.png|FILE.html]"""
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    @dataclass(frozen=True)
+    class Options:
+        """A few pairs of every class or object, for a person to judge."""
+
+        pack: Positional[Path]
+        """Folder of the pack."""
+        by: str = ""
+        """Task or table column, one strip per value; default: the first task, else the group."""
+        split: str = ""
+        """Show rows of train, val, test or unlabelled only."""
+        num: int = 6
+        """Pairs per strip, of different groups where there are so many."""
+        limit: int = 40
+        """Strips at most."""
+        side: int = 96
+        """Height of a picture in pixels."""
+        seed: int = 0
+        """Another number is another draw."""
+        out: Path | None = None
+        """A .png or an .html; default: <pack's name>.png here."""
+
+    options = parse(Options, argv, "data show")
+    out = options.out or Path(f"{options.pack.resolve().name}.png")
+    if out.suffix.lower() not in (".png", ".html"):
+        raise ValueError(f"--out {out}: give a name that ends in .png or .html")
+    if not 16 <= options.side <= 1024:
+        raise ValueError(f"--side {options.side}: give 16 to 1024 pixels")
+    if options.seed < 0:
+        raise ValueError(f"--seed {options.seed}: give a number >= 0")
+    from mvitac import sheet
+    from mvitac.pack import Pack
+    from mvitac.record import check_place, write_atomic
+
+    check_place(out)
+    pack = Pack(options.pack)
+    found, num_all = sheet.strips(
+        pack, options.by, split=options.split, num=options.num, limit=options.limit, seed=options.seed
+    )
+    if out.suffix.lower() == ".html":
+        text = sheet.to_html(pack, found, num_all, side=options.side)
+        write_atomic(out, lambda file: file.write(text.encode()))
+    else:
+        picture = sheet.to_image(pack, found, num_all, side=options.side)
+        write_atomic(out, lambda file: picture.save(file, "PNG"))
+    Console().print(f"{out}: {len(found)} of {num_all} strips", soft_wrap=True, highlight=False)
+
+
+def export_lerobot(argv: list[str]) -> None:
+    """mvitac data export-lerobot PACK --out DIR [--fps 10]"""
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    from mvitac.datasets.lerobot_out import write_lerobot
+    from mvitac.pack import Pack
+
+    @dataclass(frozen=True)
+    class Options:
+        """A pack as a LeRobotDataset v3: images as they are (PNG), one episode per touch group."""
+
+        pack: Positional[Path]
+        """Folder of the pack."""
+        out: Path
+        """Folder of the new dataset."""
+        fps: int = 10
+        """Nominal rate of the rows of an episode: a pack knows no time."""
+
+    options = parse(Options, argv, "data export-lerobot")
+    pack = Pack(options.pack)
+    num = write_lerobot(pack, options.out, fps=options.fps)
+    left = f"; {pack.num - num} rows that lack a modality left out" * (num < pack.num)
+    Console().print(f"{options.out}: {num} frames{left}", soft_wrap=True, highlight=False)

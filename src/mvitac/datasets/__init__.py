@@ -1,6 +1,31 @@
 """Datasets, one file each; importing this package registers them. No torch here: packing workers import it."""
 
-from mvitac.datasets import calandra, folder, packed, simulated
+from mvitac.datasets import (
+    calandra,
+    folder,
+    hub,
+    lerobot,
+    packed,
+    physiclear,
+    simulated,
+    slip_grasp,
+    slip_gsmini,
+    vt60,
+    webdataset,
+)
 from mvitac.datasets.base import DatasetConfig
 
-__all__ = ["DatasetConfig", "calandra", "folder", "packed", "simulated"]
+__all__ = [
+    "DatasetConfig",
+    "calandra",
+    "folder",
+    "hub",
+    "lerobot",
+    "packed",
+    "physiclear",
+    "simulated",
+    "slip_grasp",
+    "slip_gsmini",
+    "vt60",
+    "webdataset",
+]

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
+import torch
 from torch import Tensor, nn
 
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Head, build_trunk
 from mvitac.losses import info_nce
-from mvitac.methods.base import Method, MethodConfig
-from mvitac.momentum import Momentum
+from mvitac.methods.base import Contrastive, MethodConfig
+from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
 
 
@@ -36,6 +37,10 @@ class MViTacConfig(MethodConfig):
     """m of eq. 1-3; not given in the paper, .99 in the authors' code."""
     momentum_end: float | None = None
     """If given, m rises to this along a half cosine (as in BYOL and MoCo v3); the paper has no schedule."""
+    losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
+    """Which of the four losses of eq. 14 to minimise; the paper minimises all."""
+    shared_heads: bool = False
+    """One head per encoder for intra and inter losses alike, instead of the paper's two."""
     out: int = 128
     """Width of the embeddings z (paper: 128)."""
     hidden: int = 512
@@ -56,11 +61,24 @@ class MViTacConfig(MethodConfig):
         for name, width in (("out", self.out), ("hidden", self.hidden)):
             if not 1 <= width <= 65536:
                 raise ValueError(f"head width {name} {width}: give 1 to 65536")
+        if not self.losses or len(set(self.losses)) < len(self.losses):
+            raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
+        if not set(self.losses) & set(_possible(spec)):
+            raise ValueError(
+                f"losses {', '.join(self.losses)} need another modality than dataset {spec.name!r} has:"
+                f" give some of {', '.join(_possible(spec))}"
+            )
         return MViTac(self, spec, encoder)
+
+
+def _possible(spec: DataSpec) -> tuple[str, ...]:
+    """The losses of eq. 14 that a dataset's modalities allow."""
+    own = tuple({"vision": "vv", "touch": "tt"}[m] for m in spec.modalities)
+    return (*own, "vt", "tv") if len(own) == 2 else own
 
 
 class Tower(nn.Module):
@@ -74,14 +92,15 @@ class Tower(nn.Module):
             features = int(self.trunk.num_features)  # type: ignore[arg-type]
             return Head(features, config.hidden, config.out, dropout=config.dropout, norm=config.head_norm)
 
-        self.intra, self.inter = head(), head()
+        self.intra = head()
+        self.inter = self.intra if config.shared_heads else head()
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         features = self.trunk(images)
         return self.intra(features), self.inter(features)
 
 
-class MViTac(Method):
+class MViTac(Contrastive):
     """Query towers, their momentum copies, four losses."""
 
     views = 2
@@ -93,23 +112,31 @@ class MViTac(Method):
         self.query = nn.ModuleDict({m: Tower(config, encoder, spec.channels(m)) for m in spec.modalities})
         self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.query.items()})
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
-        tau = self.config.temperature
-        query = {m: self.query[m](views[0]) for m, views in batch.images.items()}
-        key = {m: self.key[m](views[1]) for m, views in batch.images.items()}
-        losses: dict[str, Tensor] = {}
-        if "vision" in query:
-            (z_vv_q, z_vt_q), (z_vv_k, z_tv_k) = query["vision"], key["vision"]  # eq. 4, 9 and eq. 5, 13
-            losses["vv"] = info_nce(z_vv_q, z_vv_k, tau)  # eq. 8
-        if "touch" in query:
-            (z_tt_q, z_tv_q), (z_tt_k, z_vt_k) = query["touch"], key["touch"]  # eq. 6, 12 and eq. 7, 10
-            losses["tt"] = info_nce(z_tt_q, z_tt_k, tau)
-        intra = sum(losses.values())
-        if len(losses) < 2:  # one modality: eq. 14 keeps its intra loss
-            return {"loss": intra, **losses}  # type: ignore[dict-item]
-        losses["vt"] = info_nce(z_vt_q, z_vt_k, tau)  # eq. 11  # type: ignore[possibly-unbound]
-        losses["tv"] = info_nce(z_tv_q, z_tv_k, tau)  # type: ignore[possibly-unbound]
-        return {"loss": intra + self.config.lambda_inter * (losses["vt"] + losses["tv"]), **losses}  # eq. 14
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        z: dict[str, Tensor] = {}
+        if "vision" in batch.images:
+            z["vv_q"], z["vt_q"] = self.query["vision"](batch.images["vision"][0])  # eq. 4, 9
+        if "touch" in batch.images:
+            z["tt_q"], z["tv_q"] = self.query["touch"](batch.images["touch"][0])  # eq. 6, 12
+        return z
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        z: dict[str, Tensor] = {}
+        if "vision" in batch.images:
+            z["vv_k"], z["tv_k"] = self.key["vision"](batch.images["vision"][1])  # eq. 5, 13
+        if "touch" in batch.images:
+            z["tt_k"], z["vt_k"] = self.key["touch"](batch.images["touch"][1])  # eq. 7, 10
+        return z
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+        parts = [part for part in ("vv", "tt", "vt", "tv") if f"{part}_q" in z and f"{part}_k" in z]
+        losses = {
+            part: info_nce(z[f"{part}_q"], z[f"{part}_k"], self.config.temperature) for part in parts
+        }  # eq. 8, 11
+        weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
+        # A loss that is left out of the sum is still told, as a witness of what the others do to it.
+        weighted = [weight.get(part, 1.0) * losses[part] for part in parts if part in self.config.losses]
+        return {"loss": torch.stack(weighted).sum(), **losses}  # eq. 14, or what is left of it with one modality
 
     def encoders(self) -> dict[str, nn.Module]:
         return {m: tower.trunk for m, tower in self.query.items()}  # type: ignore[misc]
@@ -118,8 +145,6 @@ class MViTac(Method):
         return {m: tower.inter for m, tower in self.query.items()}  # type: ignore[misc]
 
     def after_step(self, progress: float) -> None:
-        m, end = self.config.momentum, self.config.momentum_end
-        if end is not None:
-            m = end - (end - m) * (math.cos(math.pi * progress) + 1) / 2
+        m = rising(self.config.momentum, self.config.momentum_end, progress)
         for modality, tower in self.query.items():
             self.key[modality].follow(tower, m)  # type: ignore[operator]  # eq. 1-3

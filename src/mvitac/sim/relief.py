@@ -16,6 +16,7 @@ from scipy.special import ndtri
 
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
 _SIDE = 64  # the random tables repeat after this many wavelengths, more than any picture shows
+_NEXT = (np.arange(_SIDE) + 1) % _SIDE
 _STEPS = 129
 _NORMAL = ndtri((np.arange(_STEPS) + 0.5) / _STEPS).astype(np.float32)
 
@@ -23,15 +24,31 @@ _NORMAL = ndtri((np.arange(_STEPS) + 0.5) / _STEPS).astype(np.float32)
 def noise(u: F, v: F, table: F) -> F:
     """Interpolate a random lattice [64, 64] smoothly at u, v: about zero mean, features as large as 1."""
     fu, fv = np.floor(u), np.floor(v)
-    i, j = fu.astype(np.int32), fv.astype(np.int32)
+    cell, j = fu.astype(np.intp), fv.astype(np.intp)
     a, b = u - fu, v - fv
-    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
-    i0, i1, j0, j1 = (i & 63) * _SIDE, ((i + 1) & 63) * _SIDE, j & 63, (j + 1) & 63
-    flat = table.ravel()
-    left, right = flat[i0 + j0], flat[i1 + j0]
-    top = left + a * (right - left)
-    left, right = flat[i0 + j1], flat[i1 + j1]
-    return top + b * (left + a * (right - left) - top)
+    for s in (a, b):  # s * s * (3 - 2 * s)
+        rise = 3 - 2 * s
+        s *= s
+        s *= rise
+    # Most of the simulator's time goes here: in place, and the step to the next row is taken once per table, not per pixel.
+    flat, step = table.ravel(), np.subtract(table[_NEXT], table).ravel()
+    cell &= 63
+    cell *= _SIDE
+    j &= 63
+    near = cell + j
+    top = step[near]
+    top *= a
+    top += flat[near]
+    j += 1
+    j &= 63
+    cell += j
+    height = step[cell]
+    height *= a
+    height += flat[cell]
+    height -= top
+    height *= b
+    height += top
+    return height
 
 
 def fractal(u: F, v: F, table: F, octaves: int = 3, fall: float = 0.55) -> F:

@@ -1,0 +1,108 @@
+"""``--data hub``: image tables as the Hugging Face hub serves them, parquet with columns struct<bytes, path>.
+
+    data/train-00000-of-00002.parquet   data/test-00000-of-00001.parquet      the part before the first - is the split
+
+Class numbers whose names stand in the file's own metadata (ClassLabel) get those names.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mvitac.datasets.manifest import Manifest, text_of
+from mvitac.datasets.places import Cell, Place
+from mvitac.datasets.rows import RowsConfig
+from mvitac.record import digest
+
+SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class HubConfig(RowsConfig):
+    """Parquet files with images inside (columns struct<bytes, path>), as datasets on the Hugging Face hub have them."""
+
+    name: ClassVar[str] = "hub"
+
+    path: Path = Path("data")
+    """A parquet file, or a folder of them (searched in depth)."""
+
+    def manifest(self) -> Manifest:
+        files = sorted(self.path.rglob("*.parquet")) if self.path.is_dir() else [self.path]
+        if not files or not files[0].is_file():
+            raise ValueError(f"{self.path} is no .parquet and holds none: give a parquet file, or a folder of them")
+        rows: list[dict[str, str]] = []
+        found: dict[str, list[Place | None]] = {}
+        sides = [SPLITS.get(file.stem.split("-")[0]) for file in files]
+        for file, side in zip(files, sides, strict=True):
+            before = len(rows)
+            images = _read(file, rows, found)
+            if not images:
+                raise ValueError(f"{file} has no image column (struct<bytes, path> or binary): is it the right file?")
+            if all(sides):
+                for row in rows[before:]:
+                    row.setdefault("split", str(side))
+        names = tuple(dict.fromkeys(name for row in rows for name in row))
+        for column, places in found.items():
+            if len(places) < len(rows):
+                raise ValueError(f"{self.path}: image column {column!r} is not in every file")
+        return Manifest(self.path, self.path, names, rows, digest([rows, sorted(found)]), found)
+
+
+def _read(file: Path, rows: list[dict[str, str]], found: dict[str, list[Place | None]]) -> list[str]:
+    """Add the rows of ``file`` and where their images lie; the names of its image columns."""
+    try:
+        opened = pq.ParquetFile(file)
+        images = [field.name for field in opened.schema_arrow if _is_image(field.type)]
+        classes = _classes(opened.schema_arrow)
+        texts = [field.name for field in opened.schema_arrow if not pa.types.is_nested(field.type)]
+        texts = [name for name in texts if name not in images]
+        for group in range(opened.num_row_groups):
+            num = opened.metadata.row_group(group).num_rows
+            table = opened.read_row_group(group, columns=texts).to_pylist() if texts else [{}] * num
+            for place, values in enumerate(table):
+                rows.append({name: _text(value, classes.get(name)) for name, value in values.items()})
+                for column in images:
+                    found.setdefault(column, []).append(Cell(str(file), group, column, place))
+            for column in images:
+                _mark_gaps(opened, group, column, found[column], num)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{file} is not a parquet file ({' '.join(str(error).split())[:120]})") from None
+    return images
+
+
+def _is_image(kind: pa.DataType) -> bool:
+    if pa.types.is_struct(kind):
+        return {field.name for field in kind} == {"bytes", "path"}
+    return pa.types.is_binary(kind) or pa.types.is_large_binary(kind)
+
+
+def _mark_gaps(opened: pq.ParquetFile, group: int, column: str, places: list[Place | None], num: int) -> None:
+    """None for rows whose image is null."""
+    index = [i for i, name in enumerate(opened.schema.names) if opened.schema.column(i).path.split(".")[0] == column]
+    nulls = [opened.metadata.row_group(group).column(i).statistics for i in index]
+    if all(s is not None and s.has_null_count and s.null_count == 0 for s in nulls[:1]):
+        return  # no need to read the images for it
+    for place, value in enumerate(opened.read_row_group(group, columns=[column]).column(0)):
+        if not value.is_valid:
+            places[len(places) - num + place] = None
+
+
+def _classes(schema: pa.Schema) -> dict[str, list[str]]:
+    """Column -> class names by number, from the metadata the hub's library leaves."""
+    try:
+        features: dict[str, Any] = json.loads((schema.metadata or {})[b"huggingface"])["info"]["features"]
+    except (KeyError, ValueError):
+        return {}
+    return {k: f["names"] for k, f in features.items() if isinstance(f, dict) and f.get("_type") == "ClassLabel"}
+
+
+def _text(value: Any, names: list[str] | None) -> str:
+    if names and isinstance(value, int):
+        return names[value] if 0 <= value < len(names) else ""  # -1 is the hub's "no label"
+    return text_of(value)

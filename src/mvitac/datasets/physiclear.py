@@ -1,0 +1,97 @@
+"""``--data physiclear``: presses and slides of a GelSight Mini, rated for how they feel, by Yu et al. (RSS 2024).
+
+As ``git clone https://github.com/clear-nus/octopi`` brings it:
+
+    dataset/<object>_<k>.mov            one touch per video; it begins without contact
+    utils/constants.py                  MATERIALS, HARDNESS_RANK, ROUGHNESS_RANK, TEXTURE_RANK: physiclear_<object> -> label;
+    (later src/utils/constants.py)      TRAIN_OBJECTS, VAL_OBJECTS, TEST_OBJECTS: the owners' split
+
+The labels are read from the owners' file, as data: nothing of it is run.
+"""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from mvitac.datasets.manifest import Manifest, in_clone
+from mvitac.datasets.rows import RowsConfig
+from mvitac.datasets.videos import num_frames, spread
+
+LABELS = {
+    "material": "MATERIALS",
+    "hardness": "HARDNESS_RANK",
+    "roughness": "ROUGHNESS_RANK",
+    "bumpiness": "TEXTURE_RANK",
+}
+SPLIT = {"train": "TRAIN_OBJECTS", "val": "VAL_OBJECTS", "test": "TEST_OBJECTS"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysiclearConfig(RowsConfig):
+    """Material, hardness, roughness and bumpiness from one GelSight Mini (github.com/clear-nus/octopi)."""
+
+    name: ClassVar[str] = "physiclear"
+
+    path: Path = Path("octopi")
+    """The clone."""
+    frames: int = 8
+    """Frames of each video."""
+    span: tuple[float, float] = (0.3, 0.6)
+    """The stretch of each video they are spread over, as shares of its length: it begins and ends without contact."""
+    title: str | None = "physiclear"
+    labels: tuple[str, ...] = tuple(LABELS)
+    group: str | None = "object"
+    touch_group: str | None = "video"
+    split: str | None = "by-group"
+    """by-group: unseen objects; owners_split: theirs, with 7 objects in test."""
+    licence: str = "none stated"
+    source_url: str = "https://github.com/clear-nus/octopi"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.frames <= 1000:
+            raise ValueError(f"frames {self.frames}: give 1 to 1000 per video")
+        if not 0 <= self.span[0] <= self.span[1] <= 1:
+            raise ValueError(
+                f"span {self.span[0]} {self.span[1]}: give two shares of the length, 0 <= first <= last <= 1"
+            )
+
+    def manifest(self) -> Manifest:
+        videos = in_clone(self.path, "dataset", "*.mov", self.source_url)
+        root = videos.parent
+        known = _constants(root)
+        labels = {label: known[name] for label, name in LABELS.items()}
+        split = {name: side for side, constant in SPLIT.items() for name in known[constant]}
+        rows: list[dict[str, str]] = []
+        for path in sorted(videos.glob("*.mov")):
+            thing = path.stem.rpartition("_")[0]
+            key = f"physiclear_{thing}"
+            length = num_frames(path)
+            place = path.relative_to(root).as_posix()
+            same = {"touch": place, "background": place, "background_frame": "0", "video": path.stem, "object": thing}
+            same |= {label: str(found.get(key, "")) for label, found in labels.items()}
+            same |= {"owners_split": split.get(key, "unlabelled"), "n_frames": str(length)}
+            for seq, at in enumerate(spread(self.frames, length, *self.span)):
+                rows.append({**same, "frame": str(at), "seq": str(seq)})
+        return Manifest.of(root, rows)
+
+
+def _constants(root: Path) -> dict[str, Any]:
+    """The literal values that the owners' constants.py gives to the names we use."""
+    file = next((f for f in (root / "utils/constants.py", root / "src/utils/constants.py") if f.is_file()), None)
+    if file is None:
+        raise ValueError(f"{root} has no utils/constants.py, where the labels are: clone it whole")
+    found: dict[str, Any] = {}
+    wanted = {*LABELS.values(), *SPLIT.values()}
+    try:
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id in wanted:
+                found[node.targets[0].id] = ast.literal_eval(node.value)
+    except (SyntaxError, ValueError) as error:
+        raise ValueError(f"{file} cannot be read as labels ({' '.join(str(error).split())})") from None
+    for name in sorted(wanted - found.keys()):
+        raise ValueError(f"{file} says nothing of {name}: check out the version the paper was published with")
+    return found

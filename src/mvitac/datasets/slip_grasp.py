@@ -1,0 +1,87 @@
+"""``--data slip_grasp``: grasps that hold or slip, one GelSight and a camera, by Li et al. (ICRA 2018).
+
+As ``git clone https://github.com/wkoa/slip_detection`` brings it:
+
+    data/object004_result.dat           a grasp per line: width in mm, outcome in words, 1 held or 0 slipped, first, last
+                                        and key frame of its recording, name of its folder, infix of its files
+    data/object004/040_40_mm/external_imgw040_40_s010_00003368.jpg         the camera at frame 3368, 640 x 480
+                             gelsight_imgw040_40_s010_00003368.jpg         the GelSight at the same frame
+                             gelsight_lab_imgw...                          a colour conversion of it, not read
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from mvitac.datasets.manifest import Manifest, in_clone
+from mvitac.datasets.rows import RowsConfig
+from mvitac.datasets.splits import folds
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipGraspConfig(RowsConfig):
+    """Grasp success from one GelSight and a camera (github.com/wkoa/slip_detection): predict from seq <= 4."""
+
+    name: ClassVar[str] = "slip_grasp"
+
+    path: Path = Path("slip_detection")
+    """The clone."""
+    title: str | None = "slip_grasp"
+    labels: tuple[str, ...] = ("success",)
+    group: str | None = "object"
+    touch_group: str | None = "grasp"
+    split: str | None = "fold1"
+    """fold1, fold2, ...: each leaves another object out; or by-group."""
+    label_only: tuple[str, ...] = ("seq<=4",)
+    """Late frames of a failed grasp show the object sliding: by default only the five up to the key frame are asked."""
+    controls: tuple[str, ...] = ("width=width_mm", "width in sweep=width_in_sweep")
+    licence: str = "MIT (the repository's LICENSE)"
+    source_url: str = "https://github.com/wkoa/slip_detection"
+
+    def manifest(self) -> Manifest:
+        root = in_clone(self.path, "data", "object*_result.dat", self.source_url)
+        rows: list[dict[str, str]] = []
+        for file in sorted(root.glob("object*_result.dat")):
+            rows += _grasps(root, file)
+        objects = [row["object"] for row in rows]
+        for column, sides in folds(objects, objects, len(set(objects)), val_every=1).items():
+            for row, side in zip(rows, sides, strict=True):
+                row[column] = side
+        return Manifest.of(root, rows)
+
+
+def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
+    """Every pair of every grasp of one object."""
+    name = file.name[len("object") : -len("_result.dat")]
+    rows: list[dict[str, str]] = []
+    widths: dict[str, float] = {}
+    for number, line in enumerate(file.read_text().splitlines(), 1):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) != 8 or words[2] not in ("0", "1"):
+            raise ValueError(
+                f"{file} line {number}: {line!r} is not a grasp (width, outcome, 1 or 0, first, last, key frame, folder,"
+                " infix)"
+            )
+        width, _, success, _, _, key, folder, _ = words
+        pairs: dict[int, dict[str, str]] = defaultdict(dict)
+        for path in sorted((root / f"object{name}" / f"{folder}_mm").glob("*.jpg")):
+            if found := re.fullmatch(r"(external|gelsight)_img.*_(\d+)\.jpg", path.name):
+                modality = {"external": "vision", "gelsight": "touch"}[found[1]]
+                pairs[int(found[2])][modality] = path.relative_to(root).as_posix()
+        if not pairs:
+            raise ValueError(f"{file} line {number}: no images in object{name}/{folder}_mm: clone it whole")
+        grasp = f"{name}_{folder}"
+        widths[grasp] = float(width)
+        for seq, (frame, images) in enumerate(sorted(pairs.items())):
+            known = {"object": name, "grasp": grasp, "width_mm": width, "success": success}
+            counted = {"frame_rel_key": str(frame - int(key)), "seq": str(seq), "frame": str(frame)}
+            rows.append({"vision": "", "touch": "", **images, **known, **counted})
+    for row in rows:  # the outcome was driven by a sweep of the width: a control must know where in it a grasp lies
+        row["width_in_sweep"] = f"{widths[row['grasp']] - sum(widths.values()) / len(widths):.3f}"
+    return rows

@@ -1,0 +1,98 @@
+"""``--data slip_gsmini``: slip between two GelSight Minis on a gripper, no camera, by Parag and Misimi.
+
+As ``git clone https://github.com/amitparag/Incipient-Slip-Detection`` brings it, the two fingers of one shake, 25 fps:
+
+    docs/**/base_data_for_training/<object>/exp_num_<n>/camera_0.avi  camera_2.avi  slip.txt (empty: it slipped)
+    docs/**/base_data_for_validation/...                                            (our reading of the layout)
+
+More than half of the folders are copies of others, some with slip.txt and some without. Folders are told apart by the
+content of their videos; where copies disagree, the recording keeps no label and has label_conflict = 1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from mvitac.datasets.manifest import Manifest, in_clone
+from mvitac.datasets.rows import RowsConfig
+from mvitac.datasets.splits import folds
+from mvitac.datasets.videos import num_frames, spread
+from mvitac.record import digest_file
+
+FINGERS = {"left": "camera_0.avi", "right": "camera_2.avi"}
+ALIASES = {"bag_of_peanuts": "bag_peanuts"}
+"""Two names of one object must not be on two sides of a split."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipGSMiniConfig(RowsConfig):
+    """Slip from two stacked GelSight Minis (github.com/amitparag/Incipient-Slip-Detection)."""
+
+    name: ClassVar[str] = "slip_gsmini"
+
+    path: Path = Path("Incipient-Slip-Detection")
+    """The clone."""
+    frames: int = 12
+    """Frames of each recording, spread evenly from its first to its last."""
+    title: str | None = "slip_gsmini"
+    labels: tuple[str, ...] = ("slip",)
+    group: str | None = "object"
+    touch_group: str | None = "experiment"
+    split: str | None = "fold1"
+    """fold1, fold2 or fold3: whole objects, each tested once; or by-group."""
+    controls: tuple[str, ...] = ("recording length=n_frames",)
+    licence: str = "BSD-2-Clause (the repository's LICENSE)"
+    source_url: str = "https://github.com/amitparag/Incipient-Slip-Detection"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.frames <= 1000:
+            raise ValueError(f"frames {self.frames}: give 1 to 1000 per recording")
+
+    def manifest(self) -> Manifest:
+        root = in_clone(self.path, "docs", "**/exp_num_*/camera_0.avi", self.source_url)
+        copies: dict[str, list[Path]] = {}
+        for first in sorted(root.glob("**/exp_num_*/camera_0.avi")):
+            folder = first.parent
+            if all((folder / name).is_file() for name in FINGERS.values()):
+                both = "".join(digest_file(folder / name) for name in FINGERS.values())
+                copies.setdefault(hashlib.sha256(both.encode()).hexdigest(), []).append(folder)
+        rows: list[dict[str, str]] = []
+        for folders in copies.values():
+            rows += self._recording(root, folders)
+        if not rows:
+            raise ValueError(
+                f"{root} has no folder exp_num_* with both {' and '.join(FINGERS.values())}: clone it whole"
+            )
+        often: dict[str, list[int]] = {}
+        for row in rows:
+            often.setdefault(row["object"], []).append(int(row["slip"] or 0))
+        strata = [f"{sum(often[row['object']]) / len(often[row['object']]):.2f}" for row in rows]
+        for column, sides in folds([row["object"] for row in rows], strata, 3).items():
+            for row, side in zip(rows, sides, strict=True):
+                row[column] = side
+        return Manifest.of(root, rows)
+
+    def _recording(self, root: Path, folders: list[Path]) -> list[dict[str, str]]:
+        """The rows of one recording, which lies in each of ``folders``."""
+        folder = folders[0]
+        slips = {(copy / "slip.txt").exists() for copy in folders}
+        name = min(ALIASES.get(copy.parent.name, copy.parent.name) for copy in folders)
+        where = {"base_data_for_training": "train", "base_data_for_validation": "val"}
+        sides = {where.get(part) for copy in folders for part in copy.parts} - {None}
+        length = min(num_frames(folder / video) for video in FINGERS.values())
+        place = folder.relative_to(root)
+        known = {
+            **{finger: (place / video).as_posix() for finger, video in FINGERS.items()},
+            "experiment": place.as_posix(),
+            "object": name,
+            "slip": str(int(slips.pop())) if len(slips) == 1 else "",
+            "n_frames": str(length),
+            "copies": str(len(folders)),
+            "author_split": "train" if "train" in sides else "val" if sides else "extra",
+        }
+        known["label_conflict"] = str(int(not known["slip"]))
+        return [{**known, "frame": str(at), "seq": str(seq)} for seq, at in enumerate(spread(self.frames, length))]

@@ -1,0 +1,85 @@
+"""``--data webdataset``: tar files whose members share a name up to the first dot (https://github.com/webdataset/webdataset).
+
+    shard-000.tar:  0001.vision.jpg  0001.touch.png  0001.json        two images and what is known of them
+    shard-001.tar:  0002.jpg  0002.cls  ...                           one image (see ``pictures``) and its class
+
+Images stay in their tar and are read from there; .json gives a column per scalar, .cls and .txt one each.
+"""
+
+from __future__ import annotations
+
+import json
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from mvitac.datasets.images import IMAGES
+from mvitac.datasets.manifest import Manifest, text_of
+from mvitac.datasets.places import Place, Stretch
+from mvitac.datasets.rows import RowsConfig
+from mvitac.record import digest
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebDatasetConfig(RowsConfig):
+    """Tar files of images and JSON, as WebDataset writes them."""
+
+    name: ClassVar[str] = "webdataset"
+
+    path: Path = Path("data.tar")
+    """A .tar, or a folder of them."""
+    pictures: Literal["touch", "vision"] = "touch"
+    """What images without a name of their own (0001.jpg, not 0001.touch.jpg) show."""
+
+    def manifest(self) -> Manifest:
+        shards = sorted(self.path.glob("*.tar")) if self.path.is_dir() else [self.path]
+        if not shards or not shards[0].is_file():
+            raise ValueError(f"{self.path} is no .tar and holds none: give a tar file, or a folder of them")
+        samples: dict[str, dict[str, str]] = {}
+        places: dict[str, dict[str, Place]] = {}
+        for shard in shards:
+            self._index(shard, samples, places)
+        columns = list(dict.fromkeys(c for found in places.values() for c in found))
+        if not columns:
+            raise ValueError(f"{self.path} holds no images ({', '.join(IMAGES)}): is it a WebDataset?")
+        names = tuple(dict.fromkeys(name for row in samples.values() for name in row))
+        rows = [{name: row.get(name, "") for name in names} for key, row in samples.items() if key in places]
+        found = {c: [places[key].get(c) for key in samples if key in places] for c in columns}
+        return Manifest(self.path, self.path, names, rows, digest([rows, columns]), found)
+
+    def _index(self, shard: Path, samples: dict[str, dict[str, str]], places: dict[str, dict[str, Place]]) -> None:
+        """Add the members of ``shard``, which lie in it as they are: it must not be compressed."""
+        try:
+            with tarfile.open(shard, "r:") as tar:
+                for member in tar:
+                    folder, _, base = member.name.rpartition("/")
+                    key, dot, kind = base.partition(".")
+                    if not member.isfile() or not key or not dot:
+                        continue
+                    key = f"{folder}/{key}" if folder else key
+                    row = samples.setdefault(key, {"id": key, "shard": shard.name})
+                    name, _, last = kind.lower().rpartition(".")
+                    if f".{last}" in IMAGES:
+                        column = name or self.pictures
+                        if column in places.setdefault(key, {}):
+                            raise ValueError(
+                                f"{shard} has two {column} images of {key}: names must differ between shards"
+                            )
+                        places[key][column] = Stretch(str(shard), member.offset_data, member.size)
+                    elif last in ("json", "cls", "txt"):
+                        file = tar.extractfile(member)
+                        text = file.read().decode() if file else ""
+                        row.update(_known(text) if last == "json" else {last: text.strip()})
+        except (tarfile.TarError, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise ValueError(
+                f"{shard} cannot be read as a tar that is not compressed ({' '.join(str(error).split())[:120]})"
+            ) from None
+
+
+def _known(text: str) -> dict[str, str]:
+    """The scalars of a JSON object as text."""
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        return {}
+    return {name: text_of(v) for name, v in value.items() if isinstance(v, (str, int, float, bool)) or v is None}
