@@ -174,7 +174,7 @@ def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:
 
 
 def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
-    """A missing attribute, a missing image, a chunk that no longer inflates, and a wrong outcome: four reasons."""
+    """A missing attribute, a missing image, a chunk that no longer inflates, a wrong outcome: four items, four reasons."""
     objects: list[bytes | None] = [b"lemon", None, b"lime", b"potato", b"onion", b"soft_zebra", b"lemon", b"metal_can"]
     path = write_shard(tmp_path, 0, objects)
     with h5py.File(path, "a") as file:
@@ -372,7 +372,7 @@ def test_after_has_no_label(leaking: Path, tmp_path: Path) -> None:
 
 
 def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leaking: Path, tmp_path: Path) -> None:
-    """Same pre-training, same probes: what 'during' does not show is at chance, what 'after' shows is not."""
+    """The same road on both packs: what 'during' does not show is at chance, what 'after' shows is not."""
     shown = {}
     for ask in (("during",), ("after",)):
         pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)

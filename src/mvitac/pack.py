@@ -1,7 +1,7 @@
 """The pack: what any dataset becomes on disk, read once, then memory-mapped by every run.
 
     <pack>/pack.json         format, counts, digests, spec, source, licence, versions
-           samples.parquet   one row per sample: id, group, split, label_<task>, sensor, ... crc_<modality>
+           samples.parquet   one row per sample: id, group, split, label_<task>, sensor, ..., crc_<modality>
                              has_vision, has_touch (bool) where some rows lack an image; zeros stand for it
            vision.npy        uint8 [N, size, size, 3]      absent where the dataset has no camera
            touch.npy         uint8 [N, size, size, 3 or 6]
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import io
 import json
 import multiprocessing
@@ -26,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -70,6 +71,14 @@ class Count:
     """What is missing or too many, where that can be said."""
 
 
+@dataclass(frozen=True)
+class Lost:
+    """A sample that an otherwise good item cannot give: a damaged frame of a recording."""
+
+    name: str
+    why: str
+
+
 class Source(ABC):
     """Something to read samples from; picklable, so that packing can use several processes."""
 
@@ -81,8 +90,8 @@ class Source(ABC):
         """Names of the independent units of work, in pack order: a row, a grasp, a recording."""
 
     @abstractmethod
-    def read(self, item: int) -> list[Sample]:
-        """The samples of item number ``item``; ValueError or OSError if it is damaged."""
+    def read(self, item: int) -> Sequence[Sample | Lost]:
+        """The samples of item number ``item``; ValueError or OSError if it is damaged as a whole."""
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:
@@ -161,27 +170,36 @@ class Pack:
             raise unknown("column", name, self.table.column_names)
         return np.array(self.table.column(name).to_numpy(zero_copy_only=False))  # arrow memory is read-only
 
-    @functools.cached_property
-    def _labels(self) -> dict[str, np.ndarray]:
-        labels = {task.name: self.column(f"label_{task.name}").astype(np.int64) for task in self.spec.tasks}
-        for task in self.spec.tasks:
-            for name, value in task.only.items():
-                labels[task.name][self.column(name).astype(str) != value] = -1
-        return labels
+    def labels(self, task: str, *splits: str) -> np.ndarray:
+        """[N] int64 labels of ``task``, -1 where there is none or the task is not about the row (``Task.only``).
 
-    def labels(self, task: str) -> np.ndarray:
-        """[N] int64 labels of ``task``, -1 where there is none or the task is not about the row (``Task.only``)."""
-        return self._labels[task]
+        With ``splits``, -1 also where the row is, for this task, on another side (``Task.split``).
+        """
+        if (task, *splits) not in self._labels:
+            about = next(t for t in self.spec.tasks if t.name == task)
+            known = self.column(f"label_{task}").astype(np.int64)
+            for name, value in about.only.items():
+                known[self.column(name).astype(str) != value] = -1
+            if splits:
+                known[~np.isin(self.column(about.split), splits)] = -1
+            self._labels[task, *splits] = known
+        return self._labels[task, *splits]
+
+    @functools.cached_property
+    def _labels(self) -> dict[tuple[str, ...], np.ndarray]:
+        return {}
 
     def has(self, modality: str) -> np.ndarray:
         """bool [N]: which rows have an image of ``modality``; the others hold zeros, which nothing should look at."""
         name = f"has_{modality}"
         return self.column(name) if name in self.table.column_names else np.ones(self.num, bool)
 
-    def rows(self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = ()) -> np.ndarray:
-        """Ascending int64 row numbers whose split is among ``splits``, whose columns equal ``only`` and which have an
-        image of every modality in ``having``."""
-        mask = np.isin(self.column("split"), splits)
+    def rows(
+        self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = (), by: str = "split"
+    ) -> np.ndarray:
+        """Ascending int64 row numbers whose split (column ``by``) is among ``splits``, whose columns equal ``only`` and
+        which have an image of every modality in ``having``."""
+        mask = np.isin(self.column(by), splits)
         for modality in having:
             mask &= self.has(modality)
         for name, value in (only or {}).items():
@@ -256,9 +274,12 @@ def _check_table(table: pa.Table, spec: DataSpec) -> None:
     for name in (f"has_{modality}" for modality in spec.modalities):
         if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
             raise ValueError(f"column {name} holds {table.column(name).type}: write true or false in every row")
-    for split in table.column("split").unique().to_pylist():
-        if split not in SPLITS:
-            raise unknown("split", str(split), SPLITS)
+    for column in dict.fromkeys(("split", *(task.split for task in spec.tasks))):
+        if column not in table.column_names:
+            raise unknown("column", column, table.column_names)
+        for split in table.column(column).unique().to_pylist():
+            if split not in SPLITS:
+                raise unknown(column, str(split), SPLITS)
     for name, num in labels.items():
         kind = table.column(name).type
         if not pa.types.is_integer(kind):
@@ -402,9 +423,12 @@ def _write_part(job: tuple[Source, DataSpec, range, int, Path]) -> range:
     columns: list[dict[str, Any]] = []
     images: dict[str, list[np.ndarray]] = {m: [] for m in spec.modalities}
     damaged: list[list[Any]] = []
+    lost: list[list[str]] = []
     for number in numbers:
         try:
-            samples = source.read(number)
+            read = source.read(number)
+            samples = [one for one in read if isinstance(one, Sample)]
+            lost += [[one.name, one.why] for one in read if isinstance(one, Lost)]
             fitted = [{m: _check_image(s, m, spec, size) for m in spec.modalities} for s in samples]
             for sample in samples:
                 _check_columns(sample.columns, spec)
@@ -418,7 +442,8 @@ def _write_part(job: tuple[Source, DataSpec, range, int, Path]) -> range:
     arrays = {
         m: np.stack(images[m]) if images[m] else np.zeros((0, size, size, spec.channels(m)), np.uint8) for m in images
     }
-    text = {"columns": np.array(json.dumps(columns)), "damaged": np.array(json.dumps(damaged))}
+    texts = {"columns": columns, "damaged": damaged, "lost": lost}
+    text = {name: np.array(json.dumps(value)) for name, value in texts.items()}
     write_atomic(path, lambda file: np.savez(file, **arrays, **text))  # type: ignore[arg-type]
     return numbers
 
@@ -460,24 +485,21 @@ def _finish(
     spec: DataSpec = from_json(DataSpec, json.loads(json.dumps(request["spec"])), "spec")
     columns: list[dict[str, Any]] = []
     damaged: list[list[Any]] = []
+    lost: list[list[str]] = []
     for path in paths:
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as part:  # numpy leaks what it cannot read
-                for modality in spec.modalities:
-                    part[modality]  # decompressed and checked by its CRC
-                columns += json.loads(str(part["columns"]))
-                damaged += json.loads(str(part["damaged"]))
-        except Exception as error:  # zipfile and numpy raise their own kinds for a damaged file
-            raise ValueError(f"{path} is damaged ({brief(error)}): delete it and run the same command again") from None
-    if len(damaged) > max_damaged * len(items):
-        number, why = damaged[0]
+        columns += json.loads(str(_from_part(path, "columns")))
+        damaged += json.loads(str(_from_part(path, "damaged")))
+        lost += json.loads(str(_from_part(path, "lost")))
+    named = [*([items[number], why] for number, why in damaged), *lost]
+    if len(damaged) > max_damaged * len(items) or len(lost) > max_damaged * (len(columns) + len(lost)):
         for path in paths:  # the damaged parts are read again next time, when they may have been repaired
-            with np.load(path, allow_pickle=False) as part:
-                hurt = str(part["damaged"]) != "[]"
-            if hurt:
+            if any(str(_from_part(path, name)) != "[]" for name in ("damaged", "lost")):
                 path.unlink()
+        what = (
+            f"{len(damaged)} of {len(items)} items" if damaged else f"{len(lost)} of {len(columns) + len(lost)} samples"
+        )
         raise ValueError(
-            f"{len(damaged)} of {len(items)} items cannot be read, first {items[number]}: {why}"
+            f"{what} cannot be read, first {named[0][0]}: {named[0][1]}"
             " (repair it, or allow a fraction with --max-damaged)"
         )
     if not columns:
@@ -487,17 +509,19 @@ def _finish(
     joined.mkdir()
     size = int(request["size"])
     sums: dict[str, list[int]] = {m: [] for m in spec.modalities}  # so that damage can be told by row
+    digests: dict[str, str] = {}
     for modality in spec.modalities:
         shape = (len(columns), size, size, spec.channels(modality))
-        target = joined / f"{modality}.npy"
+        name = f"{modality}.npy"
         # Written, not mapped: on a full disk a write is an error one can report, a store into a map kills the process.
-        with naming(target), target.open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
+        with naming(joined / name), (joined / name).open("wb") as file:
+            written = _Hashing(file)
+            np.lib.format.write_array_header_1_0(written, {"descr": "|u1", "fortran_order": False, "shape": shape})
             for path in paths:
-                with np.load(path, allow_pickle=False) as part:
-                    images = np.ascontiguousarray(part[modality])
-                file.write(images.data)
+                images = np.ascontiguousarray(_from_part(path, modality))
+                written.write(images.data)
                 sums[modality] += [zlib.crc32(image) for image in images]
+        digests[name] = written.hash.hexdigest()
     buffer = io.BytesIO()
     table = _table(columns)
     for modality in spec.modalities:
@@ -507,13 +531,13 @@ def _finish(
     _check_table(table, spec)
     pq.write_table(table, buffer)
     write_atomic(joined / "samples.parquet", lambda file: file.write(buffer.getvalue()))
-    names = ["samples.parquet", *(f"{m}.npy" for m in spec.modalities)]
+    digests = {"samples.parquet": hashlib.sha256(buffer.getvalue()).hexdigest(), **digests}
     meta = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "num": len(columns),
-        "digests": {name: digest_file(joined / name) for name in names},
-        "damaged": [[items[number], why] for number, why in damaged],
+        "digests": digests,
+        "damaged": named,
         **request,
     }
     write_json(joined / "pack.json", {**meta, "digest": digest(json.loads(json.dumps(meta)))})
@@ -523,6 +547,26 @@ def _finish(
         out.parent.mkdir(parents=True)
     os.rename(joined, out)
     return Pack(out, verify=False)
+
+
+def _from_part(path: Path, name: str) -> np.ndarray:
+    """One array of a part, checked by its CRC."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as part:  # numpy leaks what it cannot read
+            return part[name]
+    except Exception as error:  # zipfile and numpy raise their own kinds for a damaged file
+        raise ValueError(f"{path} is damaged ({brief(error)}): delete it and run the same command again") from None
+
+
+class _Hashing:
+    """A file that takes the sha256 of what is written, so that it need not be read again."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.hash = file, hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        self.hash.update(data)
+        return self._file.write(data)
 
 
 def _table(columns: list[dict[str, Any]]) -> pa.Table:

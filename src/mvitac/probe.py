@@ -57,7 +57,9 @@ def parts(pack: Pack, task: Task, modality: str = "none") -> Parts:
     labels = pack.column(f"label_{task.name}")
     train, val, test = (
         rows[labels[rows] >= 0]
-        for rows in (pack.rows(split, only=task.only, having=having) for split in ("train", "val", "test"))
+        for rows in (
+            pack.rows(split, only=task.only, having=having, by=task.split) for split in ("train", "val", "test")
+        )
     )
     if not len(train) or not len(test):
         where = "train" if not len(train) else "test"
@@ -306,6 +308,7 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         "data": pack.spec.name,
         "pack": pack.digest,
         "group_by": pack.spec.group_by,
+        "notes": list(pack.spec.notes),
         "classes": {task.name: list(task.classes) for task in tasks},
         "records": records,
         "retrieval": retrieval,

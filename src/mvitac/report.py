@@ -129,9 +129,11 @@ def _page(study: Study) -> str:
         ("again", "Do it again", _again(study)),
     ]
     spec = study.pack.spec
+    notes = "".join(f" Note: {note}." for note in spec.notes)
     foot = page.paragraph(
-        f"Data: {spec.name}, from {spec.source}; licence {spec.licence}. All intervals are 95 %, by bootstrap over test"
-        f" {spec.group_by}s and seeds. Written by mvitac {__version__}; this page makes no network request."
+        f"Data: {spec.name}, from {spec.source}; licence {spec.licence}.{notes}"
+        f" All intervals are 95 %, by bootstrap over test {spec.group_by}s and seeds."
+        f" Written by mvitac {__version__}; this page makes no network request."
     )
     return page.html_page(title, _head(study, title), [s for s in sections if s[2]], foot)
 

@@ -16,6 +16,8 @@ class Task:
     """Class names by label; the label column is ``label_<name>``, -1 = unlabelled."""
     only: dict[str, str] = field(default_factory=dict)
     """Rows the task is about, as column -> value, e.g. {"phase": "during"} for grasp success."""
+    split: str = "split"
+    """Column with the side a row is on for this task, where the owners divide it otherwise than for pre-training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +37,8 @@ class DataSpec:
     licence: str
     source: str
     """Who owns it and where it is found."""
+    notes: tuple[str, ...] = ()
+    """What must be said beside every result, e.g. what the two sides of a published split share."""
 
     def __post_init__(self) -> None:
         if not (self.vision_channels or self.touch_channels):

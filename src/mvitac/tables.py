@@ -47,6 +47,8 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
             table.add_row(source, *(cell(task, source, m) for m in modalities))
         console.print(table)
     console.print(f"[dim]95 % intervals: bootstrap over test {result['group_by']}s and seeds.[/dim]")
+    for note in result.get("notes", ()):
+        console.print(f"note: {note}", markup=False, highlight=False)
 
 
 def print_retrieval(result: dict[str, Any], console: Console) -> None:
@@ -91,4 +93,5 @@ def markdown(result: dict[str, Any]) -> str:
             numbers = " | ".join(f"{100 * values[k]:.1f}" for k in ("R@1", "R@5", "R@10", "chance R@5"))
             lines.append(f"| {source} | {direction} | {numbers} |")
         lines.append("")
+    lines += [f"Note: {note}." for note in result.get("notes", ())]
     return "\n".join(lines)

@@ -167,7 +167,7 @@ def training_rows(run: Run, pack: Pack) -> np.ndarray:
     tasks = run.method.labels_needed(pack.spec)
     if not tasks:
         return rows
-    labels = {task: pack.labels(task)[rows] >= 0 for task in tasks}
+    labels = {task: pack.labels(task, "train")[rows] >= 0 for task in tasks}
     for task, there in labels.items():
         if not there.any():
             raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
@@ -265,7 +265,7 @@ def make_views(
         for source in sources:
             view = random_view(feed(modality, source), config, run.augment.size, generator, dtype)
             images[modality].append(view)
-    labels = {t.name: torch.from_numpy(pack.labels(t.name)[rows]).to(device) for t in pack.spec.tasks}
+    labels = {t.name: torch.from_numpy(pack.labels(t.name, "train")[rows]).to(device) for t in pack.spec.tasks}
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
 
 
@@ -322,16 +322,16 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     if held_out:
         bank = {m: pack_features(model, pack, m, train_rows, precision=run.precision) for m in model.encoders}
         for task in pack.spec.tasks:
-            labels = torch.from_numpy(pack.labels(task.name))
-            keep_bank, keep = labels[train_rows] >= 0, labels[panel_rows] >= 0
+            known, asked = (torch.from_numpy(pack.labels(task.name, split)) for split in ("train", "val"))
+            keep_bank, keep = known[train_rows] >= 0, asked[panel_rows] >= 0
             if not (keep_bank.any() and keep.any()):
                 continue
             for modality in z:
                 values[f"{modality}/knn {task.name}"] = diagnostics.knn_accuracy(
                     bank[modality][keep_bank],
-                    labels[train_rows][keep_bank],
+                    known[train_rows][keep_bank],
                     z[modality][keep],
-                    labels[panel_rows][keep],
+                    asked[panel_rows][keep],
                 )
     if len(model.projectors) == 2:
         device = next(model.parameters()).device

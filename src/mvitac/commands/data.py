@@ -30,6 +30,8 @@ def pack(argv: list[str]) -> None:
         raise ValueError(
             f"say which dataset: mvitac data pack --data {'|'.join(datasets.DatasetConfig.choices)} --out DIR"
         )
+    # Spelt as in pretrain (--data.root) or short (--root).
+    rest = [f"--{word.removeprefix('--data.')}" if word.startswith("--data.") else word for word in rest]
     _build(default(datasets.DatasetConfig, chosen["--data"]), rest, f"data pack --data {chosen['--data']}")
 
 
@@ -52,6 +54,7 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
         quiet: bool = False
         """No progress bar."""
 
+    Options.__doc__ = type(config).__doc__
     options = parse(Options, argv, prog)
     check_place(options.out)
     source = options.data.source()
@@ -63,7 +66,11 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
         max_damaged=options.max_damaged,
         quiet=options.quiet,
     )
-    Console().print(f"{pack.path}: {pack.num} samples at {pack.size} px", soft_wrap=True, highlight=False)
+    console = Console()
+    console.print(f"{pack.path}: {pack.num} samples at {pack.size} px", soft_wrap=True, highlight=False)
+    if lost := pack.meta["damaged"]:
+        text = f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {": ".join(lost[0])}'
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def sheet(argv: list[str]) -> None:
@@ -122,7 +129,7 @@ def info(argv: list[str]) -> None:
             continue
         cells = []
         for task in pack.spec.tasks:
-            labels = pack.column(f"label_{task.name}")[pack.rows(split, only=task.only)]
+            labels = pack.column(f"label_{task.name}")[pack.rows(split, only=task.only, by=task.split)]
             labels = labels[labels >= 0]
             common = np.bincount(labels).argmax() if len(labels) else None
             cells.append("" if common is None else f"{task.classes[common]} {100 * (labels == common).mean():.1f} %")
@@ -134,6 +141,8 @@ def info(argv: list[str]) -> None:
         lacking = ", ".join(f"{int((~pack.has(m)).sum())} rows without {m}" for m in gaps)
         console.print(f"{lacking}; {whole} whole pairs", soft_wrap=True, highlight=False)
     console.print(f"source {pack.spec.source}; licence {pack.spec.licence}", soft_wrap=True, highlight=False)
+    for note in pack.spec.notes:
+        console.print(f"note: {note}", soft_wrap=True, highlight=False, markup=False)
 
 
 def show(argv: list[str]) -> None:

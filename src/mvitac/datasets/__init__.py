@@ -10,6 +10,7 @@ from mvitac.datasets import (
     simulated,
     slip_grasp,
     slip_gsmini,
+    touch_and_go,
     vt60,
     webdataset,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "simulated",
     "slip_grasp",
     "slip_gsmini",
+    "touch_and_go",
     "vt60",
     "webdataset",
 ]

@@ -13,7 +13,7 @@ from mvitac.doctor import copies, pictures, tables
 from mvitac.doctor.finding import Finding
 from mvitac.doctor.looks import look_at
 from mvitac.doctor.sheet import Strips, strips_of
-from mvitac.pack import Count, Pack, Sample, Source, build
+from mvitac.pack import Count, Lost, Pack, Sample, Source, build
 from mvitac.spec import DataSpec
 
 
@@ -42,9 +42,12 @@ class Glance(Source):
     def expected(self) -> list[Count]:
         return self.source.expected()
 
-    def read(self, item: int) -> list[Sample]:
-        samples = []
+    def read(self, item: int) -> list[Sample | Lost]:
+        samples: list[Sample | Lost] = []
         for sample in self.source.read(self._chosen[item]):
+            if isinstance(sample, Lost):
+                samples.append(sample)
+                continue
             given = {"vision": sample.vision, "touch": sample.touch}
             sizes = {f"{m}_size": f"{i.shape[1]} x {i.shape[0]}" for m, i in given.items() if i is not None}
             samples.append(replace(sample, columns={**sample.columns, **sizes}))
