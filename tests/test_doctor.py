@@ -305,6 +305,25 @@ def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> Non
     assert exit_code(findings.values()) == 0
 
 
+def test_missing_images_are_no_faults_of_the_others(tmp_path: Path) -> None:
+    """A third of the rows without vision: no constant frames, no copies; only a split without any is worth a look."""
+
+    class Gaps(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            gone = item // NUM_FRAMES in TEST if self.fault == "test" else item % 3 == 1
+            columns = {**sample.columns, "has_vision": not gone}
+            return [Sample(vision=None if gone else sample.vision, touch=sample.touch, columns=columns)]
+
+    for fault in ("", "test"):
+        findings, _ = examine_source(Gaps(fault), size=SIDE, quiet=True)
+        told = {f.item: f for f in findings}
+        wrong = {f.item for f in findings if f.verdict in ("look", "broken")}
+        assert wrong == ({"missing images"} if fault else set())
+        assert f"{64 if fault else 107} of 320" in told["missing images"].evidence
+    assert "no row of test has vision" in told["missing images"].evidence
+
+
 def test_other_keys_and_other_splits_are_looked_at_too(tmp_path: Path) -> None:
     """Touch and Go's own split: touches are apart, recordings are not. And a fold column that cuts objects in two."""
 

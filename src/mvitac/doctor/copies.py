@@ -27,10 +27,10 @@ def exact_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
     notes, rows, inside = [], [], []
     for name, one in looks.items():
         _, first, numbers, counts = np.unique(one.exact, return_index=True, return_inverse=True, return_counts=True)
-        if (repeated := int((counts[numbers] > 1).sum())) and one.std.max() > 0:
+        if repeated := int(((counts[numbers] > 1) & one.seen).sum()):
             inside.append(f"{name}: {share(repeated, pack.num)} rows share their pixels with another")
         different = sides != sides[first[numbers]]
-        across = np.flatnonzero(np.isin(numbers, numbers[different]) & (one.std > 0))
+        across = np.flatnonzero(np.isin(numbers, numbers[different]) & one.seen)
         if len(across):
             across = across[np.argsort(numbers[across], kind="stable")]
             notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy on another side")
@@ -94,13 +94,13 @@ def near_copies(pack: Pack, looks: dict[str, Looks]) -> Finding:
 def residuals(one: Looks, sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors [N, F * F] of what sets each thumbnail apart, and which of them [N] show more than noise."""
     light = one.fine.astype(np.float32)
-    for sensor in np.unique(sensors):
-        mine = sensors == sensor
+    for sensor in np.unique(sensors[one.has]):
+        mine = (sensors == sensor) & one.has
         light[mine] -= np.median(light[mine][_some(np.arange(int(mine.sum())), 2000)], axis=0)
     light -= uniform_filter1d(uniform_filter1d(light, BLUR, axis=1), BLUR, axis=2)
     light = light.reshape(len(light), -1)
     light -= light.mean(axis=1, keepdims=True)
-    clear = light.std(axis=1) > FAINT
+    clear = one.has & (light.std(axis=1) > FAINT)
     return light / np.maximum(np.linalg.norm(light, axis=1, keepdims=True), 1e-6), clear
 
 

@@ -60,6 +60,7 @@ def examine(pack: Pack, counts: list[Count] | None = None) -> list[Finding]:
     return [
         *tables.published(counts or []),
         tables.unreadable(pack),
+        tables.missing_images(pack),
         pictures.constant_frames(pack, looks),
         pictures.grayscale_mix(pack, looks),
         pictures.red_and_blue(pack, looks),

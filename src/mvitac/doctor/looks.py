@@ -10,6 +10,8 @@ import numpy as np
 from mvitac.pack import Pack
 
 SIDE, FINE = 16, 32
+CONSTANT = 1.0
+"""Standard deviation in grey levels below which an image shows nothing."""
 NUM_AT_ONCE = 128
 
 
@@ -26,17 +28,20 @@ class Looks:
     """uint8 [N, F, F], area means of the channels' mean."""
     std: np.ndarray
     """float32 [N], the largest of the three channels' standard deviations."""
-    low: np.ndarray
-    """uint8 [N], darkest value."""
-    high: np.ndarray
-    """uint8 [N], brightest value."""
     exact: np.ndarray
     """bytes [N], a digest of the pixels."""
+    has: np.ndarray
+    """bool [N], whether the row has this image at all; nothing else here means anything where it has not."""
 
     @property
     def light(self) -> np.ndarray:
         """float32 [N, S, S], mean of the channels."""
         return self.thumbs.mean(axis=3, dtype=np.float32)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """bool [N], whether there is an image that shows something."""
+        return self.has & (self.std >= CONSTANT)
 
     @property
     def gray(self) -> np.ndarray:
@@ -52,26 +57,25 @@ def look_at(pack: Pack) -> dict[str, Looks]:
         num_sensors = pack.spec.channels(modality) // 3
         for sensor in range(num_sensors):
             name = modality if num_sensors == 1 else f"{modality} {sensor + 1}"
-            found[name] = _look(name, modality, pack.images[modality], slice(3 * sensor, 3 * sensor + 3))
+            channels = slice(3 * sensor, 3 * sensor + 3)
+            found[name] = _look(name, modality, pack.images[modality], channels, pack.has(modality))
     return found
 
 
-def _look(name: str, modality: str, images: np.ndarray, channels: slice) -> Looks:
+def _look(name: str, modality: str, images: np.ndarray, channels: slice, has: np.ndarray) -> Looks:
     num, size = images.shape[:2]
     side = min(SIDE, size)
-    fine_side = min(FINE, size)
+    fine_side, every = min(FINE, size), max(1, size // 64)  # some 64 x 64 pixels are plenty for a standard deviation
     thumbs, fine = np.empty((num, side, side, 3), np.uint8), np.empty((num, fine_side, fine_side), np.uint8)
-    std, low, high = np.empty(num, np.float32), np.empty(num, np.uint8), np.empty(num, np.uint8)
-    exact = np.empty(num, "S16")
+    std, exact = np.empty(num, np.float32), np.empty(num, "S16")
     for start in range(0, num, NUM_AT_ONCE):
         at = slice(start, min(start + NUM_AT_ONCE, num))
         chunk = np.ascontiguousarray(images[at, :, :, channels])
         thumbs[at] = area_means(chunk, side)
         fine[at] = area_means(chunk, fine_side).mean(axis=3)
-        std[at] = chunk.std(axis=(1, 2), dtype=np.float32).max(axis=1)
-        low[at], high[at] = chunk.min(axis=(1, 2, 3)), chunk.max(axis=(1, 2, 3))
+        std[at] = chunk[:, ::every, ::every].std(axis=(1, 2), dtype=np.float32).max(axis=1)
         exact[at] = [hashlib.blake2b(image, digest_size=8).hexdigest().encode() for image in chunk]
-    return Looks(name, modality, thumbs, fine, std, low, high, exact)
+    return Looks(name, modality, thumbs, fine, std, exact, has)
 
 
 def area_means(images: np.ndarray, side: int) -> np.ndarray:

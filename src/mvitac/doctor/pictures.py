@@ -8,8 +8,6 @@ from mvitac.doctor.finding import Finding, share, some
 from mvitac.doctor.looks import Looks
 from mvitac.pack import Pack
 
-CONSTANT = 1.0
-"""Standard deviation in grey levels below which an image shows nothing."""
 ORDER_COLUMNS = ("seq", "frame", "step", "time")
 """Columns that say in which order rows of one group were taken."""
 MAX_LAG = 5
@@ -19,7 +17,7 @@ BLOCK = 48
 
 def constant_frames(pack: Pack, looks: dict[str, Looks]) -> Finding:
     """Images of one grey: a closed shutter, a failed decode, floats 0 to 1 stored as bytes."""
-    found = {name: np.flatnonzero(one.std < CONSTANT) for name, one in looks.items()}
+    found = {name: np.flatnonzero(one.has & ~one.seen) for name, one in looks.items()}
     rows = np.unique(np.concatenate(list(found.values())))
     if not len(rows):
         return Finding(item="constant frames", verdict="ok", evidence=f"none among {pack.num} rows")
@@ -39,8 +37,7 @@ def grayscale_mix(pack: Pack, looks: dict[str, Looks]) -> Finding:
     rows: list[int] = []
     notes = []
     for name, one in looks.items():
-        # Of a nearly constant image the colour says nothing.
-        gray, seen = one.gray & (one.std >= CONSTANT), one.std >= CONSTANT
+        gray, seen = one.gray & one.seen, one.seen  # of a nearly constant image the colour says nothing
         if gray.sum() and (gray.sum() < seen.sum()):
             minority = gray if gray.sum() * 2 <= seen.sum() else seen & ~gray
             rows += np.flatnonzero(minority).tolist()
@@ -62,7 +59,7 @@ def red_and_blue(pack: Pack, looks: dict[str, Looks]) -> Finding:
     """
     notes, rows = [], []
     for name, one in looks.items():
-        usable = np.flatnonzero((one.std >= CONSTANT) & ~one.gray)
+        usable = np.flatnonzero(one.seen & ~one.gray)
         usable = (
             usable[np.linspace(0, len(usable) - 1, min(len(usable), 20_000)).astype(int)] if len(usable) else usable
         )
@@ -121,7 +118,7 @@ def swapped_modalities(pack: Pack, looks: dict[str, Looks]) -> Finding:
     if len(pack.spec.modalities) < 2:
         return Finding(item=item, verdict="not checkable", evidence="one modality only")
     pair = [next(one for one in looks.values() if one.modality == m) for m in ("vision", "touch")]
-    seen = np.flatnonzero((pair[0].std >= CONSTANT) & (pair[1].std >= CONSTANT))
+    seen = np.flatnonzero(pair[0].seen & pair[1].seen)
     if len(seen) < 16:
         return Finding(item=item, verdict="not checkable", evidence="fewer than 16 usable pairs")
     x = [np.concatenate([_coarse(one.thumbs[seen]), one.std[seen, None]], axis=1) for one in pair]
@@ -208,10 +205,10 @@ def time_offset(pack: Pack, looks: dict[str, Looks]) -> Finding:
 def motion_correlations(pack: Pack, looks: dict[str, Looks], when: np.ndarray) -> np.ndarray:
     """[stretches, 2 * MAX_LAG + 1]: correlation of motion energies, touch ``lag`` rows after vision, lag from -MAX_LAG."""
     light = {m: next(one for one in looks.values() if one.modality == m).light for m in ("vision", "touch")}
-    groups, curves = pack.touch_groups, []
+    groups, curves, both = pack.touch_groups, [], pack.has("vision") & pack.has("touch")
     order = np.lexsort((when, groups))
     for rows in np.split(order, np.flatnonzero(np.diff(groups[order])) + 1):
-        rows = rows[np.isfinite(when[rows])]
+        rows = rows[np.isfinite(when[rows]) & both[rows]]
         num_blocks = max(1, len(rows) // BLOCK)
         for block in np.array_split(rows, num_blocks):
             if len(block) < 2 * MAX_LAG + 3:

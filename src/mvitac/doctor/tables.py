@@ -29,6 +29,26 @@ def unreadable(pack: Pack) -> Finding:
     )
 
 
+def missing_images(pack: Pack) -> Finding:
+    """Rows that lack an image of a modality the dataset has."""
+    notes = []
+    verdict: Verdict = "ok"
+    for modality in pack.spec.modalities:
+        lacking = ~pack.has(modality)
+        if lacking.any():
+            notes.append(f"{share(int(lacking.sum()), pack.num)} rows have no {modality}")
+        for split in ("train", "test"):
+            if len(rows := pack.rows(split)) and lacking[rows].all():
+                verdict = "look"
+                notes.append(f"no row of {split} has {modality}")
+    return Finding(
+        item="missing images",
+        verdict=verdict,
+        evidence="; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
+        advice="deal the splits so that both have both, or leave the modality out" if verdict != "ok" else "",
+    )
+
+
 def missing_labels(pack: Pack) -> Finding:
     """Rows of train, val and test without the label that their task is about."""
     item, notes, rows = "missing labels", [], []
@@ -158,7 +178,7 @@ def mixture(pack: Pack) -> Finding:
     notes = []
     for column in columns:
         values = pack.column(column).astype(str)
-        names, counts = np.unique(values, return_counts=True)
+        names, counts = np.unique(values[values != "None"], return_counts=True)  # rows without this image
         if len(names) == 1:
             notes.append(f"{column}: {names[0]}")
             continue
@@ -173,7 +193,8 @@ def mixture(pack: Pack) -> Finding:
         for task in pack.spec.tasks:
             rows = pack.rows("train", "val", "test", only=task.only)
             labels = pack.column(f"label_{task.name}").astype(int)[rows]
-            mine, labels = values[rows][labels >= 0], labels[labels >= 0]
+            counted = (labels >= 0) & (values[rows] != "None")
+            mine, labels = values[rows][counted], labels[counted]
             if not len(labels):
                 continue
             majority = np.bincount(labels).max() / len(labels)
