@@ -70,10 +70,11 @@ def make_lerobot(root: Path, *, gel_rate: int = 10, version: str = "v3.0") -> Pa
     factor = gel_rate // 10
     film(root / f"videos/{GEL}/chunk-000/file-000.mp4", 20 * factor, which=1, rate=gel_rate)
     film(root / f"videos/{GEL}/chunk-000/file-001.mp4", 10 * factor, which=2, rate=gel_rate)
-    key, at = f"videos/{GEL}", ((0, 0.0), (0, 1.2), (1, 0.0))
+    key, at = f"videos/{GEL}", ((0, 0.0, 1.2), (0, 1.2, 2.0), (1, 0.0, 1.0))
+    names = ("file_index", "from_timestamp", "to_timestamp")
     episodes = [
-        {"episode_index": e, f"{key}/chunk_index": 0, f"{key}/file_index": file, f"{key}/from_timestamp": start}
-        for e, (file, start) in enumerate(at)
+        {"episode_index": e, f"{key}/chunk_index": 0, **{f"{key}/{n}": v for n, v in zip(names, values, strict=True)}}
+        for e, values in enumerate(at)
     ]
     pq.write_table(pa.Table.from_pylist(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
     rows: list[dict[str, Any]] = []
@@ -118,6 +119,16 @@ def test_lerobot_beyond_the_tolerance(tmp_path: Path) -> None:
     pack = packed(LeRobotConfig(path=root, size=16, labels=("kind",), allow_missing=True), tmp_path / "pack")
     late = (pack.column("episode") == "2") & (pack.column("frame").astype(int) > 5)
     assert (pack.has("touch") == ~late).all() and late.sum() == 4
+
+
+def test_lerobot_takes_no_frame_of_another_episode(tmp_path: Path) -> None:
+    root = make_lerobot(tmp_path / "set")
+    file = root / "meta/episodes/chunk-000/file-000.parquet"
+    episodes = pq.read_table(file).to_pylist()
+    episodes[0][f"videos/{GEL}/to_timestamp"] = 1.1  # the frame at 1.1 s, which row 11 would want, is the next one's
+    pq.write_table(pa.Table.from_pylist(episodes), file)
+    with pytest.raises(ValueError, match=r"no frame within 0\.04 s of 1\.100 s \(episode 0, the nearest is 0\.100 s"):
+        LeRobotConfig(path=root, size=16, labels=("kind",)).source()
 
 
 def test_nearest_of_two_rates() -> None:

@@ -76,26 +76,33 @@ class LeRobotConfig(RowsConfig):
     def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[Place | None]:
         """The frame of camera ``key`` at each row's time, None where none is near enough."""
         episodes = {str(e["episode_index"]): e for e in _tables(self.path, "meta/episodes", f"videos/{key}/")}
-        by_file: dict[Path, list[tuple[int, float]]] = {}
+        wanted: dict[str, list[int]] = {}
         for i, row in enumerate(rows):
-            episode = episodes.get(row["episode"])
-            if episode is None or f"videos/{key}/from_timestamp" not in episode:
-                raise ValueError(f"{self.path}: meta/episodes says nothing of {key} in episode {row['episode']}")
-            place = {name: episode[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            file = self.path / info["video_path"].format(video_key=key, **place)
-            by_file.setdefault(file, []).append((i, episode[f"videos/{key}/from_timestamp"] + float(row["timestamp"])))
+            wanted.setdefault(row["episode"], []).append(i)
+        times: dict[Path, np.ndarray] = {}
         places: list[Place | None] = [None] * len(rows)
-        for file, wanted in by_file.items():
-            if not file.is_file():
-                raise ValueError(f"{file} is missing: fetch the videos too, or leave {key} out")
-            at, away = nearest(timestamps(file), np.array([when for _, when in wanted]))
-            for (i, when), frame, miss in zip(wanted, at.tolist(), away.tolist(), strict=True):
+        for name, numbers in wanted.items():
+            episode = episodes.get(name)
+            if episode is None or episode.get(f"videos/{key}/from_timestamp") is None:
+                raise ValueError(f"{self.path}: meta/episodes says nothing of {key} in episode {name}")
+            place = {part: episode[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")}
+            file = self.path / info["video_path"].format(video_key=key, **place)
+            if file not in times:
+                if not file.is_file():
+                    raise ValueError(f"{file} is missing: fetch the videos too, or leave {key} out")
+                times[file] = timestamps(file)
+            start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
+            # Several episodes lie in one file: the nearest frame must not be another one's.
+            low, high = np.searchsorted(times[file], [start - 1e-3, (np.inf if end is None else end) - 1e-3])
+            when = start + np.array([float(rows[i]["timestamp"]) for i in numbers])
+            at, away = nearest(times[file][low:high], when)
+            for i, frame, miss, moment in zip(numbers, (low + at).tolist(), away.tolist(), when.tolist(), strict=True):
                 if miss <= self.tolerance:
                     places[i] = Frame(str(file), frame)
                 elif not self.allow_missing:
                     raise ValueError(
-                        f"{file}: no frame within {self.tolerance:g} s of {when:.3f} s (episode {rows[i]['episode']}, the"
-                        f" nearest is {miss:.3f} s away): give a larger tolerance, or allow_missing"
+                        f"{file}: no frame within {self.tolerance:g} s of {moment:.3f} s (episode {name}, the nearest is"
+                        f" {miss:.3f} s away): give a larger tolerance, or allow_missing"
                     )
         return places
 

@@ -29,7 +29,7 @@ VERSION = 2
 """Raised when the same table would give another pack."""
 CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet")
 """What the probe itself calls its controls."""
-MAX_TOGETHER = 2048
+MAX_TOGETHER = 1024
 """Rows of one video read in one pass; more would not fit into memory at 256 px for every worker."""
 
 

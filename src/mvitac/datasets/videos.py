@@ -40,6 +40,8 @@ def timestamps(path: Path) -> np.ndarray:
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each of ``wanted`` [M] the place of the nearest of ascending ``times`` [N], and how far away it is (seconds)."""
+    if not len(times):
+        return np.zeros(len(wanted), int), np.full(len(wanted), np.inf)
     after = np.clip(np.searchsorted(times, wanted), 1, max(1, len(times) - 1))
     before = after - 1
     after = np.minimum(after, len(times) - 1)
