@@ -3,7 +3,7 @@
 On every task, touch and vision together, unseen groups: a supervised reference must stand at least 20 points above the
 untrained trunk's features and below 97 %. No self-supervised method is looked at here.
 
-    python -m benchmarks.difficulty materials|grasps [--seeds N] [--steps N] [--json FILE]
+    python -m benchmarks.difficulty materials|grasps [--world SEED] [--seeds N] [--steps N] [--json FILE]
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mvitac.datasets import DatasetConfig
+from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.probe import Session, probe_runs
 from mvitac.recipes import recipe
@@ -30,20 +30,22 @@ MARGIN, CEILING = 0.20, 0.97
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", choices=("materials", "grasps"))
+    parser.add_argument("--world", type=int, default=0, help="seed of the simulated world")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--out", type=Path, default=Path("runs/difficulty"))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     run = replace(
-        recipe("demo", default(DatasetConfig, options.data)),
+        recipe("demo", replace(default(SimulatedConfig, options.data), seed=options.world)),
         method=SupervisedConfig(),
         optim=Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=0.05, schedule="cosine", warmup=0.05),
+        batch_size=128,
         steps=options.steps,
         eval_every=0,
     )
     paths = [
-        train(replace(run, seed=seed), options.out / f"{options.data}-{seed}", resume=True)
+        train(replace(run, seed=seed), options.out / f"{options.data}-{options.world}-{seed}", resume=True)
         for seed in range(options.seeds)
     ]
     result = probe_runs(paths, Session())
@@ -61,7 +63,14 @@ def main() -> None:
         console.print(f"{task}: {scores}: the rule {'holds' if verdicts[task]['holds'] else 'DOES NOT HOLD'}")
     if options.json:
         write_json(
-            options.json, {"rule": verdicts, "summary": result["summary"], "steps": options.steps, **provenance()}
+            options.json,
+            {
+                "rule": verdicts,
+                "summary": result["summary"],
+                "steps": options.steps,
+                "world": options.world,
+                **provenance(),
+            },
         )
 
 

@@ -27,3 +27,21 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pack(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     """120 striped pairs at 32 px: 3 classes x 20 instances x 2; split by instance."""
     return toy_pack(tmp_path_factory.mktemp("toy") / "pack")
+
+
+@pytest.fixture(scope="session")
+def smoke_run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of eight steps on the striped pairs."""
+    from mvitac.datasets.packed import PackConfig
+    from mvitac.recipes import recipe
+    from mvitac.train import train
+
+    return train(recipe("smoke", PackConfig(path=pack.path)), tmp_path_factory.mktemp("smoke") / "run", quiet=True)
+
+
+@pytest.fixture(scope="session")
+def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """That run, published."""
+    from mvitac.publish import publish
+
+    return publish(smoke_run, tmp_path_factory.mktemp("artifact") / "artifact")

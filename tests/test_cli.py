@@ -92,7 +92,18 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = ["--data.num", "800", "--data.touches", "2", "--data.size", "32", "--augment.size", "32"]
+    small = [
+        "--data.num",
+        "800",
+        "--data.touches",
+        "2",
+        "--data.size",
+        "32",
+        "--augment.size",
+        "32",
+        "--augment.whole",
+        "32",
+    ]
     tiny = ["--encoder.trunk", "mvitac_tiny", "--steps", "2", "--batch-size", "16", "--precision", "fp32"]
     command = ["demo", "--out", str(tmp_path / "demo"), "--seeds", "2", *small, *tiny]
     assert main(command) == 0

@@ -18,7 +18,10 @@ import pytest
 from PIL import Image
 
 from mvitac.cli import main
-from mvitac.datasets.folder import Folder, FolderConfig, deal, decode
+from mvitac.datasets.folder import FolderConfig
+from mvitac.datasets.images import decode
+from mvitac.datasets.rows import Rows
+from mvitac.datasets.splits import deal
 from mvitac.pack import Pack, build
 from mvitac.recipes import recipe
 from mvitac.record import cache_dir
@@ -27,7 +30,7 @@ from mvitac.run import Run
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
 NUM = 24
-Rows = list[dict[str, Any]]
+Table = list[dict[str, Any]]
 
 
 def colour(row: int, which: int) -> tuple[int, int, int]:
@@ -35,9 +38,9 @@ def colour(row: int, which: int) -> tuple[int, int, int]:
     return (10 * row, 80 * which, 255 - 5 * row)
 
 
-def make_rows(root: Path) -> Rows:
+def make_rows(root: Path) -> Table:
     """24 rows of plain pictures: 8 objects x 3 touches, 2 materials, one object unlabelled, three image columns."""
-    rows: Rows = []
+    rows: Table = []
     for i in range(NUM):
         for which, name in enumerate(("vision", "left", "right")):
             path = root / name / f"{i:02d}.png"
@@ -60,7 +63,7 @@ def make_rows(root: Path) -> Rows:
     return rows
 
 
-def write(rows: Rows, file: Path) -> Path:
+def write(rows: Table, file: Path) -> Path:
     if file.suffix == ".csv":
         with file.open("w", newline="") as stream:
             writer = csv.DictWriter(stream, list(rows[0]) if rows else ["vision", "touch"])
@@ -74,7 +77,7 @@ def write(rows: Rows, file: Path) -> Path:
 
 
 @pytest.fixture
-def rows(tmp_path: Path) -> Rows:
+def rows(tmp_path: Path) -> Table:
     return make_rows(tmp_path)
 
 
@@ -92,7 +95,7 @@ def packed(options: FolderConfig, out: Path, *, workers: int = 1) -> Pack:
 
 
 @pytest.mark.parametrize("options", [{"split": "side"}, {}, {"only": ("seq>=1",)}, {"only": ("object!=002", "seq=1")}])
-def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Rows, options: dict[str, Any]) -> None:
+def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Table, options: dict[str, Any]) -> None:
     pack = packed(config(write(rows, tmp_path / "manifest.csv"), **options), tmp_path / "pack")
     assert pack.spec.touch_channels == 6
     assert pack.spec.vision_channels == 3
@@ -105,14 +108,14 @@ def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Rows, optio
         assert (("metal", "wood", "")[label]) == rows[row]["material"]
 
 
-def test_two_sensors_stack_in_the_order_given(tmp_path: Path, rows: Rows) -> None:
+def test_two_sensors_stack_in_the_order_given(tmp_path: Path, rows: Table) -> None:
     options = config(write(rows, tmp_path / "manifest.csv"), touch=("right", "left"), vision="")
     pack = packed(options, tmp_path / "pack")
     assert pack.spec.modalities == ("touch",)
     assert (pack.images["touch"][5] == (*colour(5, 2), *colour(5, 1))).all()
 
 
-def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path, rows: Rows) -> None:
+def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path, rows: Table) -> None:
     digests, options = set(), {"split": "side", "controls": ("width=width", "which=object"), "labels": ("stiffness",)}
     for suffix in ("csv", "parquet", "jsonl"):
         folder = tmp_path / suffix
@@ -122,12 +125,12 @@ def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path, rows: Rows) -> None
     assert len(digests) == 1
 
 
-def test_two_workers_give_the_pack_of_one(tmp_path: Path, rows: Rows, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_workers_give_the_pack_of_one(tmp_path: Path, rows: Table, monkeypatch: pytest.MonkeyPatch) -> None:
     many = [row for row in rows for _ in range(6)]
     options = config(write(many, tmp_path / "manifest.csv"))
     one = packed(options, tmp_path / "one")
-    sent: list[Folder] = []
-    monkeypatch.setattr(Folder, "__getstate__", lambda self: sent.append(self) or self.__dict__, raising=False)
+    sent: list[Rows] = []
+    monkeypatch.setattr(Rows, "__getstate__", lambda self: sent.append(self) or self.__dict__, raising=False)
     assert packed(options, tmp_path / "two", workers=2).digest == one.digest
     assert len(sent) <= 2  # to each worker once, not with each of five parts
 
@@ -144,7 +147,7 @@ def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_p
     assert config(tmp_path / place).source().fingerprint() != prints[0]
 
 
-def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_path: Path, rows: Rows) -> None:
+def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_path: Path, rows: Table) -> None:
     floats = [{**row, "stiffness": float(row["stiffness"]) if row["stiffness"] else float("nan")} for row in rows]
     for suffix in ("csv", "parquet", "jsonl"):
         file = write(floats, tmp_path / f"{suffix}.{suffix}")
@@ -152,7 +155,7 @@ def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_pat
         assert [t.classes for t in spec.tasks] == [("2", "4", "6", "8", "10"), ("metal", "wood")]
 
 
-def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Rows) -> None:
+def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Table) -> None:
     pack = packed(config(write(rows, tmp_path / "m.csv"), label_only=("seq<=1",)), tmp_path / "pack")
     labels = pack.column("label_material")
     assert pack.num == NUM
@@ -161,7 +164,7 @@ def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Ro
     assert (labels[pack.rows("unlabelled")] == -1).all()
 
 
-def test_controls_are_numbers_or_one_hot(tmp_path: Path, rows: Rows) -> None:
+def test_controls_are_numbers_or_one_hot(tmp_path: Path, rows: Table) -> None:
     options = config(write(rows, tmp_path / "m.csv"), controls=("how wide=width", "mixed=width,side"))
     pack = packed(options, tmp_path / "pack")
     assert pack.spec.controls == {"how wide": ("width",), "mixed": ("width", "side=test", "side=train", "side=val")}
@@ -293,7 +296,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_image_is_named_or_counted(tmp_path: Path, rows: Rows, kind: str) -> None:
+def test_a_damaged_image_is_named_or_counted(tmp_path: Path, rows: Table, kind: str) -> None:
     damage, says = DAMAGE[kind]
     source = config(write(rows, tmp_path / "m.csv")).source()
     damage(tmp_path / "left" / "04.png")
@@ -342,7 +345,7 @@ def test_dealing_is_stratified_and_the_shares_are_kept() -> None:
     assert deal(groups, [target], 0.25, 0.15, 0) != deal(groups, [target], 0.25, 0.15, 1)
 
 
-def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Rows) -> None:
+def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Table) -> None:
     rows[0]["side"] = "test"
     file = write(rows, tmp_path / "m.csv")
     with pytest.raises(ValueError, match=r"leaks: 1 of 8 groups \(object\).*'000' in test and train.*by-group"):
@@ -351,14 +354,14 @@ def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Rows) -
     assert config(file).source().items()
 
 
-def test_train_and_unlabelled_are_one_side(tmp_path: Path, rows: Rows) -> None:
+def test_train_and_unlabelled_are_one_side(tmp_path: Path, rows: Table) -> None:
     rows[0]["side"] = "unlabelled"
     assert config(write(rows, tmp_path / "m.csv"), split="side").source().items()
 
 
 # -- every mistake is named before work begins ------------------------------------------------------------------------
 
-Change = Callable[[Rows], object]
+Change = Callable[[Table], object]
 
 
 def each(**cells: Any) -> Change:
@@ -377,7 +380,7 @@ def numbered(**patterns: str) -> Change:
     return lambda rows: [row.update({k: v.format(i) for k, v in patterns.items()}) for i, row in enumerate(rows)]
 
 
-def many_names(rows: Rows) -> None:
+def many_names(rows: Table) -> None:
     rows[:] = [{**rows[i % NUM], "side": f"s{i}"} for i in range(3 * NUM)]
 
 
@@ -442,7 +445,7 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_manifests_are_named_before_anything_is_written(tmp_path: Path, rows: Rows, name: str) -> None:
+def test_bad_manifests_are_named_before_anything_is_written(tmp_path: Path, rows: Table, name: str) -> None:
     change, options, says = BAD[name]
     if change:
         change(rows)
@@ -505,7 +508,7 @@ def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
     assert file in str(caught.value)
 
 
-def test_bad_folders_are_named(tmp_path: Path, rows: Rows) -> None:
+def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     def refused(path: Path, says: str) -> None:
         with pytest.raises(ValueError, match=says):
             FolderConfig(path=path).source()
@@ -532,7 +535,7 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Rows) -> None:
     refused(tmp_path / "half", r"vision images in some splits only \(row")
 
 
-def test_the_command_says_it_in_one_line(tmp_path: Path, rows: Rows, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_it_in_one_line(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(rows, tmp_path / "m.csv")
     common = ["data", "pack", "--data", "folder", "--path", str(file), "--quiet"]
     assert main([*common, "--labels", "materiel", "--out", str(tmp_path / "bad")]) == 2

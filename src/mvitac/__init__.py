@@ -1,6 +1,6 @@
 """mvitac: learn from paired camera and optical-tactile images without labels, and say what the features are worth.
 
-    model = mvitac.load("runs/demo/seed0")                      # a trained run
+    model = mvitac.load("runs/demo/seed0")                      # a run, an artifact, owner/name on the Hub
     features = model.embed(vision=photos, touch=presses)        # {"vision": [N, 512], "touch": [N, 512]}
 
 Names are imported on first use, so that ``import mvitac`` costs nothing.
@@ -12,7 +12,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mvitac.model import Model, load
+    from mvitac.artifact import load
+    from mvitac.model import Model
     from mvitac.pack import Pack
     from mvitac.recipes import recipe
     from mvitac.run import Run
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["Model", "Pack", "Run", "load", "recipe", "train"]
 
-_HOME = {"Model": "model", "Pack": "pack", "Run": "run", "load": "model", "recipe": "recipes", "train": "train"}
+_HOME = {"Model": "model", "Pack": "pack", "Run": "run", "load": "artifact", "recipe": "recipes", "train": "train"}
 
 
 def __getattr__(name: str) -> Any:

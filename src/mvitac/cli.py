@@ -22,6 +22,8 @@ what the features are worth.
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes beside their controls
   report RUN...        one HTML page with curves, tables and pictures
+  publish RUN OUT      weights, probes, model card: one folder, or on the Hub
+  export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
 
 First steps:
   mvitac demo                                        # no data needed
@@ -39,6 +41,8 @@ COMMANDS = {
     "pretrain": "learn:pretrain",
     "probe": "learn:probe",
     "report": "learn:report",
+    "publish": "robot:publish",
+    "export": "robot:export",
 }
 """Command -> module of ``commands``:function, imported when called."""
 

@@ -10,7 +10,7 @@ from typing import Any
 import timm
 from timm.models import register_model
 from timm.models.resnet import BasicBlock, ResNet
-from torch import nn
+from torch import Tensor, nn
 
 from mvitac.record import brief
 
@@ -90,3 +90,19 @@ class Head(nn.Sequential):
         if dropout:
             layers.append(nn.Dropout(dropout))
         super().__init__(*layers, nn.Linear(hidden, out))
+
+
+class Projected(nn.Module):
+    """A trunk with one head: images [B, C, H, W] to embeddings [B, D]."""
+
+    def __init__(self, trunk: nn.Module, head: nn.Module) -> None:
+        super().__init__()
+        self.trunk, self.head = trunk, head
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.head(self.trunk(images))
+
+
+def num_features(trunk: nn.Module) -> int:
+    """Width D of a trunk's pooled features."""
+    return int(trunk.num_features)  # type: ignore[arg-type]

@@ -57,7 +57,7 @@ class Study:
         """The split to look at and its rows: test, as the first task and retrieval score it; else what there is."""
         only = self.pack.spec.tasks[0].only if self.pack.spec.tasks else None
         for split in ("test", "val", "train", "unlabelled"):
-            rows = self.pack.rows(split, only=only)
+            rows = self.pack.rows(split, only=only, having=self.pack.spec.modalities)
             if len(rows):
                 return split, rows
         raise ValueError(f"no rows to look at in {self.pack.path}")

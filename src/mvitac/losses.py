@@ -19,3 +19,17 @@ def info_nce(query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], temperature
         query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)
         logits = query @ key.T / temperature
         return F.cross_entropy(logits, torch.arange(len(query), device=query.device))
+
+
+def queue_nce(
+    query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], queue: Float[Tensor, "K D"], temperature: float
+) -> Float[Tensor, ""]:
+    """InfoNCE against a queue (MoCo, eq. 1): the negatives are its K keys, the other keys of the batch are not.
+
+    L = -log( exp(q.k+ / tau) / (exp(q.k+ / tau) + sum_i exp(q.k_i / tau)) ), mean over the queries. Query and key are
+    L2-normalised here, the queue holds normalised keys; fp32 as in ``info_nce``.
+    """
+    with torch.autocast(query.device.type, enabled=False):
+        query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)
+        logits = torch.cat([(query * key).sum(1, keepdim=True), query @ queue.T], dim=1) / temperature
+        return F.cross_entropy(logits, torch.zeros(len(query), dtype=torch.int64, device=query.device))

@@ -23,6 +23,7 @@ from mvitac.augment import plain_view
 from mvitac.encoders import SCRATCH
 from mvitac.methods.base import Method
 from mvitac.pack import Pack, fit
+from mvitac.readout import Readout
 from mvitac.record import brief, digest, read_json, write_atomic
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
@@ -33,7 +34,7 @@ Images = np.ndarray | Tensor | Image.Image | Sequence[Any]
 
 
 class Model(nn.Module):
-    """Encoders modality -> trunk, projectors modality -> head, in eval mode, with their preprocessing."""
+    """Encoders modality -> trunk, projectors modality -> head, classifiers of tasks, in eval mode, with preprocessing."""
 
     def __init__(self, method: Method, run: Run, spec: DataSpec, stored: int) -> None:
         """``stored``: side in pixels at which the training pack stores images, to which raw ones are squashed first."""
@@ -41,6 +42,11 @@ class Model(nn.Module):
         self.run, self.spec, self.stored = run, spec, stored
         self.encoders = nn.ModuleDict(method.encoders())
         self.projectors = nn.ModuleDict(method.projectors())
+        own = method.classifiers()
+        self.tasks = tuple(own)
+        self.classifiers = nn.ModuleList(own.values())
+        # No part of the state dict: a run's weights are the same with and without the probes that were published.
+        self.readouts: dict[str, Readout] = {}
         self.eval()
 
     @torch.no_grad()
@@ -56,6 +62,14 @@ class Model(nn.Module):
         if modality not in self.projectors:
             raise ValueError(f"this model has no shared space for {modality}: its method is {self.run.method.name!r}")
         return nn.functional.normalize(self.projectors[modality](features), dim=1)
+
+    @torch.no_grad()
+    def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
+        """Class probabilities [B, K] by the classifier trained along with the encoders (supervised methods only)."""
+        if task not in self.tasks:
+            raise unknown("task of this model's own classifiers", task, self.tasks or ("none",))
+        joined = torch.cat([features[m] for m in self.encoders], dim=1)
+        return self.classifiers[self.tasks.index(task)](joined).softmax(dim=1)
 
     def embed(
         self, *, vision: Images | None = None, touch: Images | None = None, shared: bool = False
@@ -79,6 +93,26 @@ class Model(nn.Module):
             features = self.features(modality, images)
             result[modality] = self.project(modality, features) if shared else features
         return result
+
+    def predict(self, *, vision: Images | None = None, touch: Images | None = None) -> dict[str, Tensor]:
+        """Class probabilities [N, K] by task, from the probes that a published artifact carries.
+
+        Given both modalities, the probe on both answers. ``classes`` names the columns. ValueError as for ``embed``, and
+        where there is no probe.
+        """
+        given = self.embed(vision=vision, touch=touch)
+        asked = "both" if len(given) == 2 else next(iter(given))
+        if len({len(x) for x in given.values()}) > 1:
+            raise ValueError(f"predict: got {len(given['vision'])} vision and {len(given['touch'])} touch images")
+        chosen = [r for r in self.readouts.values() if r.question.modality == asked]
+        if not chosen:
+            raise ValueError(f"this model has no probe on {asked}: load an artifact written by `mvitac publish`")
+        return {r.question.task: r(torch.cat([given[m].cpu() for m in r.question.modalities], dim=1)) for r in chosen}
+
+    @property
+    def classes(self) -> dict[str, tuple[str, ...]]:
+        """Class names by task, in the order of ``predict``'s columns."""
+        return {r.question.task: r.question.classes for r in self.readouts.values()}
 
     def weights_digest(self) -> str:
         """Content address of the weights and of the view they expect, for caches."""

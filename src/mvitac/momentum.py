@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+
+def rising(m: float, end: float | None, progress: float) -> float:
+    """m at ``progress`` (0 to 1) of a run: constant, or rising to ``end`` along a half cosine (BYOL, MoCo v3)."""
+    return m if end is None else end - (end - m) * (math.cos(math.pi * progress) + 1) / 2
 
 
 class Momentum(nn.Module):

@@ -2,6 +2,7 @@
 
     <pack>/pack.json         format, counts, digests, spec, source, licence, versions
            samples.parquet   one row per sample: id, group, split, label_<task>, sensor, ... (row i <-> image i)
+                             has_vision, has_touch (bool) where some rows lack an image; zeros stand for it
            vision.npy        uint8 [N, size, size, 3]      absent where the dataset has no camera
            touch.npy         uint8 [N, size, size, 3 or 6]
 
@@ -46,12 +47,26 @@ NUM_PART_ITEMS = 32
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """One row of a dataset, images as decoded: uint8 [H, W, C] of any size, or None where the modality is absent."""
+    """One row of a dataset, images as decoded: uint8 [H, W, C] of any size, or None where the modality is absent.
+
+    A row that lacks a modality the dataset has says so in its columns: has_vision or has_touch (bool) is False.
+    """
 
     vision: np.ndarray | None
     touch: np.ndarray | None
     columns: dict[str, Any] = field(default_factory=dict)
     """At least id (str), group (str), split (one of SPLITS) and a label_<task> (int, -1 = none) per task."""
+
+
+@dataclass(frozen=True)
+class Count:
+    """What a published list says there is, beside what was found."""
+
+    what: str
+    published: int
+    found: int
+    detail: str = ""
+    """What is missing or too many, where that can be said."""
 
 
 class Source(ABC):
@@ -75,6 +90,10 @@ class Source(ABC):
     def num_samples(self) -> int:
         """How many samples to expect, for the disk estimate."""
         return len(self.items())
+
+    def expected(self) -> list[Count]:
+        """What a published list of the dataset says, beside what is there, for `mvitac data check`."""
+        return []
 
 
 class Pack:
@@ -138,9 +157,29 @@ class Pack:
             raise unknown("column", name, self.table.column_names)
         return np.array(self.table.column(name).to_numpy(zero_copy_only=False))  # arrow memory is read-only
 
-    def rows(self, *splits: str, only: dict[str, str] | None = None) -> np.ndarray:
-        """Ascending int64 row numbers whose split is among ``splits`` and whose columns equal ``only``."""
+    @functools.cached_property
+    def _labels(self) -> dict[str, np.ndarray]:
+        labels = {task.name: self.column(f"label_{task.name}").astype(np.int64) for task in self.spec.tasks}
+        for task in self.spec.tasks:
+            for name, value in task.only.items():
+                labels[task.name][self.column(name).astype(str) != value] = -1
+        return labels
+
+    def labels(self, task: str) -> np.ndarray:
+        """[N] int64 labels of ``task``, -1 where there is none or the task is not about the row (``Task.only``)."""
+        return self._labels[task]
+
+    def has(self, modality: str) -> np.ndarray:
+        """bool [N]: which rows have an image of ``modality``; the others hold zeros, which nothing should look at."""
+        name = f"has_{modality}"
+        return self.column(name) if name in self.table.column_names else np.ones(self.num, bool)
+
+    def rows(self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = ()) -> np.ndarray:
+        """Ascending int64 row numbers whose split is among ``splits``, whose columns equal ``only`` and which have an
+        image of every modality in ``having``."""
         mask = np.isin(self.column("split"), splits)
+        for modality in having:
+            mask &= self.has(modality)
         for name, value in (only or {}).items():
             mask &= self.column(name).astype(str) == value
         return np.flatnonzero(mask)
@@ -198,6 +237,9 @@ def _check_table(table: pa.Table, spec: DataSpec) -> None:
         if name in table.column_names and table.column(name).null_count:
             row = first(table.column(name).is_null().to_numpy())
             raise ValueError(f"column {name} is empty in row {row}: every row needs one")
+    for name in (f"has_{modality}" for modality in spec.modalities):
+        if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
+            raise ValueError(f"column {name} holds {table.column(name).type}: write true or false in every row")
     for split in table.column("split").unique().to_pylist():
         if split not in SPLITS:
             raise unknown("split", str(split), SPLITS)
@@ -272,7 +314,9 @@ def build(
     else:
         write_json(partial / "request.json", request)
 
-    parts = [range(i, min(i + NUM_PART_ITEMS, len(items))) for i in range(0, len(items), NUM_PART_ITEMS)]
+    # A part is held in memory: few items where one gives many samples (a video).
+    step = max(1, NUM_PART_ITEMS * len(items) // max(len(items), source.num_samples()))
+    parts = [range(i, min(i + step, len(items))) for i in range(0, len(items), step)]
     missing = [i for i in range(len(parts)) if not (partial / f"part-{i:06d}.npz").exists()]
     with _progress(quiet) as progress:
         bar = progress.add_task(f"packing {spec.name}", total=len(items), completed=0)
@@ -342,7 +386,7 @@ def _write_part(job: tuple[Source, DataSpec, range, int, Path]) -> range:
     for number in numbers:
         try:
             samples = source.read(number)
-            fitted = [{m: _check_image(getattr(s, m), m, spec, size) for m in spec.modalities} for s in samples]
+            fitted = [{m: _check_image(s, m, spec, size) for m in spec.modalities} for s in samples]
             for sample in samples:
                 _check_columns(sample.columns, spec)
         except (ValueError, OSError) as error:
@@ -360,9 +404,12 @@ def _write_part(job: tuple[Source, DataSpec, range, int, Path]) -> range:
     return numbers
 
 
-def _check_image(image: np.ndarray | None, modality: str, spec: DataSpec, size: int) -> np.ndarray:
+def _check_image(sample: Sample, modality: str, spec: DataSpec, size: int) -> np.ndarray:
+    image = getattr(sample, modality)
+    if (image is None) != (sample.columns.get(f"has_{modality}", True) is False):
+        raise ValueError(f"{'no' if image is None else 'a'} {modality} image, against its column has_{modality}")
     if image is None:
-        raise ValueError(f"no {modality} image")
+        return np.zeros((size, size, spec.channels(modality)), np.uint8)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != spec.channels(modality):
         raise ValueError(
             f"{modality} image is {image.dtype} {image.shape}, not uint8 H x W x {spec.channels(modality)}"

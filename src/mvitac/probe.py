@@ -48,15 +48,21 @@ class Parts:
     test: np.ndarray
 
 
-def parts(pack: Pack, task: Task) -> Parts:
-    """Labelled rows of ``task`` by split; without a val split, a fifth of train's groups is set aside for choosing."""
+def parts(pack: Pack, task: Task, modality: str = "none") -> Parts:
+    """Labelled rows of ``task`` that have an image of ``modality`` ("both": of either, "none": of any), by split.
+
+    Without a val split, a fifth of train's groups is set aside for choosing.
+    """
+    having = pack.spec.modalities if modality == "both" else () if modality == "none" else (modality,)
     labels = pack.column(f"label_{task.name}")
     train, val, test = (
-        rows[labels[rows] >= 0] for rows in (pack.rows(split, only=task.only) for split in ("train", "val", "test"))
+        rows[labels[rows] >= 0]
+        for rows in (pack.rows(split, only=task.only, having=having) for split in ("train", "val", "test"))
     )
     if not len(train) or not len(test):
         where = "train" if not len(train) else "test"
-        raise ValueError(f"task {task.name!r} has no labelled rows in split {where}: nothing to probe")
+        lacking = f" with {' and '.join(having)}" if having else ""
+        raise ValueError(f"task {task.name!r} has no labelled rows{lacking} in split {where}: nothing to probe")
     if not len(val):
         groups = pack.column("group")[train].astype(str)
         names = np.random.default_rng(0).permutation(np.unique(groups))
@@ -102,10 +108,22 @@ def borders(pack: Pack, modality: str, rows: np.ndarray, side: int = 16, width: 
 # -- probes -----------------------------------------------------------------------------------------------------------
 
 
-def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray) -> tuple[Any, float]:
+@dataclass(frozen=True)
+class Logistic:
+    """A fitted logistic regression on (z - mean) / std; called, it gives probabilities in ascending label order."""
+
+    model: LogisticRegression
+    mean: np.ndarray
+    std: np.ndarray
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return self.model.predict_proba((z - self.mean) / self.std)
+
+
+def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray) -> tuple[Logistic, float]:
     """Logistic regression on standardised features; C is the best on val, then train and val are fitted together.
 
-    Returns a function from features to class probabilities in ascending label order, and C.
+    Returns it and C.
     """
     mean, std = x.mean(0), x.std(0) + 1e-6
     x, x_val = (x - mean) / std, (x_val - mean) / std
@@ -119,7 +137,7 @@ def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarra
         if set(y_val) - set(y):  # a class only seen in val changes the shape of the weights
             model = LogisticRegression(max_iter=300, tol=1e-3)
         model.set_params(C=c).fit(np.concatenate([x, x_val]), np.concatenate([y, y_val]))
-    return lambda z: model.predict_proba((z - mean) / std), c
+    return Logistic(model, mean, std), c
 
 
 def fit_paper(x: np.ndarray, y: np.ndarray, num_classes: int, seed: int) -> Any:
@@ -262,7 +280,8 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
                     f" it was trained on {model.spec.name!r}"
                 )
     for task in tasks:
-        parts(pack, task)
+        for modality in modalities:
+            parts(pack, task, modality)
     if session.controls:  # fetched now, so that one that cannot be had is not found out at the end
         for weights in _start_weights([m.run for m in models], session):
             build_trunk(replace(models[0].run.encoder, weights=weights), 3)
@@ -313,17 +332,14 @@ def _chosen(pack: Pack, session: Session) -> tuple[list[Task], list[str]]:
 def _probe_model(
     model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str], probes: Sequence[str]
 ) -> list[dict[str, Any]]:
-    needed = np.unique(
-        np.concatenate([np.concatenate([p.train, p.val, p.test]) for p in (parts(pack, t) for t in tasks)])
-    )
-    by_modality = {
-        m: features(model, pack, m, needed) for m in pack.spec.modalities if m in modalities or "both" in modalities
-    }
+    asked = [parts(pack, task, modality) for task in tasks for modality in modalities]
+    needed = np.unique(np.concatenate([np.concatenate([p.train, p.val, p.test]) for p in asked]))
+    own = {m: needed[pack.has(m)[needed]] for m in pack.spec.modalities if m in modalities or "both" in modalities}
+    by_modality = {m: features(model, pack, m, rows) for m, rows in own.items()}
 
     def matrix(modality: str, rows: np.ndarray) -> np.ndarray:
-        at = np.searchsorted(needed, rows)
         names = pack.spec.modalities if modality == "both" else (modality,)
-        return np.concatenate([by_modality[m][at] for m in names], axis=1)
+        return np.concatenate([by_modality[m][np.searchsorted(own[m], rows)] for m in names], axis=1)
 
     return _probe_all(matrix, pack, tasks, modalities, probes, model.run.seed)
 
@@ -334,10 +350,9 @@ def _probe_all(
     """Every (task, modality, probe) on the features ``matrix(modality, rows)``."""
     records = []
     for task in tasks:
-        rows = parts(pack, task)
-        everything = np.concatenate([rows.train, rows.val, rows.test])
         for modality in modalities:
-            x = matrix(modality, everything)
+            rows = parts(pack, task, modality)
+            x = matrix(modality, np.concatenate([rows.train, rows.val, rows.test]))
             for kind in probes:
                 result = probe_features(x, pack, task, rows, kind, seed)
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
@@ -398,7 +413,8 @@ def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
 
     Empty without a shared space or with fewer than ``MIN_GALLERY`` test groups.
     """
-    rows = pack.rows("test", only=pack.spec.tasks[0].only if pack.spec.tasks else None)
+    only = pack.spec.tasks[0].only if pack.spec.tasks else None
+    rows = pack.rows("test", only=only, having=pack.spec.modalities)
     if len(model.projectors) < 2 or not len(rows):
         return []
     device = next(model.parameters()).device

@@ -91,7 +91,7 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     usable = []
     for task in pack.spec.tasks:
         try:
-            parts(pack, task)
+            parts(pack, task, "both")
         except ValueError:  # no labelled rows to learn from or to be scored on
             continue
         usable.append(task.name)

@@ -71,7 +71,7 @@ def train(
     pack = pack or run.data.open(quiet=quiet or not world.writes)
     if not world.rank:
         world.wait()
-    rows = pack.rows("train", "unlabelled")
+    rows = training_rows(run, pack)
     run.check(pack.spec, len(rows), pack.size)
     _check_world(run, world)
     again = (out / "run.json").exists()
@@ -83,11 +83,9 @@ def train(
     if device.type == "cpu":
         keep_freed_memory()
     torch.manual_seed(run.seed)
-    method = run.method.build(pack.spec, run.encoder).to(device)
-    method.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    for task in run.method.labels_needed(pack.spec):
-        if not (pack.column(f"label_{task}")[rows] >= 0).any():
-            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    method = run.method.build(pack.spec, run.encoder)
+    method.prepare(torch.from_numpy(rows))
+    method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _try(method, run, pack)
     synchronise_norms(method, world)
     step = Step(run, method, device, world)
@@ -161,6 +159,19 @@ def describe(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"{device.type}, {torch.get_num_threads()} threads"
+
+
+def training_rows(run: Run, pack: Pack) -> np.ndarray:
+    """Pack rows to pre-train on; a method that learns from labels sees only rows that carry one it needs."""
+    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)  # a pair with a hole in it is no pair
+    tasks = run.method.labels_needed(pack.spec)
+    if not tasks:
+        return rows
+    labels = {task: pack.labels(task)[rows] >= 0 for task in tasks}
+    for task, there in labels.items():
+        if not there.any():
+            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    return rows[np.logical_or.reduce(list(labels.values()))]
 
 
 def mix(*numbers: int) -> int:
@@ -241,9 +252,10 @@ def make_views(
     num_views: int,
     generator: torch.Generator,
     device: torch.device,
-    feed: Feed,
+    feed: Feed | None = None,
 ) -> Views:
     """Random views of the pack's ``rows`` on ``device``, in the precision the networks read them in."""
+    feed = feed or Feed(pack, device)
     sources = [rows] * num_views
     if run.positives == "same-touch":
         sources[1:] = [partners(pack, rows, generator) for _ in range(num_views - 1)]
@@ -254,18 +266,19 @@ def make_views(
         for source in sources:
             view = random_view(feed(modality, source), config, run.augment.size, generator, dtype)
             images[modality].append(view)
-    labels = {t.name: torch.from_numpy(pack.column(f"label_{t.name}")[rows]).to(device) for t in pack.spec.tasks}
+    labels = {t.name: torch.from_numpy(pack.labels(t.name)[rows]).to(device) for t in pack.spec.tasks}
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
 
 
 def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
     """For each of ``rows`` a random other row of its touch group in the same split, or itself if it is alone there."""
     groups, split = pack.touch_groups, pack.column("split")
+    whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]))
-        others = others[(others != row) & (split[others] == split[row])]
+        others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found
@@ -290,14 +303,16 @@ NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
 def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """kNN accuracy of each task and the collapse panel on held-out groups (split val); never looks at test.
 
-    Without a val split the panel is over training rows and there is no kNN score.
+    Without a val split the panel is over training rows and there is no kNN score. Only rows with both modalities count.
     """
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
 
     def some(rows: np.ndarray, num: int) -> np.ndarray:
         return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
-    train_rows, val_rows = some(pack.rows("train", "unlabelled"), NUM_EVAL_TRAIN), pack.rows("val")
+    whole = pack.spec.modalities
+    train_rows = some(pack.rows("train", "unlabelled", having=whole), NUM_EVAL_TRAIN)
+    val_rows = pack.rows("val", having=whole)
     held_out = len(val_rows) > 1
     panel_rows = some(val_rows, NUM_EVAL_VAL) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: pack_features(model, pack, m, panel_rows, precision=run.precision) for m in model.encoders}
@@ -308,7 +323,7 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     if held_out:
         bank = {m: pack_features(model, pack, m, train_rows, precision=run.precision) for m in model.encoders}
         for task in pack.spec.tasks:
-            labels = torch.from_numpy(pack.column(f"label_{task.name}"))
+            labels = torch.from_numpy(pack.labels(task.name))
             keep_bank, keep = labels[train_rows] >= 0, labels[panel_rows] >= 0
             if not (keep_bank.any() and keep.any()):
                 continue

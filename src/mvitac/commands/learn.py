@@ -1,6 +1,6 @@
 """``mvitac demo``, ``pretrain``, ``probe`` and ``report``: the main road."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from mvitac.options import parse, selectors
@@ -17,7 +17,7 @@ def pretrain(argv: list[str]) -> None:
     from mvitac.datasets import DatasetConfig
     from mvitac.methods import MethodConfig
     from mvitac.model import read_record
-    from mvitac.recipes import RECIPES, recipe
+    from mvitac.recipes import RECIPES, recipe, with_method
     from mvitac.registry import default
     from mvitac.run import Run
     from mvitac.sinks import open_sinks
@@ -31,9 +31,7 @@ def pretrain(argv: list[str]) -> None:
     else:
         data = default(DatasetConfig, chosen.get("--data", "materials"))
         base = recipe(chosen.get("--recipe", "demo"), data)
-        method = chosen.get("--method", base.method.name)
-        if method != base.method.name:
-            base = replace(base, method=default(MethodConfig, method))
+        base = with_method(base, chosen.get("--method", base.method.name))
 
     @dataclass(frozen=True, kw_only=True)
     class Options:

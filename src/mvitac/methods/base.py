@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
@@ -28,12 +29,24 @@ class Method(nn.Module, ABC):
     def encoders(self) -> dict[str, nn.Module]:
         """What outlives pre-training: modality -> trunk from [B, C, H, W] to features [B, D]."""
 
+    def classifiers(self) -> dict[str, nn.Module]:
+        """task -> classifier from all ``encoders``' features, concatenated in their order, to logits; {} if none."""
+        return {}
+
     def projectors(self) -> dict[str, nn.Module]:
         """modality -> head from features into the space both modalities share, for retrieval; {} if there is none."""
         return {}
 
+    def prepare(self, rows: Tensor) -> None:
+        """Called once, after the weights are drawn and before any are restored, with the pack rows [N] (ascending int64)
+        that training draws from: the place to make memory that is sized or indexed by them."""
+        return
+
     def after_step(self, progress: float) -> None:
-        """What happens after the optimiser's step, e.g. the momentum update; ``progress`` runs from 0 to 1."""
+        """What happens after the optimiser's step, e.g. the momentum update; ``progress`` runs from 0 to 1.
+
+        What it needs of the batch, ``forward`` leaves in an attribute (``pending``) that ``forward`` never reads.
+        """
         return
 
 
@@ -63,6 +76,37 @@ class Contrastive(Method):
 @dataclass(frozen=True, kw_only=True)
 class MethodConfig(Registered, ABC):
     """Base of every method's config, which lies beside its method."""
+
+    def check_fields(
+        self,
+        *,
+        positive: tuple[str, ...] = (),
+        weight: tuple[str, ...] = (),
+        share: tuple[str, ...] = (),
+        width: tuple[str, ...] = (),
+    ) -> None:
+        """ValueError unless the named fields are > 0, >= 0, in [0, 1] (or None) and 1 to 65536 (or None) respectively."""
+        for name in positive:
+            if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
+                raise ValueError(f"{name} {getattr(self, name)}: give a positive number")
+        for name in weight:
+            if not (getattr(self, name) >= 0 and math.isfinite(getattr(self, name))):
+                raise ValueError(f"{name} {getattr(self, name)}: give a finite number >= 0")
+        for name in share:
+            if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} {getattr(self, name)}: give a number from 0 to 1")
+        for name in width:
+            if not 1 <= getattr(self, name) <= 65536:
+                raise ValueError(f"{name} {getattr(self, name)}: give 1 to 65536")
+
+    def check_pairs(self, spec: DataSpec) -> None:
+        """ValueError unless the dataset has both modalities."""
+        if len(spec.modalities) < 2:
+            have = ", ".join(spec.modalities)
+            raise ValueError(
+                f"method {self.name!r} learns from pairs, dataset {spec.name!r} has {have} only:"
+                " choose --method mvitac or a method per modality (simclr, moco, byol, vicreg)"
+            )
 
     def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
         """Tasks whose labels it learns from; none for a self-supervised method."""

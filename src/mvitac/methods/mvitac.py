@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
-import torch
 from torch import Tensor, nn
 
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Head, build_trunk
 from mvitac.losses import info_nce
 from mvitac.methods.base import Contrastive, MethodConfig
-from mvitac.momentum import Momentum
+from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
 
 
@@ -37,6 +36,10 @@ class MViTacConfig(MethodConfig):
     """m of eq. 1-3; not given in the paper, .99 in the authors' code."""
     momentum_end: float | None = None
     """If given, m rises to this along a half cosine (as in BYOL and MoCo v3); the paper has no schedule."""
+    losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
+    """Which of the four losses of eq. 14 to minimise; the paper minimises all."""
+    shared_heads: bool = False
+    """One head per encoder for intra and inter losses alike, instead of the paper's two."""
     out: int = 128
     """Width of the embeddings z (paper: 128)."""
     hidden: int = 512
@@ -57,11 +60,24 @@ class MViTacConfig(MethodConfig):
         for name, width in (("out", self.out), ("hidden", self.hidden)):
             if not 1 <= width <= 65536:
                 raise ValueError(f"head width {name} {width}: give 1 to 65536")
+        if not self.losses or len(set(self.losses)) < len(self.losses):
+            raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
+        if not set(self.losses) & set(_possible(spec)):
+            raise ValueError(
+                f"losses {', '.join(self.losses)} need another modality than dataset {spec.name!r} has:"
+                f" give some of {', '.join(_possible(spec))}"
+            )
         return MViTac(self, spec, encoder)
+
+
+def _possible(spec: DataSpec) -> tuple[str, ...]:
+    """The losses of eq. 14 that a dataset's modalities allow."""
+    own = tuple({"vision": "vv", "touch": "tt"}[m] for m in spec.modalities)
+    return (*own, "vt", "tv") if len(own) == 2 else own
 
 
 class Tower(nn.Module):
@@ -75,7 +91,8 @@ class Tower(nn.Module):
             features = int(self.trunk.num_features)  # type: ignore[arg-type]
             return Head(features, config.hidden, config.out, dropout=config.dropout, norm=config.head_norm)
 
-        self.intra, self.inter = head(), head()
+        self.intra = head()
+        self.inter = self.intra if config.shared_heads else head()
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         features = self.trunk(images)
@@ -112,12 +129,11 @@ class MViTac(Contrastive):
 
     def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         parts = [part for part in ("vv", "tt", "vt", "tv") if f"{part}_q" in z and f"{part}_k" in z]
-        losses = {
-            part: info_nce(z[f"{part}_q"], z[f"{part}_k"], self.config.temperature) for part in parts
-        }  # eq. 8, 11
-        weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
-        weighted = [weight.get(part, 1.0) * losses[part] for part in parts]
-        return {"loss": torch.stack(weighted).sum(), **losses}  # eq. 14, or what is left of it with one modality
+        losses = {p: info_nce(z[f"{p}_q"], z[f"{p}_k"], self.config.temperature) for p in parts}  # eq. 8, 11
+        # eq. 14; a loss that is left out of it is still told, as a witness of what the others do to it
+        weight = {"vv": 1.0, "tt": 1.0, "vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
+        total = sum(weight[name] * loss for name, loss in losses.items() if name in self.config.losses)
+        return {"loss": total, **losses}  # type: ignore[dict-item]
 
     def encoders(self) -> dict[str, nn.Module]:
         return {m: tower.trunk for m, tower in self.query.items()}  # type: ignore[misc]
@@ -126,8 +142,6 @@ class MViTac(Contrastive):
         return {m: tower.inter for m, tower in self.query.items()}  # type: ignore[misc]
 
     def after_step(self, progress: float) -> None:
-        m, end = self.config.momentum, self.config.momentum_end
-        if end is not None:
-            m = end - (end - m) * (math.cos(math.pi * progress) + 1) / 2
+        m = rising(self.config.momentum, self.config.momentum_end, progress)
         for modality, tower in self.query.items():
             self.key[modality].follow(tower, m)  # type: ignore[operator]  # eq. 1-3

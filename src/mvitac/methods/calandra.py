@@ -1,0 +1,56 @@
+"""Supervised fusion of Calandra et al. (2017): a trunk per stream (vision, left gel, right gel), one MLP on all of them.
+
+The layout is that of TACTO's grasp-stability experiment, which MViTac ran for its Table II: a ResNet-18 per stream, pooled
+features concatenated, linear layers 512 - 256 - classes with ReLU between (arXiv:1710.05512 and
+https://github.com/facebookresearch/tacto, experiments/grasp_stability). Streams share no weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from mvitac.encoders import EncoderConfig, build_trunk, num_features
+from mvitac.methods.supervised import LabelledConfig, Supervised
+from mvitac.spec import DataSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalandraConfig(LabelledConfig):
+    """Supervised grasp prediction with a trunk per camera and per gel, end to end."""
+
+    name: ClassVar[str] = "calandra"
+
+    widths: tuple[int, int] = (512, 256)
+    """Widths of the two hidden layers after the trunks (512, 256)."""
+
+    def __post_init__(self) -> None:
+        for width in self.widths:
+            if not 1 <= width <= 65536:
+                raise ValueError(f"widths {self.widths}: give two numbers, each 1 to 65536")
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
+        streams: dict[str, nn.Module] = {m: Streams(encoder, spec.channels(m) // 3) for m in self.modalities_of(spec)}
+        width = sum(num_features(stream) for stream in streams.values())
+        first, second = self.widths
+
+        def classifier(num: int) -> nn.Module:
+            layers = (nn.Linear(width, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU())
+            return nn.Sequential(*layers, nn.Linear(second, num))
+
+        return Supervised(streams, {task: classifier(num) for task, num in self.num_classes(spec).items()})
+
+
+class Streams(nn.Module):
+    """One trunk per three channels of a stacked image, features concatenated: [B, 3 S, H, W] to [B, S D]."""
+
+    def __init__(self, encoder: EncoderConfig, num: int) -> None:
+        super().__init__()
+        self.trunks = nn.ModuleList(build_trunk(encoder, 3) for _ in range(num))
+        self.num_features = sum(num_features(trunk) for trunk in self.trunks)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return torch.cat([trunk(x) for trunk, x in zip(self.trunks, images.split(3, dim=1), strict=True)], dim=1)

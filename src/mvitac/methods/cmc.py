@@ -1,0 +1,128 @@
+"""Contrastive Multiview Coding as Touch and Go's authors run it (TAG): across modalities, against memory banks, by NCE.
+
+One trunk and one linear layer per modality, L2-normalised: z_v, z_t. Each modality keeps a bank with one embedding per
+training row; a vision query is told its own row of the touch bank from K rows drawn at random, and the other way round:
+
+    s_j   = exp(z_v . bank_t[j] / tau) / Z,      Z = N * mean of exp(...) over the first batch, fixed from then on
+    L_vt  = -log( s_+ / (s_+ + K/N) ) - sum over the K drawn of log( (K/N) / (s_j + K/N) ),    mean over the batch
+
+The K rows are drawn evenly, with replacement, the query's own row not excluded, one draw for both directions. After the
+step, bank rows move: bank[i] <- normalised .5 bank[i] + .5 z_i. There is no momentum encoder and one view per image.
+Sources: arXiv:1906.05849 (eq. 8 - 12); https://github.com/HobbitLong/CMC (NCE/);
+https://github.com/fredfyyang/Touch-and-Go (train_CMC_touch.py: K 16384, tau .07, bank momentum .5, 128-d).
+
+N rows of training data, B in a batch, K negatives, D = 128.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvitac.batch import Views
+from mvitac.encoders import EncoderConfig, Projected, build_trunk, num_features
+from mvitac.memory import Bank
+from mvitac.methods.base import Method, MethodConfig
+from mvitac.spec import DataSpec
+
+EPS = 1e-7
+"""Added to both denominators, as the owner's code does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CMCConfig(MethodConfig):
+    """Vision against a memory bank of touch and the other way round, by noise-contrastive estimation (TAG's baseline)."""
+
+    name: ClassVar[str] = "cmc"
+
+    num_negatives: int = 16384
+    """K, rows drawn from the bank for each query (TAG: 16384)."""
+    temperature: float = 0.07
+    """tau (TAG: .07)."""
+    bank_momentum: float = 0.5
+    """Share of its old value that a bank row keeps at an update (TAG: .5)."""
+    softmax: bool = False
+    """InfoNCE over the positive and the K drawn rows instead of NCE (an option of the owner's code)."""
+    out: int = 128
+    """Width of the embeddings (TAG: 128)."""
+
+    def __post_init__(self) -> None:
+        self.check_fields(positive=("temperature",), share=("bank_momentum",), width=("out",))
+        if not 1 <= self.num_negatives <= 1 << 20:
+            raise ValueError(f"num_negatives {self.num_negatives}: give 1 to {1 << 20}")
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> CMC:
+        self.check_pairs(spec)
+        return CMC(self, spec, encoder)
+
+
+def nce(scores: Float[Tensor, "B K+1"], num_rows: int) -> Float[Tensor, ""]:
+    """NCE of normalised ``scores`` (column 0 is the positive's) against even noise over ``num_rows`` rows."""
+    noise = (scores.shape[1] - 1) / num_rows
+    positive, negatives = scores[:, 0], scores[:, 1:]
+    told = torch.log(positive / (positive + noise + EPS))
+    rejected = torch.log(noise / (negatives + noise + EPS)).sum(1)
+    return -(told + rejected).mean()
+
+
+class CMC(Method):
+    """Two towers, two banks."""
+
+    rows: Tensor
+    z_norm: Tensor
+
+    def __init__(self, config: CMCConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.towers = nn.ModuleDict()
+        for modality in spec.modalities:
+            trunk = build_trunk(encoder, spec.channels(modality))
+            self.towers[modality] = Projected(trunk, nn.Linear(num_features(trunk), config.out))
+        self.banks = nn.ModuleDict()
+        self.register_buffer("rows", torch.zeros(0, dtype=torch.int64))
+        self.register_buffer("z_norm", torch.zeros(2))  # Z of vision's and of touch's queries; 0 = not fixed yet
+        self.pending: tuple[Tensor, dict[str, Tensor], Tensor] | None = None
+
+    def prepare(self, rows: Tensor) -> None:
+        self.rows = rows
+        self.banks = nn.ModuleDict({m: Bank(len(rows), self.config.out) for m in self.towers})
+
+    def forward(self, batch: Views) -> dict[str, Tensor]:
+        assert len(self.rows), "prepare(rows) comes first"
+        at = torch.searchsorted(self.rows, batch.rows)
+        drawn = torch.randint(len(self.rows), (len(at), self.config.num_negatives + 1), device=at.device)
+        drawn[:, 0] = at
+        z = {m: F.normalize(tower(batch.images[m][0]).float(), dim=1) for m, tower in self.towers.items()}
+        with torch.autocast(at.device.type, enabled=False):
+            vt, z_vision = self._contrast(z["vision"], "touch", drawn, self.z_norm[0])
+            tv, z_touch = self._contrast(z["touch"], "vision", drawn, self.z_norm[1])
+        self.pending = (at, {m: value.detach() for m, value in z.items()}, torch.stack([z_vision, z_touch]))
+        return {"loss": vt + tv, "vt": vt, "tv": tv}
+
+    def _contrast(self, query: Tensor, bank: str, drawn: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss of ``query`` against the bank of modality ``bank``, and its Z."""
+        # All N scores at once, then the drawn ones: the same numbers as fetching B x K rows, in far less memory.
+        logits = (query @ self.banks[bank].values.T).gather(1, drawn) / self.config.temperature  # type: ignore[union-attr]
+        if self.config.softmax:
+            return F.cross_entropy(logits, torch.zeros_like(drawn[:, 0])), fixed
+        scores = logits.exp()
+        norm = torch.where(fixed > 0, fixed, scores.detach().mean() * len(self.rows))
+        return nce(scores / norm, len(self.rows)), norm
+
+    def after_step(self, progress: float) -> None:
+        assert self.pending is not None, "forward comes first"
+        at, z, norm = self.pending
+        for modality, bank in self.banks.items():
+            bank.follow(at, z[modality], self.config.bank_momentum)  # type: ignore[operator]
+        self.z_norm.copy_(norm)
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return {m: tower.trunk for m, tower in self.towers.items()}  # type: ignore[misc]
+
+    def projectors(self) -> dict[str, nn.Module]:
+        return {m: tower.head for m, tower in self.towers.items()}  # type: ignore[misc]

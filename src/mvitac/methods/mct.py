@@ -1,0 +1,122 @@
+"""Multimodal Contrastive Training (Yuan et al., CVPR 2021, arXiv:2104.12836) for vision and touch: what MViTac started from.
+
+Towers, heads and momentum are MViTac's. What differs, as the MViTac paper tells it (section III-D, III-E): negatives come
+from a queue of keys instead of the batch, and the inter-modal losses are dot products with a margin instead of InfoNCE:
+
+    L_vt = mean over queries and queue of max(0, margin - q.k+ + q.k_i)
+
+No training code is public and the exact margin loss could not be verified here: the hinge, its mean over the queue, and the
+normalised embeddings are our reading. MCT's second modality was text; touch is augmented as an image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvitac.batch import Views
+from mvitac.encoders import EncoderConfig
+from mvitac.losses import queue_nce
+from mvitac.memory import Queue
+from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.mvitac import MViTac, MViTacConfig
+from mvitac.spec import DataSpec
+
+SIDES = ("intra", "inter")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MCTConfig(MethodConfig):
+    """MViTac's towers with a queue and a margin, as in the method it adapts."""
+
+    name: ClassVar[str] = "mct"
+
+    queue: int = 4096
+    """Keys remembered per modality and head; never more than half the training rows (see moco)."""
+    margin: float = 0.2
+    """By how much a pair's cosine must exceed that of a query with a key of the queue; not known for MCT."""
+    temperature: float = 0.07
+    """tau of the intra-modal losses."""
+    lambda_inter: float = 1.0
+    """Weight of the two inter-modal losses."""
+    momentum: float = 0.999
+    """m of the key towers (MoCo, which MCT builds on: .999)."""
+    momentum_end: float | None = None
+    """If given, m rises to this along a half cosine."""
+    out: int = 128
+    """Width of the embeddings."""
+    hidden: int = 512
+    """Hidden width of the 2-layer heads."""
+    head_norm: bool = False
+    """BatchNorm after the heads' first layer."""
+
+    def __post_init__(self) -> None:
+        self.check_fields(positive=("temperature",), weight=("margin", "lambda_inter"))
+        self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
+        if not 1 <= self.queue <= 1 << 24:
+            raise ValueError(f"queue {self.queue}: give 1 to {1 << 24} keys")
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MCT:
+        self.check_pairs(spec)
+        return MCT(self, spec, encoder)
+
+
+def hinge(
+    query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], queue: Float[Tensor, "K D"], margin: float
+) -> Float[Tensor, ""]:
+    """max(0, margin - q.k+ + q.k_i), mean over B queries and K queue entries; normalised embeddings; fp32."""
+    with torch.autocast(query.device.type, enabled=False):
+        query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)
+        return F.relu(margin - (query * key).sum(1, keepdim=True) + query @ queue.T).mean()
+
+
+class MCT(Method):
+    """MViTac's query and key towers, a queue for each head of each modality."""
+
+    views = 2
+
+    def __init__(self, config: MCTConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        same = ("temperature", "lambda_inter", "momentum", "momentum_end", "out", "hidden", "head_norm")
+        self.towers = MViTac(MViTacConfig(**{name: getattr(config, name) for name in same}), spec, encoder)
+        self.queues = nn.ModuleDict()
+        self.pending: dict[str, tuple[Tensor, Tensor]] = {}
+
+    def prepare(self, rows: Tensor) -> None:
+        size = min(self.config.queue, max(1, len(rows) // 2))
+        names = [f"{m}_{side}" for m in self.towers.query for side in SIDES]
+        self.queues = nn.ModuleDict({name: Queue(size, self.config.out) for name in names})
+
+    def forward(self, batch: Views) -> dict[str, Tensor]:
+        assert self.queues, "prepare(rows) comes first"
+        config = self.config
+        query = {m: self.towers.query[m](views[0]) for m, views in batch.images.items()}
+        key = {m: self.towers.key[m](views[1]) for m, views in batch.images.items()}
+        self.pending = key
+        queue: dict[str, Tensor] = {name: q.keys for name, q in self.queues.items()}  # type: ignore[misc]
+        losses = {
+            "vv": queue_nce(query["vision"][0], key["vision"][0], queue["vision_intra"], config.temperature),
+            "tt": queue_nce(query["touch"][0], key["touch"][0], queue["touch_intra"], config.temperature),
+            "vt": hinge(query["vision"][1], key["touch"][1], queue["touch_inter"], config.margin),
+            "tv": hinge(query["touch"][1], key["vision"][1], queue["vision_inter"], config.margin),
+        }
+        loss = losses["vv"] + losses["tt"] + config.lambda_inter * (losses["vt"] + losses["tv"])
+        return {"loss": loss, **losses}
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return self.towers.encoders()
+
+    def projectors(self) -> dict[str, nn.Module]:
+        return self.towers.projectors()
+
+    def after_step(self, progress: float) -> None:
+        for modality, keys in self.pending.items():
+            for side, embedding in zip(SIDES, keys, strict=True):
+                self.queues[f"{modality}_{side}"].push(embedding)  # type: ignore[operator]
+        self.towers.after_step(progress)

@@ -1,0 +1,93 @@
+"""VICReg (Bardes, Ponce, LeCun, ICLR 2022, arXiv:2105.04906) for each modality by itself: no negatives, no second tower.
+
+Embeddings Z, Z' [B, D] of two views, eq. 1-6:
+
+    v(Z) = mean over dimensions of max(0, 1 - sqrt(Var(z_j) + 1e-4))      variance: every dimension stays spread
+    c(Z) = 1/D * sum of squared off-diagonal entries of Cov(Z)            covariance: dimensions say different things
+    s    = mean squared difference of Z and Z'                            invariance: two views of one image agree
+    L    = 25 s + 25 (v(Z) + v(Z')) / 2 + 1 (c(Z) + c(Z'))
+
+The half at the variance term is the authors' code's (https://github.com/facebookresearch/vicreg), not the paper's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvitac.batch import Views
+from mvitac.encoders import EncoderConfig, Projected, build_trunk, num_features
+from mvitac.methods.base import Method, MethodConfig
+from mvitac.spec import DataSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class VICRegConfig(MethodConfig):
+    """Variance, invariance, covariance of two views, per modality."""
+
+    name: ClassVar[str] = "vicreg"
+
+    invariance: float = 25.0
+    """Weight of s (VICReg: 25)."""
+    variance: float = 25.0
+    """Weight of v (VICReg: 25)."""
+    covariance: float = 1.0
+    """Weight of c (VICReg: 1)."""
+    hidden: int = 2048
+    """Width of the three layers of the expander: four times the trunk's, as VICReg's 8192 is four times ResNet-50's."""
+
+    def __post_init__(self) -> None:
+        self.check_fields(weight=("invariance", "variance", "covariance"), width=("hidden",))
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> VICReg:
+        return VICReg(self, spec, encoder)
+
+
+def variance(z: Float[Tensor, "B D"]) -> Float[Tensor, ""]:
+    """v(Z), eq. 1-2."""
+    return F.relu(1 - torch.sqrt(z.var(dim=0) + 1e-4)).mean()
+
+
+def covariance(z: Float[Tensor, "B D"]) -> Float[Tensor, ""]:
+    """c(Z), eq. 3-4."""
+    centred = z - z.mean(0)
+    cov = centred.T @ centred / (len(z) - 1)
+    return (cov.square().sum() - cov.diagonal().square().sum()) / z.shape[1]
+
+
+class VICReg(Method):
+    """A tower with a 3-layer expander per modality."""
+
+    views = 2
+
+    def __init__(self, config: VICRegConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.towers = nn.ModuleDict()
+        for modality in spec.modalities:
+            trunk, hidden = build_trunk(encoder, spec.channels(modality)), config.hidden
+            layers: list[nn.Module] = []
+            for width in (num_features(trunk), hidden):
+                layers += [nn.Linear(width, hidden), nn.BatchNorm1d(hidden), nn.ReLU()]
+            expander = nn.Sequential(*layers, nn.Linear(hidden, hidden, bias=False))
+            self.towers[modality] = Projected(trunk, expander)
+
+    def forward(self, batch: Views) -> dict[str, Tensor]:
+        losses: dict[str, Tensor] = {}
+        for modality, tower in self.towers.items():
+            first, second = (tower(view).float() for view in batch.images[modality])
+            with torch.autocast(first.device.type, enabled=False):
+                s = F.mse_loss(first, second)
+                v = (variance(first) + variance(second)) / 2
+                c = covariance(first) + covariance(second)
+            weights = self.config
+            losses[modality] = weights.invariance * s + weights.variance * v + weights.covariance * c
+        return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return {m: tower.trunk for m, tower in self.towers.items()}  # type: ignore[misc]

@@ -1,0 +1,414 @@
+"""Calandra's shards, built here in the owners' structure: nothing is lost, mixed up or leaked on the way to a table."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from rich.console import Console
+
+from mvitac.datasets.calandra import (
+    AUTHORS_TEST,
+    AUTHORS_TRAIN,
+    NUM_SHARDS,
+    PHASES,
+    Calandra,
+    CalandraConfig,
+    crop_kinect,
+    doubtful,
+    most_attempted,
+    owners_shuffle,
+)
+from mvitac.datasets.packed import PackConfig
+from mvitac.pack import Pack, build
+from mvitac.probe import Session, parts, probe_runs
+from mvitac.recipes import recipe
+from mvitac.tables import markdown, print_summary
+from mvitac.train import make_views, train
+
+GEL, KINECT = (24, 32, 3), (54, 96, 3)
+OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_other_thing")
+
+
+def pixel(shard: int, index: int, sensor: int, phase: int) -> int:
+    """Upper left pixel of an image of the fixture, different for every image of a grasp."""
+    return (shard * 97 + index * 9 + sensor * 3 + phase) % 256
+
+
+def write_shard(
+    folder: Path, shard: int, objects: Sequence[bytes | str | None], *, leak: bool = False, grip: Any = None
+) -> Path:
+    """One shard in the owners' structure: /data/iN with nine images each, name and outcome as attributes of iN.
+
+    ``leak``: the image 'after' shows the outcome and the others do not. ``grip`` replaces the outcome (None = i % 2).
+    """
+    path = folder / f"calandra_corl2017_{shard:03d}.h5"
+    rng = np.random.default_rng(shard)
+    with h5py.File(path, "w") as file:
+        for index, name in enumerate(objects):
+            group = file.create_group(f"data/i{index}")
+            gripping = bool(rng.integers(2)) if leak else bool(index % 2)
+            for s, (sensor, shape) in enumerate((("gelsightA", GEL), ("gelsightB", GEL), ("kinectA_rgb", KINECT))):
+                for p, phase in enumerate(PHASES):
+                    image = rng.integers(0, 256, shape, np.uint8)
+                    image[0, 0] = pixel(shard, index, s, p)
+                    if leak and phase == "after":
+                        image[:] = 220 if gripping else 30
+                    group.create_dataset(f"{sensor}_{phase}", data=image, compression="gzip", compression_opts=1)
+            if name is not None:
+                group.attrs["object_name"] = np.bytes_(name) if isinstance(name, bytes) else name
+            group.attrs["is_gripping"] = np.bool_(gripping) if grip is None else grip
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two shards of 14 and 12 grasps; the second begins with i10 and i9 out of alphabetical order."""
+    path = tmp_path_factory.mktemp("calandra")
+    write_shard(path, 0, [OBJECTS[i % 7].encode() for i in range(14)])
+    write_shard(path, 2, [OBJECTS[i % 6].encode() for i in range(12)])
+    (path / "notes.txt").write_text("not a shard")
+    return path
+
+
+@pytest.fixture(scope="module")
+def packed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    config = CalandraConfig(path=folder, size=24)
+    return build(config.source(), tmp_path_factory.mktemp("packed") / "p", size=24, quiet=True)
+
+
+def test_every_image_is_in_its_place(folder: Path) -> None:
+    source = CalandraConfig(path=folder, split="object").source()
+    assert source.items()[:3] == [f"calandra_corl2017_000.h5 i{i}" for i in range(3)]
+    assert source.items()[14:] == [f"calandra_corl2017_002.h5 i{i}" for i in range(12)]  # i10 after i9, not after i1
+    for item, (shard, index) in ((13, (0, 13)), (25, (2, 11))):
+        samples = source.read(item)
+        assert [sample.columns["phase"] for sample in samples] == list(PHASES)
+        for p, sample in enumerate(samples):
+            assert sample.touch is not None and sample.touch.shape == (24, 32, 6)
+            assert sample.vision is not None and sample.vision.shape == KINECT
+            assert sample.touch[0, 0].tolist() == [pixel(shard, index, 0, p)] * 3 + [pixel(shard, index, 1, p)] * 3
+            assert sample.vision[0, 0].tolist() == [pixel(shard, index, 2, p)] * 3
+            assert sample.columns["outcome"] == index % 2
+            assert sample.columns["touch_group"] == f"{shard:03d}-{index:03d}"
+
+
+def test_every_pixel_is_the_shards(folder: Path) -> None:
+    with h5py.File(folder / "calandra_corl2017_000.h5") as file:
+        raw = {name: file[f"data/i5/{name}"][()] for name in file["data/i5"]}
+    before, during, after = CalandraConfig(path=folder, split="object").source().read(5)
+    for phase, sample in (("before", before), ("during", during), ("after", after)):
+        assert sample.touch is not None and sample.vision is not None
+        assert np.array_equal(sample.touch[:, :, :3], raw[f"gelsightA_{phase}"])
+        assert np.array_equal(sample.touch[:, :, 3:], raw[f"gelsightB_{phase}"])
+        assert np.array_equal(sample.vision, raw[f"kinectA_rgb_{phase}"])
+
+
+def test_the_pack_is_the_shards(packed: Pack) -> None:
+    assert packed.spec.touch_channels == 6
+    assert packed.num == 3 * 24  # two of the 26 grasps are of an object outside the 40
+    assert set(packed.column("split")[packed.column("group") == "soft_zebra"]) == {"test"}
+    assert set(packed.column("split")[packed.column("group") == "onion"]) <= {"train", "val"}
+
+
+def test_two_processes_give_the_bytes_of_one(folder: Path, packed: Pack, tmp_path: Path) -> None:
+    config = CalandraConfig(path=folder, size=24)
+    with_two = build(config.source(), tmp_path / "two", size=24, workers=2, quiet=True)
+    assert with_two.digest == packed.digest
+
+
+def test_the_pack_does_not_depend_on_where_the_shards_lie(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "elsewhere")
+    one, other = CalandraConfig(path=folder), CalandraConfig(path=tmp_path / "elsewhere", workers=3)
+    assert one.source().fingerprint() == other.source().fingerprint()
+    assert one.source().fingerprint() != replace(one, split="object").source().fingerprint()
+
+
+def test_any_subset_of_shards(folder: Path) -> None:
+    source = CalandraConfig(path=folder, shards=(2,), split="object").source()
+    assert len(source.items()) == 12 and all("_002.h5" in name for name in source.items())
+    with pytest.raises(ValueError, match=r"no calandra_corl2017_001\.h5"):
+        CalandraConfig(path=folder, shards=(1,)).source()
+
+
+# -- names ------------------------------------------------------------------------------------------------------------
+
+
+def test_object_names_are_repaired(tmp_path: Path) -> None:
+    write_shard(tmp_path, 0, [b"plastic_duc", b"plastic_duck", b" lemon\0", "lime", b"rubiks_cube", b"hair_dryer_"])
+    source = Calandra(CalandraConfig(path=tmp_path, split="object", repairs=("rubiks_cube=rubics_cube",)))
+    names = [source.read(i)[0].columns["group"] for i in range(6)]
+    assert names == ["plastic_duck", "plastic_duck", "lemon", "lime", "rubics_cube", "hair_dryer_spiky_nozzle"]
+
+
+def test_misspelt_names_are_pointed_out() -> None:
+    counts = Counter({"plastic_duck": 90, "plastic_duk": 3, "ogx_shampoo": 40, "ogx_sham": 2, "lime": 50, "line": 1})
+    assert doubtful(counts) == [("plastic_duk", "plastic_duck"), ("ogx_sham", "ogx_shampoo")]
+    assert not doubtful(Counter([*AUTHORS_TRAIN, *AUTHORS_TEST]))
+
+
+def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:
+    """deepdish wrote through PyTables, whose bool attributes are 8-bit bit fields, not HDF5 enums."""
+    path = write_shard(tmp_path, 0, [b"lemon", b"lime"])
+    with h5py.File(path, "a") as file:
+        attributes = file["data/i0"].attrs
+        del attributes["is_gripping"]
+        space = h5py.h5s.create(h5py.h5s.SCALAR)
+        made = h5py.h5a.create(attributes._id, b"is_gripping", h5py.h5t.NATIVE_B8, space)
+        made.write(np.array(1, np.uint8), mtype=h5py.h5t.NATIVE_B8)
+    assert CalandraConfig(path=tmp_path, split="object").source().read(0)[0].columns["outcome"] == 1
+
+
+# -- damage -----------------------------------------------------------------------------------------------------------
+
+
+def test_damaged_grasps_are_listed_and_the_rest_is_read(tmp_path: Path) -> None:
+    """A missing attribute, a missing image, a chunk that no longer inflates, and a wrong outcome: four reasons."""
+    objects: list[bytes | None] = [b"lemon", None, b"lime", b"potato", b"onion", b"soft_zebra", b"lemon", b"metal_can"]
+    path = write_shard(tmp_path, 0, objects)
+    with h5py.File(path, "a") as file:
+        del file["data/i2/gelsightB_during"]
+        file["data/i4"].attrs["is_gripping"] = np.array([0, 1])
+        chunk = file["data/i3/kinectA_rgb_before"].id.get_chunk_info(0)
+    damaged = bytearray(path.read_bytes())
+    damaged[chunk.byte_offset + 2 : chunk.byte_offset + chunk.size] = b"\xff" * (chunk.size - 2)
+    path.write_bytes(damaged)
+    source = CalandraConfig(path=tmp_path, size=24).source()
+    with pytest.raises(
+        ValueError, match=r"4 of 8 items cannot be read, first calandra_corl2017_000.h5 i1: .*object_name"
+    ):
+        build(source, tmp_path / "strict", size=24, quiet=True)
+    pack = build(source, tmp_path / "lenient", size=24, max_damaged=0.5, quiet=True)
+    assert pack.num == 3 * 4
+    reasons = dict(pack.meta["damaged"])
+    assert "gelsightB_during" in reasons["calandra_corl2017_000.h5 i2"]
+    assert "kinectA_rgb_before" in reasons["calandra_corl2017_000.h5 i3"]
+    assert "is_gripping" in reasons["calandra_corl2017_000.h5 i4"]
+
+
+def test_a_truncated_shard_counts_as_all_its_grasps(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "d")
+    path = tmp_path / "d" / "calandra_corl2017_037.h5"
+    write_shard(tmp_path / "d", 37, [b"lemon"] * 3)
+    path.write_bytes(path.read_bytes()[:-2000])
+    source = CalandraConfig(path=tmp_path / "d", split="object").source()
+    assert len(source.items()) == 26 + 46  # what the owners' last shard holds, not the 3 of this fixture
+    with pytest.raises(ValueError, match=r"calandra_corl2017_037\.h5 cannot be read as HDF5 .*download it again"):
+        source.read(30)
+    (tmp_path / "e").mkdir()
+    shutil.copy(path, tmp_path / "e")
+    with pytest.raises(ValueError, match="no grasp can be read"):
+        CalandraConfig(path=tmp_path / "e").source()
+
+
+def test_gels_of_two_sizes_are_refused(tmp_path: Path) -> None:
+    path = write_shard(tmp_path, 0, [b"lemon", b"lime"])
+    with h5py.File(path, "a") as file:
+        del file["data/i0/gelsightB_before"]
+        file["data/i0/gelsightB_before"] = np.zeros((12, 16, 3), np.uint8)
+        del file["data/i1/gelsightB_before"]
+        file["data/i1/gelsightB_before"] = np.zeros((24, 32, 3), np.float32)
+    source = CalandraConfig(path=tmp_path, split="object").source()
+    with pytest.raises(ValueError, match="stacked sensors need one size"):
+        source.read(0)
+    with pytest.raises(ValueError, match="float32"):
+        source.read(1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"split": "random"}, "unknown split 'random'"),
+        ({"shards": (38,)}, "numbers from 0 to 37"),
+        ({"shards": (1, 1)}, "name each once"),
+        ({"phases": ()}, "phases: give at least one"),
+        ({"phases": ("before", "during"), "ask": ("after",)}, "phases leaves 'after' out"),
+        ({"val_share": 1.0}, "val_share"),
+        ({"split_seed": -1}, "split_seed"),
+        ({"repairs": ("lemon",)}, "written=right"),
+    ],
+)
+def test_impossible_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CalandraConfig(**options)
+
+
+def test_missing_data_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="is no folder"):
+        CalandraConfig(path=tmp_path / "nowhere").source()
+    with pytest.raises(ValueError, match="OPARA"):
+        CalandraConfig(path=tmp_path).source()
+    write_shard(tmp_path, 0, [b"some_other_thing"])
+    with pytest.raises(ValueError, match="none of the authors' 40"):
+        CalandraConfig(path=tmp_path).source()
+
+
+# -- splits -----------------------------------------------------------------------------------------------------------
+
+
+def splits_of(config: CalandraConfig) -> dict[str, str]:
+    source = config.source()
+    return {c["group"]: c["split"] for i in range(len(source.items())) for c in [source.read(i)[0].columns]}
+
+
+@pytest.fixture(scope="module")
+def forty_four(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("objects")
+    others = ["some_other_thing", "hair_dryer_", "beans_in_pa", "yellow_bulb"]
+    write_shard(path, 0, [name.encode() for name in (*AUTHORS_TRAIN, *AUTHORS_TEST, *others)])
+    return path
+
+
+def test_the_authors_split(forty_four: Path) -> None:
+    splits = splits_of(CalandraConfig(path=forty_four))
+    assert {name for name, split in splits.items() if split == "test"} == set(AUTHORS_TEST)
+    assert {name for name, split in splits.items() if split in ("train", "val")} == set(AUTHORS_TRAIN)
+    assert sum(split == "val" for split in splits.values()) == round(0.15 * 32)
+    without_val = splits_of(CalandraConfig(path=forty_four, val_share=0.0))
+    assert Counter(without_val.values()) == {"train": 32, "test": 8}
+    more = splits_of(CalandraConfig(path=forty_four, extra_objects=True))
+    assert more["hair_dryer_spiky_nozzle"] == "unlabelled" and Counter(more.values())["unlabelled"] == 4
+
+
+def test_the_owners_split(forty_four: Path) -> None:
+    splits = splits_of(CalandraConfig(path=forty_four, split="object", val_share=0.0))
+    assert Counter(splits.values()) == {"train": 33, "test": 11}
+    assert splits_of(CalandraConfig(path=forty_four, split="object", split_seed=1, val_share=0.0)) != splits
+    carved = splits_of(CalandraConfig(path=forty_four, split="object"))
+    assert Counter(carved.values()) == {"train": 28, "val": 5, "test": 11}
+    assert {n for n, s in carved.items() if s == "test"} == {n for n, s in splits.items() if s == "test"}
+
+
+def test_the_owners_order_is_python_2s_shuffle() -> None:
+    """random.Random's own floats are those of Python 2; its shuffle(x, random) was j = int(random() * (i + 1))."""
+    names = [f"o{i:02d}" for i in range(20)]
+    expected, generator = list(names), random.Random(3)
+    floats = [generator.random() for _ in range(19)]
+    for i, value in zip(range(19, 0, -1), floats, strict=True):
+        j = int(value * (i + 1))
+        expected[i], expected[j] = expected[j], expected[i]
+    assert owners_shuffle(names[::-1], 3) == expected
+    assert sorted(expected) == names != expected
+
+
+def test_leave_one_object_out(folder: Path) -> None:
+    names = sorted(OBJECTS)
+    for k, name in enumerate(names):
+        splits = splits_of(CalandraConfig(path=folder, split=f"fold:{k}"))
+        assert [n for n, s in splits.items() if s == "test"] == [name]
+        assert splits == splits_of(CalandraConfig(path=folder, split=f"fold:{name}"))
+    with pytest.raises(ValueError, match="give 0 to 6"):
+        CalandraConfig(path=folder, split="fold:7").source()
+
+
+def test_published_counts(tmp_path: Path) -> None:
+    """Two objects of the list tried once, 38 twice, and two others three times: 38 of the list are among the 40."""
+    listed = [name.encode() for name in (*AUTHORS_TRAIN, *AUTHORS_TEST)]
+    write_shard(tmp_path, 5, [*listed, *listed[:38], *[b"froot_loops", b"pig"] * 3])
+    source = Calandra(CalandraConfig(path=tmp_path))
+    assert set(most_attempted(source.counts)) == {n.decode() for n in listed[:38]} | {"froot_loops", "pig"}
+    counts = {count.what: count for count in source.expected()}
+    assert counts["shards"].published == NUM_SHARDS and counts["shards"].found == 1
+    assert "000 001" in counts["shards"].detail and "005" not in counts["shards"].detail
+    assert counts["grasps that can be read"].found == 84
+    found = counts["objects of the authors' list among the 40 most attempted"]
+    assert (found.published, found.found) == (40, 38)
+    assert "soft_beer_bottle_holder" in found.detail and "froot_loops" in found.detail
+
+
+def test_the_list_has_forty_objects() -> None:
+    assert len(set(AUTHORS_TRAIN)) == 32 and len(set(AUTHORS_TEST)) == 8 and not set(AUTHORS_TRAIN) & set(AUTHORS_TEST)
+
+
+# -- images -----------------------------------------------------------------------------------------------------------
+
+
+def test_kinect_crop_is_the_owners(folder: Path) -> None:
+    """Bounds by hand: of 540 rows 34 to 327, of 960 columns 129 to 936."""
+    image = np.zeros((540, 960, 3), np.uint8)
+    image[34:327, 129:936] = 1
+    assert crop_kinect(image).shape == (293, 807, 3) and crop_kinect(image).all()
+    source = CalandraConfig(path=folder, split="object", kinect_crop=True).source()
+    vision = source.read(0)[0].vision
+    assert vision is not None and vision.shape == (29, 81, 3)
+
+
+# -- 'after' ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def leaking(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """240 grasps of 8 objects, in which the image 'after' gives the outcome away and the others are noise."""
+    path = tmp_path_factory.mktemp("leaking")
+    objects = [*AUTHORS_TRAIN[:6], *AUTHORS_TEST[:2]]
+    write_shard(path, 0, [objects[i % 8].encode() for i in range(240)], leak=True)
+    return path
+
+
+def leaking_pack(leaking: Path, out: Path, **options: Any) -> Pack:
+    config = CalandraConfig(path=leaking, size=32, **options)
+    return build(config.source(), out, size=32, quiet=True)
+
+
+def test_after_has_no_label(leaking: Path, tmp_path: Path) -> None:
+    pack = leaking_pack(leaking, tmp_path / "p")
+    assert [task.name for task in pack.spec.tasks] == ["success"]
+    labelled = pack.column("label_success") >= 0
+    assert set(pack.column("phase")[labelled]) == {"during"}
+    rows = parts(pack, pack.spec.tasks[0])
+    for part in (rows.train, rows.val, rows.test):
+        assert len(part) and set(pack.column("phase")[part]) == {"during"}
+
+
+def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leaking: Path, tmp_path: Path) -> None:
+    """Same pre-training, same probes: what 'during' does not show is at chance, what 'after' shows is not."""
+    shown = {}
+    for ask in (("during",), ("after",)):
+        pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)
+        run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=2, eval_every=1)
+        result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], Session(probes=("linear", "knn")))
+        console = Console(record=True, width=120, file=(tmp_path / "out.txt").open("w"))
+        print_summary(result, console)
+        tables = console.export_text() + markdown(result)
+        console.file.close()
+        log = (tmp_path / f"run-{ask[0]}" / "log.jsonl").read_text()
+        shown[ask[0]] = result["summary"], tables, log
+    honest, leaked = shown["during"], shown["after"]
+    assert set(honest[0]) == {"success"} and "after" not in honest[1] and "after" not in honest[2]
+    assert honest[0]["success"]["touch"]["pixels"]["mean"] < 0.75
+    assert leaked[0]["success_after_leaks"]["touch"]["pixels"]["mean"] == 1.0
+    assert leaked[1].count("success_after_leaks") == 2 and "success_after_leaks" in leaked[2]
+
+
+def test_the_authors_protocol_is_named_too(leaking: Path, tmp_path: Path) -> None:
+    pack = leaking_pack(leaking, tmp_path / "p", ask=("during", "authors"))
+    task = pack.spec.tasks[1]
+    rows = parts(pack, task)
+    assert "after" in task.name
+    assert set(pack.column("phase")[rows.train]) == set(PHASES)
+    assert set(pack.column("phase")[rows.val]) == set(pack.column("phase")[rows.test]) == {"during"}
+
+
+def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
+    """Simulated grasps carry the outcome in all three phases: neither the supervised baseline nor kNN may see them."""
+    import torch
+
+    from mvitac.datasets.simulated import GraspsConfig
+
+    pack = build(GraspsConfig(num=24, size=16).source(), tmp_path / "p", size=16, quiet=True)
+    about = pack.column("phase") == "during"
+    assert (pack.column("label_success") >= 0).all()
+    assert np.array_equal(pack.labels("success") >= 0, about)
+    run = recipe("smoke", PackConfig(path=pack.path))
+    rows = pack.rows("train")
+    run = replace(run, augment=replace(run.augment, size=16))
+    views = make_views(run, pack, rows, 1, torch.Generator(), torch.device("cpu"))
+    assert np.array_equal(views.labels["success"].numpy() >= 0, about[rows])

@@ -1,0 +1,234 @@
+"""An export is the trained model, or there is none: parity on real inputs, and every way to get it wrong is named."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy import toy_pack
+
+import mvitac
+from mvitac import graph as graphs
+from mvitac.cli import main
+from mvitac.datasets.packed import PackConfig
+from mvitac.export import Tolerance, export, parity, reference
+from mvitac.graph import Graph
+from mvitac.model import Model
+from mvitac.pack import Pack
+from mvitac.publish import with_readouts
+from mvitac.recipes import recipe
+from mvitac.runtime import Engine, cosines
+from mvitac.train import train
+
+EXACT = Tolerance(min_cosine=0.9999, accuracy_loss=0.0)
+
+
+@pytest.fixture(scope="module")
+def model(artifact: Path) -> Model:
+    return mvitac.load(artifact)
+
+
+def run_graph(graph: Graph):
+    def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        with torch.no_grad():
+            return [x.numpy() for x in graph(*(torch.from_numpy(a) for a in arrays))]
+
+    return call
+
+
+def check(model: Model, graph: Graph, pack: Pack, tolerance: Tolerance = EXACT) -> dict:
+    rows = pack.rows("test")
+    return parity(graph, run_graph(graph), model, pack, rows, reference(model, graph, pack, rows), tolerance)
+
+
+@pytest.fixture(scope="module")
+def onnx(model: Model, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("export") / "onnx"
+    export(model, pack, out, kind="onnx")
+    return out
+
+
+@pytest.fixture(scope="module")
+def openvino(model: Model, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("export") / "openvino"
+    export(model, pack, out, kind="openvino", int8=True, tolerance=Tolerance(min_cosine=0.9, accuracy_loss=10))
+    return out
+
+
+@pytest.mark.parametrize("stored", [32, 45, 72])
+def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model: Model) -> None:
+    from mvitac.augment import plain_view
+
+    images = torch.randint(
+        0, 256, (3, 3, stored, stored), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+    )
+    was, model.stored = model.stored, stored
+    try:
+        found = Graph(model).view(images.permute(0, 2, 3, 1))
+    finally:
+        model.stored = was
+    torch.testing.assert_close(found, plain_view(images, 32), atol=1e-4, rtol=0)
+
+
+def test_an_export_is_the_trained_model(model: Model, onnx: Path, pack: Pack) -> None:
+    """Whatever the batch, and with embed() and predict() on the other side."""
+    engine = Engine(onnx, threads=1)
+    for num in (1, 7):
+        images = {m: pack.images[m][10 : 10 + num] for m in ("vision", "touch")}
+        found = engine(**images)
+        features, shared, said = model.embed(**images), model.embed(**images, shared=True), model.predict(**images)
+        for m in images:
+            np.testing.assert_allclose(found[f"embedding_{m}"], features[m].numpy(), atol=1e-3, rtol=1e-3)
+            np.testing.assert_allclose(found[f"shared_{m}"], shared[m].numpy(), atol=1e-3)
+        for task, probabilities in said.items():
+            np.testing.assert_allclose(found[f"probability_{task}"], probabilities.numpy(), atol=1e-3)
+            assert tuple(engine.classes[task]) == model.classes[task]
+
+
+def test_int8_reports_what_it_keeps_and_runs(openvino: Path, pack: Pack, model: Model) -> None:
+    meta = json.loads((openvino / "export.json").read_text())
+    report = meta["report"]
+    assert meta["int8"] and report["num_rows"] == len(pack.rows("test"))
+    assert 0.9 < report["cosine"]["embedding_touch"]["min"] < 0.99999  # int8 leaves its mark
+    assert report["size_mb"] > 0 and 0 < report["latency_ms"]["p50"] <= report["latency_ms"]["p99"]
+    images = {m: pack.images[m][:5] for m in ("vision", "touch")}
+    found = Engine(openvino, threads=1)(**images)
+    assert cosines(found["embedding_touch"], model.embed(**images)["touch"].numpy()).min() > 0.9
+
+
+def test_torch_export_of_touch_alone(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+    """From a run: the probes are fitted on the way; one modality: its own probe answers."""
+    out = tmp_path / "touch"
+    command = ["export", str(smoke_run), "--format", "torch", "--modality", "touch", "--out", str(out)]
+    assert main([*command, "--threads", "1"]) == 0
+    model = with_readouts(mvitac.load(smoke_run), pack)
+    images = pack.images["touch"][:3]
+    found = Engine(out)(touch=images)
+    np.testing.assert_allclose(found["probability_pattern"], model.predict(touch=images)["pattern"], atol=1e-4)
+    assert main([*command, "--threads", "1"]) == 2  # it is already there
+
+
+def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:
+    pack = toy_pack(tmp_path / "p", touch_channels=6, num=90)
+    run = train(recipe("smoke", PackConfig(path=pack.path)), tmp_path / "r", quiet=True)
+    model = with_readouts(mvitac.load(run))
+    assert check(model, Graph(model), pack)["cosine"]["embedding_touch"]["min"] > 0.9999
+
+
+def test_a_wrong_normalisation_is_named(model: Model, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    check(model, Graph(model), pack)
+    for mean, std, message in (
+        ((0.5,) * 3, (0.5,) * 3, r"normalises to \[-1, 1\]"),
+        ((0.0,) * 3, (1.0,) * 3, "does not normalise by the ImageNet mean"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(graphs, "IMAGENET_MEAN", mean)
+            patch.setattr(graphs, "IMAGENET_STD", std)
+            wrong = Graph(model)
+        with pytest.raises(ValueError, match=f"not the trained model: embedding_vision has cosine .*{message}"):
+            check(model, wrong, pack)
+
+
+def test_bgr_input_is_named(model: Model, tmp_path: Path) -> None:
+    """A pack of strong colours, so that swapping red and blue shows; the engine is fed as OpenCV would feed it."""
+    rng = np.random.default_rng(0)
+
+    pack = toy_pack(tmp_path / "p")
+    images = rng.integers(0, 256, (pack.num, 4, 4, 3)).repeat(8, 1).repeat(8, 2).astype(np.uint8)
+    images[..., 0] //= 8
+    pack.images = dict.fromkeys(("vision", "touch"), images)
+    graph, rows = Graph(model), pack.rows("test")
+    call = run_graph(graph)
+    wanted = reference(model, graph, pack, rows)
+    parity(graph, call, model, pack, rows, wanted, EXACT)
+
+    def bgr(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        return call([np.ascontiguousarray(a[..., ::-1]) for a in arrays])
+
+    with pytest.raises(ValueError, match="its input is BGR, the model wants RGB"):
+        parity(graph, bgr, model, pack, rows, wanted, EXACT)
+
+
+def test_corrupted_weights_in_the_graph_leave_no_export(
+    model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Same weights for the reference, other ones in what is written: parity stops it and the folder is not made."""
+    real = Graph.forward
+
+    def corrupted(self: Graph, *images: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        found = real(self, *images)
+        return (found[0] * torch.linspace(-1, 1, found[0].shape[1]), *found[1:])
+
+    monkeypatch.setattr(Graph, "forward", corrupted)
+    with pytest.raises(ValueError, match="not the trained model"):
+        export(model, pack, tmp_path / "x", kind="torch")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lost_accuracy_stops_an_export(model: Model, pack: Pack) -> None:
+    graph, rows = Graph(model), pack.rows("test")
+    wanted, call = reference(model, graph, pack, rows), run_graph(graph)
+    at = graph.outputs.index("probability_pattern")
+
+    def worse(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        found = call(arrays)
+        found[at] = np.roll(found[at], 1, axis=1)
+        return found
+
+    with pytest.raises(ValueError, match="points of accuracy on pattern"):
+        parity(graph, worse, model, pack, rows, wanted, EXACT)
+
+
+@pytest.mark.parametrize("name", ["model.onnx", "check.safetensors", "export.json"])
+def test_a_changed_byte_of_an_export_is_found(onnx: Path, tmp_path: Path, name: str) -> None:
+    import shutil
+
+    copy = shutil.copytree(onnx, tmp_path / "copy")
+    data = bytearray((copy / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (copy / name).write_bytes(data)
+    with pytest.raises(ValueError, match=r"does not match its digest|not valid JSON"):
+        Engine(copy)
+
+
+def test_an_engine_that_computes_otherwise_is_refused_on_the_spot(onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The few real inputs that travel with an export are run again where it is opened."""
+    from mvitac import runtime
+
+    real = runtime.open_engine
+    monkeypatch.setattr(runtime, "open_engine", lambda *a, **k: lambda arrays: real(*a, **k)([255 - x for x in arrays]))
+    with pytest.raises(ValueError, match="on this machine embedding_vision has cosine"):
+        Engine(onnx)
+
+
+def test_foreign_inputs_are_named(onnx: Path, pack: Pack) -> None:
+    engine = Engine(onnx, threads=1)
+    one = pack.images["touch"][:1]
+    with pytest.raises(ValueError, match="takes vision, touch; got touch"):
+        engine(touch=one)
+    with pytest.raises(ValueError, match="touch: expected uint8"):
+        engine(vision=one, touch=one.astype(np.float32))
+    with pytest.raises(ValueError, match="vision: expected uint8"):
+        engine(vision=one[:, :16], touch=one)
+
+
+def test_impossible_requests_are_refused_first(model: Model, pack: Pack, tmp_path: Path) -> None:
+    for options, message in (
+        ({"kind": "torch", "int8": True}, "--int8 is for onnx and openvino"),
+        ({"kind": "onnx", "precision": "bf16"}, "--format openvino"),
+        ({"modalities": ("smell",)}, "no smell encoder"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            export(model, pack, tmp_path / "x", **options)
+    with pytest.raises(ValueError, match="cannot check this model"):
+        export(model, toy_pack(tmp_path / "p", size=40), tmp_path / "x")
+
+
+def test_running_an_onnx_export_needs_no_torch() -> None:
+    code = "import sys, mvitac.runtime; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"

@@ -1,0 +1,98 @@
+"""Rows that lack a modality: stored and marked, never trained on as a pair, never probed on what they lack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy import Toy
+
+from mvitac import probe as probe_module
+from mvitac import train as train_module
+from mvitac.datasets.packed import PackConfig
+from mvitac.pack import Pack, Sample, build
+from mvitac.probe import Session, parts, probe_runs
+from mvitac.recipes import recipe
+from mvitac.train import partners, train
+
+
+@dataclass
+class Holes(Toy):
+    """Every fifth item without touch, every seventh without vision."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        has = {"vision": item % 7 != 3, "touch": item % 5 != 1}
+        columns = {**sample.columns, **{f"has_{m}": present for m, present in has.items()}}
+        images = {m: getattr(sample, m) if has[m] else None for m in has}
+        return [Sample(columns=columns, **images)]
+
+
+@pytest.fixture(scope="module")
+def holes(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Holes(), tmp_path_factory.mktemp("holes") / "pack", size=32, quiet=True)
+
+
+def test_holes_are_zeros_and_marked(holes: Pack) -> None:
+    items = np.arange(120)
+    for modality, lacking in (("vision", items % 7 == 3), ("touch", items % 5 == 1)):
+        assert (holes.has(modality) == ~lacking).all()
+        assert ((holes.images[modality].reshape(120, -1) == 0).all(1) == lacking).all()
+    both = set(holes.rows("train", having=("vision", "touch")))
+    assert both < set(holes.rows("train", having=("touch",))) < set(holes.rows("train"))
+
+
+def test_a_pack_without_holes_has_everything(pack: Pack) -> None:
+    assert pack.has("vision").all() and pack.has("touch").all()
+    assert "has_touch" not in pack.table.column_names
+
+
+@pytest.mark.parametrize("column", [True, None])
+def test_an_image_must_agree_with_its_mark(tmp_path: Path, column: bool | None) -> None:
+    class Lying(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            mark = {} if column is None else {"has_touch": column}
+            return [replace(sample, touch=None if item == 3 else sample.touch, columns={**sample.columns, **mark})]
+
+    with pytest.raises(ValueError, match="first item 3: no touch image, against its column has_touch"):
+        build(Lying(), tmp_path / "p", size=32, quiet=True)
+
+
+def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    real = train_module.make_views
+    monkeypatch.setattr(
+        train_module, "make_views", lambda run, pack, rows, *rest: seen.extend(rows) or real(run, pack, rows, *rest)
+    )
+    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=4, eval_every=4, positives="same-touch")
+    train(run, tmp_path / "run", quiet=True)
+    whole = holes.has("vision") & holes.has("touch")
+    assert whole[seen].all()
+    assert set(seen) <= set(holes.rows("train", "unlabelled"))
+
+    found = partners(holes, np.array(seen), torch.Generator().manual_seed(0))
+    assert whole[found].all()
+
+
+def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
+    train(run, tmp_path / "run", quiet=True)
+    asked: dict[str, set[int]] = {"vision": set(), "touch": set()}
+    real = probe_module.features
+
+    def features(model: object, pack: Pack, modality: str, rows: np.ndarray) -> np.ndarray:
+        asked[modality] |= set(rows.tolist())
+        return real(model, pack, modality, rows)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(probe_module, "features", features)
+    result = probe_runs([tmp_path / "run"], Session(tasks=("pattern",)), holes)
+    for modality, rows in asked.items():
+        assert rows and holes.has(modality)[sorted(rows)].all()
+    task = holes.spec.tasks[0]
+    num = {r["modality"]: r["num_test"] for r in result["records"] if r["source"] == "mvitac"}
+    assert num == {m: len(parts(holes, task, m).test) for m in ("vision", "touch", "both")}
+    assert num["both"] < min(num["vision"], num["touch"])
