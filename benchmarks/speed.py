@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed [--quick] [--device cpu|cuda] [--json FILE]     (make bench)
 
-Sections: the step on resident random tensors; the input; both together, end to end; gradient caching. Every speed stands
+Sections: the step on resident random tensors; the input; both together, end to end; the probe; gradient caching. Every speed stands
 as a share of the bare networks (`benchmarks/floor.py`, same precision) and of the machine's measured arithmetic.
 On several GPUs: torchrun --nproc-per-node N -m benchmarks.scaling
 """
@@ -35,6 +35,8 @@ from mvitac.allocator import keep_freed_memory
 from mvitac.batch import Views
 from mvitac.distributed import World
 from mvitac.encoders import SCRATCH, EncoderConfig
+from mvitac.heads import EPOCHS, train_heads
+from mvitac.model import Model, pack_features
 from mvitac.pack import Pack, Sample, Source, build
 from mvitac.recipes import recipe
 from mvitac.record import provenance, write_json
@@ -203,6 +205,28 @@ def measure_caching(scale: Scale, device: torch.device, plain: int, large: int, 
     return rows
 
 
+def measure_probe(scale: Scale, pack: Pack, device: torch.device, num: int = 5000) -> dict[str, Any]:
+    """Seconds of 5 seeds x 3 tasks x 3 modalities of the paper's probe on ``num`` pairs: features once, heads together;
+    and encoding every epoch anew for every head, as the field's code does (one pass is measured, the rest multiplied)."""
+    seeds, classes = list(range(5)), [20, 2, 2]
+    run = our_run(scale, "fp32")
+    model = Model(run.method.build(pack.spec, run.encoder).to(device), run, pack.spec, pack.size)
+    rows = pack.rows("train")[:64]
+    one = clock(lambda: [pack_features(model, pack, m, rows) for m in pack.spec.modalities], device) * num / len(rows)
+    labels = torch.stack([torch.randint(k, (num,)) for k in classes])
+    heads = 0.0
+    for width in (512, 512, 1024):
+        features = torch.randn(len(seeds), num, width, device=device)
+        heads += clock(lambda f=features: train_heads(f, labels, classes, seeds), device)  # type: ignore[misc]
+    again = EPOCHS * one * len(seeds) * len(classes) * 2  # touch, vision, and both for each task of each seed
+    once = one * len(seeds) + heads
+    return {
+        "encoding every epoch": {"seconds": again, "times": 1.0},
+        "features once, heads together": {"seconds": once, "times": again / once},
+        "of which the heads": {"seconds": heads},
+    }
+
+
 def show(console: Console, title: str, rows: dict[str, dict[str, float]]) -> None:
     table = Table(title=title, title_justify="left")
     names = list(dict.fromkeys(itertools.chain.from_iterable(rows.values())))
@@ -220,7 +244,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, nargs="+", help="default 32 on a CPU, 256 and 1024 on a GPU")
     parser.add_argument("--rounds", type=int)
     parser.add_argument("--workers", type=int, default=0, help="of the typical DataLoader")
-    parser.add_argument("--sections", nargs="+", default=["step", "input", "whole", "caching"])
+    parser.add_argument("--sections", nargs="+", default=["step", "input", "whole", "probe", "caching"])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     device, console = torch.device(options.device), Console()
@@ -256,6 +280,9 @@ def main() -> None:
                 show(console, "end to end", part["whole"]["variants"])
                 hours = part["whole"]["hours_for_the_papers_pretraining"]
                 console.print(f"the paper's pre-training (92k pairs x 240 epochs) at this speed: {hours:.1f} h")
+        if "probe" in options.sections:
+            result["probe"] = measure_probe(scale, pack, device, 500 if options.quick else 5000)
+            show(console, "the paper's probe: 5 seeds x 3 tasks x 3 modalities", result["probe"])
     if "caching" in options.sections:
         sizes = (64, 1024, 32) if cuda else (16, 64, 8) if options.quick else (64, 256, 32)
         result["caching"] = measure_caching(scale, device, *sizes)
