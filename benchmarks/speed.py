@@ -2,8 +2,9 @@
 
     python -m benchmarks.speed [--quick] [--device cpu|cuda] [--json FILE]     (make bench)
 
-Sections: the step on resident random tensors; the input; both together, end to end; the probe; gradient caching. Every speed stands
-as a share of the bare networks (`benchmarks/floor.py`, same precision) and of the machine's measured arithmetic.
+Sections: the step on resident random tensors; the input; both together, end to end; the probe; gradient caching.
+Every speed stands as a share of the bare networks (`benchmarks/floor.py`, same precision) and of the machine's measured
+arithmetic.
 On several GPUs: torchrun --nproc-per-node N -m benchmarks.scaling
 """
 
