@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench docs pins clean
+.PHONY: demo test check bench difficulty docs pins clean
 
 .venv/ready: constraints.txt pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -26,7 +26,10 @@ pins:  ## write constraints.txt anew: needs uv on the PATH
 	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-header --no-annotate --output-file constraints.txt
 
-bench: .venv/ready  ## the simulator's difficulty rule, measured anew (long)
+bench: .venv/ready  ## speed against the bare networks and the typical research code (docs/speed.md)
+	$(BIN)/python -m benchmarks.speed
+
+difficulty: .venv/ready  ## the simulator's difficulty rule, measured anew (long)
 	$(BIN)/python -m benchmarks.difficulty materials
 
 docs: .venv/ready  ## draw the pictures of the docs again

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from toy import toy_pack
 
 from mvitac import probe
 from mvitac.datasets.packed import PackConfig
+from mvitac.heads import train_heads
 from mvitac.model import fresh
 from mvitac.pack import Pack
 from mvitac.probe import Session, cross_modal, interval, parts, probe_features, probe_runs, summarise
@@ -216,3 +218,34 @@ def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) 
     path = train(run, tmp_path / "r", quiet=True)
     with pytest.raises(ValueError, match="trained on different data"):
         probe_runs([runs[0], path], Session())
+
+
+def test_heads_trained_together_are_the_heads_trained_alone() -> None:
+    """Three tasks on the features of two models at once: the weights of each trained by itself."""
+    rng = np.random.default_rng(0)
+    features = torch.from_numpy(rng.normal(size=(2, 600, 12)).astype(np.float32))
+    classes = [3, 2, 4]
+    labels = torch.from_numpy(np.stack([rng.integers(0, k, 600) for k in classes]))
+    together = train_heads(features, labels, classes, [5, 6])
+    for model, seed in enumerate((5, 6)):
+        alone = train_heads(features[model : model + 1], labels, classes, [seed])[0]
+        for a, b in zip(together[model], alone, strict=True):
+            torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
+    single = train_heads(features[:1], labels[1:2], classes[1:2], [5])[0][0]  # other tasks beside it change nothing
+    torch.testing.assert_close(together[0][1], single, atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(together[0][0], together[1][0], atol=1e-2)
+
+
+def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
+    """The records are those of each task probed on its own."""
+    x = features_that_know(pack, 0)
+    tasks = list(pack.spec.tasks)
+    order = np.concatenate([*dataclasses.astuple(parts(pack, tasks[0]))])
+
+    def matrix(modality: str, rows: np.ndarray) -> np.ndarray:
+        return x[[int(np.flatnonzero(order == row)[0]) for row in rows]]
+
+    records = probe._probe_all(matrix, pack, tasks, ["touch"], ["paper"], 3)
+    for task, record in zip(tasks, records, strict=True):
+        alone = probe_features(x, pack, task, parts(pack, task), "paper", 3)
+        assert record["accuracy"] == alone["accuracy"] and record["confusion"] == alone["confusion"]

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.distributed.nn.functional import all_reduce
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,21 @@ class SyncedBatchNorm(nn.BatchNorm2d):
         return (out + self.bias.view(shape) if self.affine else out).to(input.dtype)
 
 
+class _Sum(torch.autograd.Function):
+    """All-reduce by sum, whose gradient is all-reduced too."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        total = value.clone()
+        dist.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        total = gradients[0].clone()
+        dist.all_reduce(total)
+        return total
+
+
 def _sum_over_processes(value: Tensor) -> Tensor:
-    """All-reduce whose gradient is all-reduced too."""
-    return all_reduce(value)  # type: ignore[no-any-return]
+    return _Sum.apply(value)  # type: ignore[return-value]

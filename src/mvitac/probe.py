@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from mvitac import diagnostics
 from mvitac.encoders import SCRATCH, build_trunk
+from mvitac.heads import train_heads
 from mvitac.model import Model, fresh, load, pack_features
 from mvitac.pack import Pack
 from mvitac.record import cache_dir, check_place, digest, write_atomic, write_json
@@ -145,22 +147,20 @@ def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarra
 
 
 def fit_paper(x: np.ndarray, y: np.ndarray, num_classes: int, seed: int) -> Any:
-    """The paper's probe (appendix A): dropout .2 and one linear layer, Adam 1e-4 (eps 1e-7), 60 epochs, batch 256."""
-    generator = torch.Generator().manual_seed(seed)
-    inputs, labels = torch.from_numpy(x).float(), torch.from_numpy(y).long()
-    bound = inputs.shape[1] ** -0.5
-    weight = torch.empty(num_classes, inputs.shape[1]).uniform_(-bound, bound, generator=generator).requires_grad_()
-    bias = torch.zeros(num_classes, requires_grad=True)
-    optimiser = torch.optim.Adam([weight, bias], lr=1e-4, eps=1e-7)
-    for _ in range(60):
-        for batch in torch.randperm(len(inputs), generator=generator).split(256):
-            keep = torch.rand(len(batch), inputs.shape[1], generator=generator) >= 0.2
-            loss = F.cross_entropy(F.linear(inputs[batch] * keep / 0.8, weight, bias), labels[batch])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-    w, b = weight.detach().numpy(), bias.detach().numpy()
-    return lambda z: np.asarray(torch.softmax(torch.from_numpy(z @ w.T + b), 1))
+    """The paper's probe (``heads.py``) of one task."""
+    return fit_papers(x, [y], [num_classes], seed)[0]
+
+
+def fit_papers(x: np.ndarray, ys: list[np.ndarray], num_classes: list[int], seed: int) -> list[Any]:
+    """The paper's probes of several tasks on the same rows, trained together: a function to class probabilities each."""
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    labels = torch.from_numpy(np.stack(ys)).long()
+    heads = train_heads(torch.from_numpy(x).float()[None].to(device), labels, num_classes, [seed])[0]
+
+    def predict(z: np.ndarray, head: np.ndarray) -> np.ndarray:
+        return np.asarray(torch.softmax(torch.from_numpy(z @ head[:, :-1].T + head[:, -1]), 1))
+
+    return [partial(predict, head=head.numpy()) for head in heads]
 
 
 def fit_knn(x: np.ndarray, y: np.ndarray, num_classes: int, k: int = 20) -> Any:
@@ -204,8 +204,10 @@ def spread_out(probabilities: np.ndarray, seen: np.ndarray, num_classes: int) ->
     return full
 
 
-def probe_features(x: np.ndarray, pack: Pack, task: Task, rows: Parts, kind: str, seed: int) -> dict[str, Any]:
-    """One probe of ``kind`` on features ``x`` [train + val + test rows in this order, D]."""
+def probe_features(
+    x: np.ndarray, pack: Pack, task: Task, rows: Parts, kind: str, seed: int, paper: Any = None
+) -> dict[str, Any]:
+    """One probe of ``kind`` on features ``x`` [train + val + test rows in this order, D]; ``paper`` is a trained one."""
     labels = pack.column(f"label_{task.name}").astype(int)
     num_train, num_val, num = len(rows.train), len(rows.val), len(task.classes)
     y, y_val = labels[rows.train], labels[rows.val]
@@ -218,7 +220,7 @@ def probe_features(x: np.ndarray, pack: Pack, task: Task, rows: Parts, kind: str
         predict, extra["C"] = fit_linear(learn, y, choose, y_val)
         probabilities = spread_out(predict(test), np.unique(y_whole), num)
     elif kind == "paper":
-        probabilities = fit_paper(whole, y_whole, num, seed)(test)
+        probabilities = (paper or fit_paper(whole, y_whole, num, seed))(test)
     elif kind == "knn":
         probabilities = fit_knn(whole, y_whole, num)(test)
     else:
@@ -373,15 +375,34 @@ def _probe_all(
     matrix: Any, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str], probes: Sequence[str], seed: int
 ) -> list[dict[str, Any]]:
     """Every (task, modality, probe) on the features ``matrix(modality, rows)``."""
+    papers = _papers(matrix, pack, tasks, modalities, seed) if "paper" in probes else {}
     records = []
     for task in tasks:
         for modality in modalities:
             rows = parts(pack, task, modality)
             x = matrix(modality, np.concatenate([rows.train, rows.val, rows.test]))
             for kind in probes:
-                result = probe_features(x, pack, task, rows, kind, seed)
+                result = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
+
+
+def _papers(
+    matrix: Any, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str], seed: int
+) -> dict[tuple[str, str], Any]:
+    """The paper's probes by (task, modality), those of tasks that learn from the same rows trained together."""
+    found: dict[tuple[str, str], Any] = {}
+    for modality in modalities:
+        sharing: dict[bytes, list[Task]] = {}
+        for task in tasks:
+            rows = parts(pack, task, modality)
+            sharing.setdefault(np.concatenate([rows.train, rows.val]).tobytes(), []).append(task)
+        for key, group in sharing.items():
+            rows = np.frombuffer(key, np.int64)
+            ys = [pack.column(f"label_{task.name}").astype(int)[rows] for task in group]
+            fitted = fit_papers(matrix(modality, rows), ys, [len(task.classes) for task in group], seed)
+            found.update({(task.name, modality): predict for task, predict in zip(group, fitted, strict=True)})
+    return found
 
 
 def controls_of(

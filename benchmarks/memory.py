@@ -1,0 +1,55 @@
+"""Peak memory and time per pair of one step, in a process of its own: python -m benchmarks.memory '{"batch": 64, ...}'
+
+Memory is what the step adds to the loaded libraries and the data: resident on a CPU, allocated on a GPU.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from dataclasses import replace
+from functools import partial
+
+import torch
+
+from benchmarks.floor import clock
+from mvitac.augment import ViewAugment, random_view
+from mvitac.batch import Views
+from mvitac.encoders import SCRATCH, EncoderConfig
+from mvitac.recipes import recipe
+from mvitac.spec import DataSpec
+from mvitac.step import Step
+
+
+def main() -> None:
+    given = json.loads(sys.argv[1])
+    device, batch, part = torch.device(given["device"]), given["batch"], given["chunk"] or given["batch"]
+    base = recipe("paper")
+    encoder = EncoderConfig(trunk=given["trunk"], weights=SCRATCH)
+    run = replace(base, encoder=encoder, batch_size=batch, chunk=given["chunk"], precision="bf16")
+    shape = {"vision_channels": 3, "touch_channels": 3, "tasks": (), "group_by": "row"}
+    spec = DataSpec(name="noise", licence="none", source="noise", **shape)
+    method = run.method.build(spec, run.encoder).to(device)
+    method.to(memory_format=torch.channels_last)
+    step = Step(run, method.train(), device)
+    raw = torch.randint(0, 255, (part, 256, 256, 3), dtype=torch.uint8, device=device).permute(0, 3, 1, 2)
+
+    def views(number: int) -> Views:
+        generator = torch.Generator().manual_seed(number)
+        view = partial(random_view, raw, ViewAugment(), given["size"], generator, torch.bfloat16)
+        images = {m: [view(), view()] for m in ("vision", "touch")}
+        return Views(images=images, labels={}, rows=torch.arange(part))
+
+    parts = [partial(views, number) for number in range(batch // part)]
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds = min(clock(lambda: step(parts, lr=1e-3, seed=0, progress=0.5), device) for _ in range(2))
+    if device.type == "cuda":
+        peak = torch.cuda.max_memory_allocated() / 2**30
+    else:
+        peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**20
+    print(json.dumps({"peak_gib": peak, "ms_per_pair": 1000 * seconds / batch}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""What more processes cost: pairs/s of the step alone and of the step in a world, the same pairs for each process.
+
+torchrun --nproc-per-node 2 -m benchmarks.scaling [--batch 32] [--size 224]
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+import torch
+import torch.distributed as dist
+
+from benchmarks.speed import Scale, interleave, our_run
+from mvitac.batch import Views
+from mvitac.distributed import World, join, local_device, synchronise_norms
+from mvitac.spec import DataSpec
+from mvitac.step import Step
+from mvitac.train import pick_device
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--batch", type=int, default=32, help="pairs of each process")
+    parser.add_argument("--size", type=int, default=224)
+    parser.add_argument("--trunk", default="resnet18")
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args()
+    world = join()
+    device = pick_device(local_device("auto"))
+    scale = Scale(trunk=options.trunk, size=options.size, batch=options.batch)
+    spec = DataSpec(
+        name="noise", vision_channels=3, touch_channels=3, tasks=(), group_by="row", licence="none", source="noise"
+    )
+    shape = (options.batch, 3, options.size, options.size)
+    images = [torch.randn(shape, device=device).to(torch.bfloat16, memory_format=torch.channels_last) for _ in range(4)]
+    batch = Views(images={"vision": images[:2], "touch": images[2:]}, labels={}, rows=torch.arange(options.batch))
+    variants = {}
+    for name, size in (("alone", World()), ("together", world)):
+        run = replace(our_run(scale, "bf16"), batch_size=options.batch * size.size)
+        method = run.method.build(spec, run.encoder).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        step = Step(run, synchronise_norms(method.train(), size), device, size)  # type: ignore[arg-type]
+        variants[name] = lambda step=step: step([lambda: batch], lr=1e-3, seed=0, progress=0.5)
+    seconds = interleave(variants, options.rounds, device)
+    if world.writes:
+        print(
+            f"{world.size} processes, {options.batch} pairs each: a step takes {seconds['together'] / seconds['alone']:.2f}x"
+        )
+    if world.size > 1:
+        dist.destroy_process_group()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,297 @@
+"""How fast is it, against what the machine can do and against the typical research code? Interleaved, medians, ratios.
+
+    python -m benchmarks.speed [--quick] [--device cpu|cuda] [--json FILE]     (make bench)
+
+Sections: the step on resident random tensors; the input; both together, end to end; the probe; gradient caching.
+Every speed stands as a share of the bare networks (`benchmarks/floor.py`, same precision) and of the machine's measured
+arithmetic.
+On several GPUs: torchrun --nproc-per-node N -m benchmarks.scaling
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.floor import Floor, clock, peak
+from benchmarks.typical import TypicalStep, typical_batches, write_jpegs
+from mvitac.allocator import keep_freed_memory
+from mvitac.batch import Views
+from mvitac.distributed import World
+from mvitac.encoders import SCRATCH, EncoderConfig
+from mvitac.heads import EPOCHS, train_heads
+from mvitac.model import Model, pack_features
+from mvitac.pack import Pack, Sample, Source, build
+from mvitac.recipes import recipe
+from mvitac.record import provenance, write_json
+from mvitac.run import Run
+from mvitac.spec import DataSpec
+from mvitac.step import Step
+from mvitac.train import describe, feed_parts
+
+PAPER_PAIRS, PAPER_EPOCHS = 91_982, 240
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """How large the measurement is."""
+
+    trunk: str = "resnet18"
+    size: int = 224
+    batch: int = 32
+    rounds: int = 5
+    num_pairs: int = 128
+    compile: bool = False
+
+
+class Jpegs(Source):
+    """The same JPEG files as the typical input reads, to be packed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.paths = sorted(folder.glob("vision-*.jpg"))
+
+    def spec(self) -> DataSpec:
+        known = {"name": "jpegs", "vision_channels": 3, "touch_channels": 3, "tasks": (), "group_by": "file"}
+        return DataSpec(**known, licence="none", source="benchmarks/speed.py")
+
+    def items(self) -> list[str]:
+        return [path.stem for path in self.paths]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"num": len(self.paths)}
+
+    def read(self, item: int) -> list[Sample]:
+        path = self.paths[item]
+        pair = [np.asarray(Image.open(p)) for p in (path, path.with_name(path.name.replace("vision", "touch")))]
+        return [Sample(vision=pair[0], touch=pair[1], columns={"id": path.stem, "group": path.stem, "split": "train"})]
+
+
+def interleave(variants: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, float]:
+    """Median seconds per call of each variant, called in turn so that a busy moment of the machine hits all alike."""
+    for run in variants.values():
+        clock(run, device)  # once for caches, kernels and compilation
+    seconds: dict[str, list[float]] = {name: [] for name in variants}
+    for _ in range(rounds):
+        for name, run in variants.items():
+            seconds[name].append(clock(run, device))
+    return {name: median(values) for name, values in seconds.items()}
+
+
+def our_run(scale: Scale, precision: str, **changes: Any) -> Run:
+    base = recipe("paper")
+    network = EncoderConfig(trunk=scale.trunk, weights=SCRATCH)
+    optim = replace(base.optim, lr=1e-3)
+    views = replace(base.augment, size=scale.size)
+    return replace(
+        base, encoder=network, optim=optim, augment=views, batch_size=scale.batch, precision=precision, **changes
+    )  # type: ignore[arg-type]
+
+
+def our_step(scale: Scale, precision: str, spec: DataSpec, device: torch.device, **changes: Any) -> Step:
+    run = our_run(scale, precision, **changes)
+    method = run.method.build(spec, run.encoder).to(device)
+    method.to(memory_format=torch.channels_last)
+    return Step(run, method.train(), device)
+
+
+def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[str, Any]:
+    """Pairs/s of each step, with its share of the floor and of the measured peak in the same precision."""
+    torch.manual_seed(0)
+    images = [torch.randn(scale.batch, 3, scale.size, scale.size, device=device) for _ in range(4)]
+    close = [image.contiguous(memory_format=torch.channels_last) for image in images]
+    small = [image.bfloat16() for image in close]
+
+    def ours(precision: str, **changes: Any) -> Callable[[], object]:
+        step = our_step(scale, precision, spec, device, **changes)
+        given = small if precision == "bf16" else close
+        views = {"vision": [given[0], given[2]], "touch": [given[1], given[3]]}
+        batch = Views(images=views, labels={}, rows=torch.arange(scale.batch))
+        return lambda: step([lambda: batch], lr=1e-3, seed=0, progress=0.5)
+
+    typical = TypicalStep(scale.trunk, device)
+    floors = {p: Floor(scale.trunk, device, p) for p in ("fp32", "bf16")}
+    variants: dict[str, Callable[[], object]] = {
+        "typical fp32": lambda: typical((images[0], images[2]), (images[1], images[3])),
+        "floor fp32": lambda: floors["fp32"](close),
+        "ours fp32": ours("fp32"),
+        "floor bf16": lambda: floors["bf16"](small),
+        "ours bf16": ours("bf16"),
+    }
+    if scale.compile:
+        variants["ours bf16 compiled"] = ours("bf16", compile=True)
+    seconds = interleave(variants, scale.rounds, device)
+    flop = floors["fp32"].flop(close)
+    peaks = {p: peak(device, p) for p in ("fp32", "bf16")}
+    rows = {}
+    for name, value in seconds.items():
+        precision = "bf16" if "bf16" in name else "fp32"
+        rows[name] = {
+            "pairs_per_s": scale.batch / value,
+            "of_floor": seconds[f"floor {precision}"] / value,
+            "tflop_per_s": flop / value / 1e12,
+            "of_matmul_peak": flop / value / peaks[precision]["matmul"],
+            "of_conv_peak": flop / value / peaks[precision]["conv"],
+            "over_typical": seconds["typical fp32"] / value,
+        }
+    return {"flop_per_pair": flop / scale.batch, "peak_flop_per_s": peaks, "variants": rows}
+
+
+def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
+    """Augmented images/s of each input (four images per pair), without a network."""
+    typical = typical_batches(folder, scale.size, scale.batch, workers)
+    feeds = {p: feed(our_run(scale, p), pack, device) for p in ("fp32", "bf16")}
+    variants: dict[str, Callable[[], object]] = {
+        "typical, JPEG files": lambda: next(typical),
+        **{f"ours, pack, {p}": (lambda f=f: next(f)[0]()) for p, f in feeds.items()},
+    }
+    seconds = interleave(variants, scale.rounds, device)
+    slowest = seconds["typical, JPEG files"]
+    return {n: {"images_per_s": 4 * scale.batch / s, "over_typical": slowest / s} for n, s in seconds.items()}
+
+
+def feed(run: Run, pack: Pack, device: torch.device) -> Any:
+    """The loop's own parts of one step after another, without end."""
+    return feed_parts(run, pack, pack.rows("train"), 2, device, World(), 0, 10**9)
+
+
+def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
+    """Pairs/s from stored data to updated weights, and what share of the step alone that is."""
+    loader, old = typical_batches(folder, scale.size, scale.batch, workers), TypicalStep(scale.trunk, device)
+
+    def typical() -> None:
+        a, b, c, d = (views.to(device) for views in next(loader))
+        old((a, b), (c, d))
+
+    step, parts = our_step(scale, "bf16", pack.spec, device), feed(our_run(scale, "bf16"), pack, device)
+    alone = next(parts)[0]()
+    variants = {
+        "typical, JPEG files to weights": typical,
+        "ours bf16, step alone": lambda: step([lambda: alone], lr=1e-3, seed=0, progress=0.5),
+        "ours bf16, pack to weights": lambda: step(next(parts), lr=1e-3, seed=0, progress=0.5),
+    }
+    seconds = interleave(variants, scale.rounds, device)
+    first, only = seconds["typical, JPEG files to weights"], seconds["ours bf16, step alone"]
+    rows = {
+        n: {"pairs_per_s": scale.batch / s, "over_typical": first / s, "of_step_alone": only / s}
+        for n, s in seconds.items()
+    }
+    hours = PAPER_PAIRS * PAPER_EPOCHS * seconds["ours bf16, pack to weights"] / scale.batch / 3600
+    return {"variants": rows, "hours_for_the_papers_pretraining": hours}
+
+
+def measure_caching(scale: Scale, device: torch.device, plain: int, large: int, chunk: int) -> dict[str, Any]:
+    """Peak memory and time per pair of plain batches and of a large batch in chunks, each in a process of its own."""
+    rows = {}
+    for name, batch, part in ((f"plain {plain}", plain, 0), (f"{large} in chunks of {chunk}", large, chunk)):
+        settings = {"batch": batch, "chunk": part, "size": scale.size, "trunk": scale.trunk, "device": device.type}
+        command = [sys.executable, "-m", "benchmarks.memory", json.dumps(settings)]
+        rows[name] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    return rows
+
+
+def measure_probe(scale: Scale, pack: Pack, device: torch.device, num: int = 5000) -> dict[str, Any]:
+    """Seconds of 5 seeds x 3 tasks x 3 modalities of the paper's probe on ``num`` pairs: features once, heads together;
+    and encoding every epoch anew for every head, as the field's code does (one pass is measured, the rest multiplied)."""
+    seeds, classes = list(range(5)), [20, 2, 2]
+    run = our_run(scale, "fp32")
+    model = Model(run.method.build(pack.spec, run.encoder).to(device), run, pack.spec, pack.size)
+    rows = pack.rows("train")[:64]
+    one = clock(lambda: [pack_features(model, pack, m, rows) for m in pack.spec.modalities], device) * num / len(rows)
+    labels = torch.stack([torch.randint(k, (num,)) for k in classes])
+    heads = 0.0
+    for width in (512, 512, 1024):
+        features = torch.randn(len(seeds), num, width, device=device)
+        heads += clock(lambda f=features: train_heads(f, labels, classes, seeds), device)  # type: ignore[misc]
+    again = EPOCHS * one * len(seeds) * len(classes) * 2  # touch, vision, and both for each task of each seed
+    once = one * len(seeds) + heads
+    return {
+        "encoding every epoch": {"seconds": again, "times": 1.0},
+        "features once, heads together": {"seconds": once, "times": again / once},
+        "of which the heads": {"seconds": heads},
+    }
+
+
+def show(console: Console, title: str, rows: dict[str, dict[str, float]]) -> None:
+    table = Table(title=title, title_justify="left")
+    names = list(dict.fromkeys(itertools.chain.from_iterable(rows.values())))
+    for column in ("", *names):
+        table.add_column(column.replace("_", " "), justify="right" if column else "left")
+    for name, row in rows.items():
+        table.add_row(name, *(f"{row[c]:.3g}" if c in row else "" for c in names))
+    console.print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="under a minute: a small trunk at 64 px")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--batch", type=int, nargs="+", help="default 32 on a CPU, 256 and 1024 on a GPU")
+    parser.add_argument("--rounds", type=int)
+    parser.add_argument("--workers", type=int, default=0, help="of the typical DataLoader")
+    parser.add_argument("--sections", nargs="+", default=["step", "input", "whole", "probe", "caching"])
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    device, console = torch.device(options.device), Console()
+    cuda = device.type == "cuda"
+    scale = Scale(compile=cuda, rounds=20 if cuda else 5, num_pairs=2048 if cuda else 128)
+    if options.quick:
+        scale = Scale(trunk="resnet10t", size=64, batch=16, rounds=3, num_pairs=32)
+    scale = replace(scale, rounds=options.rounds or scale.rounds)
+    batches = options.batch or ([256, 1024] if cuda and not options.quick else [scale.batch])
+    keep_freed_memory()
+    result: dict[str, Any] = {
+        "date": datetime.now(UTC).isoformat(timespec="minutes"),
+        "device": describe(device),
+        "load": os.getloadavg()[0],
+        "scale": asdict(scale),
+        **provenance(),
+    }
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        write_jpegs(folder / "jpegs", max(scale.num_pairs, *batches))
+        pack = build(Jpegs(folder / "jpegs"), folder / "pack", size=min(256, 2 * scale.size), quiet=True)
+        for batch in batches:
+            at = replace(scale, batch=batch)
+            part = result.setdefault(f"batch {batch}", {})
+            if "step" in options.sections:
+                part["step"] = measure_steps(at, pack.spec, device)
+                show(console, f"step, batch {batch}, {scale.size} px, {scale.trunk}", part["step"]["variants"])
+            if "input" in options.sections:
+                part["input"] = measure_input(at, folder / "jpegs", pack, device, options.workers)
+                show(console, "input", part["input"])
+            if "whole" in options.sections:
+                part["whole"] = measure_whole(at, folder / "jpegs", pack, device, options.workers)
+                show(console, "end to end", part["whole"]["variants"])
+                hours = part["whole"]["hours_for_the_papers_pretraining"]
+                console.print(f"the paper's pre-training (92k pairs x 240 epochs) at this speed: {hours:.1f} h")
+        if "probe" in options.sections:
+            result["probe"] = measure_probe(scale, pack, device, 500 if options.quick else 5000)
+            show(console, "the paper's probe: 5 seeds x 3 tasks x 3 modalities", result["probe"])
+    if "caching" in options.sections:
+        sizes = (64, 1024, 32) if cuda else (16, 64, 8) if options.quick else (64, 256, 32)
+        result["caching"] = measure_caching(scale, device, *sizes)
+        show(console, "gradient caching, bf16", result["caching"])
+    console.print(f"{result['device']}, load {result['load']:.1f}, commit {result['commit']}", highlight=False)
+    if options.json:
+        write_json(options.json, result)
+
+
+if __name__ == "__main__":
+    main()
