@@ -13,13 +13,13 @@ def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.nda
 
     From a dealing drawn by ``seed`` one group is moved, or two are exchanged, as long as that brings the sides nearer to
     their ``shares`` of each class's rows and of each class's groups (sum of squared differences). Groups decide how far an
-    interval is from useless, rows how far a score is from noise: both count the same. A class is known by its column; one
-    without rows is ignored.
+    interval is from useless, rows how far a score is from noise: both count the same. A class of a single group cannot be
+    shared out and does not count.
     """
     num = len(counts)
     if not num:
         return np.zeros(0, np.int64)
-    counts = counts[:, counts.sum(0) > 0].astype(np.float64)
+    counts = counts[:, (counts > 0).sum(0) > 1].astype(np.float64)
     has = (counts > 0).astype(np.float64)
     parts = np.concatenate([m / m.sum(0) for m in (counts, has, np.ones((num, 1)))], axis=1)  # [G, F] columns of sum 1
     weight = np.rint(parts * SCALE).astype(np.int64)
