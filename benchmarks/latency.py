@@ -24,7 +24,7 @@ import torch
 
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.encoders import EncoderConfig
-from mvitac.export import Tolerance, export, silent
+from mvitac.export import Tolerance, export
 from mvitac.graph import Graph
 from mvitac.model import fresh
 from mvitac.pack import Pack, build
@@ -59,6 +59,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--trunk", default="resnet18.tv_in1k")
     parser.add_argument("--work", type=Path, help="folder to keep the exports in, for a second call")
+    parser.add_argument(
+        "--no-compile", action="store_true", help="leave torch.compile out: it takes minutes to compile"
+    )
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -79,7 +82,7 @@ def main() -> None:
 
     graph = Graph(with_readouts(model, pack))
     calls: dict[str, Call] = {"eager": in_torch(graph)}
-    with silent():
+    if not options.no_compile:
         calls["torch.compile"] = in_torch(torch.compile(graph, dynamic=False))
     sizes = {"eager": sum(p.numel() * 4 for p in graph.parameters()) / 1e6}
     for name, how in VARIANTS.items():

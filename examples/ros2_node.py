@@ -1,0 +1,131 @@
+"""A ROS 2 node: image topics in, predictions and embeddings out.
+
+    python examples/ros2_node.py exports/first --vision /camera/image_raw --touch /gel/image_raw
+
+Subscribes to sensor_msgs/Image (rgb8 or bgr8), publishes std_msgs/String (JSON: contact, class and confidence by task, age)
+on ~/prediction and std_msgs/Float32MultiArray on ~/embedding. Only ``main`` needs ROS: ``Node`` works on anything with the
+fields of an Image message, which is how it is tested.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mvitac.capture import Source, Stream
+from mvitac.realtime import Live
+from mvitac.runtime import Engine
+
+
+def to_rgb(message: Any) -> np.ndarray:
+    """uint8 RGB [H, W, 3] of a sensor_msgs/Image; rows may be padded. ValueError names a foreign encoding."""
+    if message.encoding not in ("rgb8", "bgr8"):
+        raise ValueError(f"encoding {message.encoding!r}: publish rgb8 or bgr8")
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+    image = rows[:, : 3 * message.width].reshape(message.height, message.width, 3)
+    return np.ascontiguousarray(image[..., ::-1] if message.encoding == "bgr8" else image)
+
+
+class Topic(Source):
+    """A topic as a source: ``put`` what arrives, then pump."""
+
+    def __init__(self) -> None:
+        self.message: Any = None
+
+    def open(self) -> None:
+        pass
+
+    def put(self, message: Any) -> None:
+        self.message = message
+
+    def read(self) -> np.ndarray:
+        return to_rgb(self.message)
+
+
+class Node:
+    """Messages in by modality, ``publish(kind, value)`` out: "prediction" (str) and "embedding" (list of float)."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        publish: Callable[[str, Any], None],
+        *,
+        warn: Callable[[str], None] = print,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.publish, self.outputs = publish, {}
+        self.topics = {m: [Topic() for _ in range(shape[2] // 3)] for m, shape in engine.inputs.items()}
+        self.streams = {
+            m: [Stream(f"{m} {i}", topic, clock=clock) for i, topic in enumerate(topics)]
+            for m, topics in self.topics.items()
+        }
+        # Live needs no embedding; the node publishes it, so the engine's last outputs are kept.
+        self.live = Live(Kept(engine, self.outputs), self.streams, clock=clock, tell=lambda event: warn(event.text))  # type: ignore[arg-type]
+
+    def image(self, modality: str, message: Any, which: int = 0) -> None:
+        """Take one Image message; publishes if it completes an answer."""
+        self.topics[modality][which].put(message)
+        self.streams[modality][which].pump()
+        if not self.live.tick():
+            return
+        said = {task: {"class": c, "confidence": p} for task, (c, p) in self.live.answers(self.live.touch).items()}
+        self.publish("prediction", json.dumps({"touch": self.live.num_touches, "contact": True, **said}))
+        names = [n for n in self.outputs if n.startswith("embedding_")]
+        self.publish("embedding", np.concatenate([self.outputs[n][0] for n in names]).tolist())
+
+
+class Kept:
+    """An engine that leaves its last outputs in a dict."""
+
+    def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
+        self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
+
+    def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+        self.outputs.update(self.engine(**images))
+        return self.outputs
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("export", help="folder written by `mvitac export`")
+    parser.add_argument("--vision", action="append", default=[], help="image topic of the camera")
+    parser.add_argument("--touch", action="append", default=[], help="image topic of a touch sensor; twice for two")
+    options, rest = parser.parse_known_args()
+
+    import rclpy  # pyright: ignore[reportMissingImports]
+    from rclpy.qos import qos_profile_sensor_data  # pyright: ignore[reportMissingImports]
+    from sensor_msgs.msg import Image  # pyright: ignore[reportMissingImports]
+    from std_msgs.msg import Float32MultiArray, String  # pyright: ignore[reportMissingImports]
+
+    rclpy.init(args=rest)
+    ros = rclpy.create_node("mvitac")
+    publishers = {
+        "prediction": (ros.create_publisher(String, "~/prediction", 10), String),
+        "embedding": (ros.create_publisher(Float32MultiArray, "~/embedding", 10), Float32MultiArray),
+    }
+
+    def publish(kind: str, value: Any) -> None:
+        publisher, message = publishers[kind]
+        publisher.publish(message(data=value))
+
+    node = Node(Engine(options.export), publish, warn=ros.get_logger().warning)
+    for modality, topics in (("vision", options.vision), ("touch", options.touch)):
+        for which, topic in enumerate(topics):
+            # Sensor data QoS: best effort, newest first; an old frame is of no use to us.
+            ros.create_subscription(
+                Image, topic, lambda m, k=modality, i=which: node.image(k, m, i), qos_profile_sensor_data
+            )
+    try:
+        rclpy.spin(ros)
+    finally:
+        ros.destroy_node()
+        rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""The encoders inside a policy, and the ROS 2 node on a fake publisher."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from faults import Clock, Rig
+
+import mvitac
+from mvitac.model import Model
+from mvitac.pack import Pack
+from mvitac.policy import ObservationEncoder
+from mvitac.runtime import Engine
+
+KEYS = {"observation.images.wrist": "vision", "observation.images.gel": "touch"}
+
+
+@pytest.fixture
+def model(artifact: Path) -> Model:
+    return mvitac.load(artifact)
+
+
+def observe(pack: Pack, rows: list[int]) -> dict[str, torch.Tensor]:
+    return {k: torch.from_numpy(pack.images[m][rows]).permute(0, 3, 1, 2) for k, m in KEYS.items()}
+
+
+def test_features_are_the_models(model: Model, pack: Pack) -> None:
+    """uint8 or float, single steps or a history: what embed() gives."""
+    encoder, seen = ObservationEncoder(model, KEYS), observe(pack, [3, 50])
+    expected = model.embed(vision=pack.images["vision"][[3, 50]], touch=pack.images["touch"][[3, 50]])
+    wanted = torch.cat([expected["vision"], expected["touch"]], dim=1)
+    torch.testing.assert_close(encoder(seen), wanted, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(encoder({k: v / 255 for k, v in seen.items()}), wanted, atol=1e-4, rtol=1e-4)
+    history = {k: v[None].expand(4, -1, -1, -1, -1) for k, v in seen.items()}
+    torch.testing.assert_close(encoder(history), wanted[None].expand(4, -1, -1), atol=1e-4, rtol=1e-4)
+    assert encoder.out_features == wanted.shape[1]
+
+
+def test_a_policy_trains_its_head_and_leaves_the_encoders_alone(model: Model, pack: Pack) -> None:
+    encoder = ObservationEncoder(model, KEYS, state=2)
+    policy = torch.nn.Sequential(encoder, torch.nn.Linear(encoder.out_features, 3))
+    before = {k: v.clone() for k, v in encoder.state_dict().items()}
+    policy.train()
+    optimiser = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], lr=0.01)
+    seen = {**observe(pack, list(range(12))), "observation.state": torch.zeros(12, 2)}
+    target = torch.from_numpy(pack.column("label_pattern")[:12].astype(int))
+    losses = []
+    for _ in range(30):
+        loss = torch.nn.functional.cross_entropy(policy(seen), target)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.5 * losses[0]
+    assert all(torch.equal(before[k], v) for k, v in encoder.state_dict().items())
+
+
+def test_tuned_encoders_get_gradients_but_keep_their_batchnorm(model: Model, pack: Pack) -> None:
+    encoder = ObservationEncoder(model, KEYS, tune=True).train()
+    before = {k: v.clone() for k, v in encoder.named_buffers()}
+    encoder(observe(pack, [0, 1])).sum().backward()
+    assert all(p.grad is not None for p in encoder.encoders.parameters())
+    assert all(torch.equal(before[k], v) for k, v in encoder.named_buffers())
+
+
+def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
+    with pytest.raises(ValueError, match="no smell encoder"):
+        ObservationEncoder(model, {"a": "smell"})
+    with pytest.raises(ValueError, match=r"takes 1 image\(s\), 2 given: left, right"):
+        ObservationEncoder(model, {"left": "touch", "right": "touch"})
+    encoder = ObservationEncoder(model, KEYS, state=2)
+    seen = observe(pack, [0])
+    with pytest.raises(ValueError, match=r"observation has no 'observation\.state'"):
+        encoder(seen)
+    with pytest.raises(ValueError, match=r"expected images \[B, 3, H, W\]"):
+        encoder({k: v[:, :1] for k, v in seen.items()})
+    with pytest.raises(ValueError, match=r"observation.state: expected \(1, 2\)"):
+        encoder({**seen, "observation.state": torch.zeros(1, 3)})
+
+
+def load_example(name: str) -> Any:
+    path = Path(__file__).parents[1] / "examples" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def message(image: np.ndarray, encoding: str, pad: int = 5) -> SimpleNamespace:
+    """A sensor_msgs/Image with padded rows."""
+    height, width, _ = image.shape
+    pixels = image[..., ::-1] if encoding == "bgr8" else image
+    rows = np.concatenate([pixels.reshape(height, -1), np.full((height, pad), 99, np.uint8)], axis=1)
+    return SimpleNamespace(height=height, width=width, step=3 * width + pad, encoding=encoding, data=rows.tobytes())
+
+
+def test_the_ros_node_on_a_fake_publisher(onnx: Path) -> None:
+    ros2_node = load_example("ros2_node")
+    clock, sent, warned = Clock(), [], []
+    rigs = {"vision": Rig(clock, 1), "touch": Rig(clock, 2)}
+    engine = Engine(onnx, threads=1)
+    node = ros2_node.Node(engine, lambda kind, value: sent.append((kind, value)), warn=warned.append, clock=clock)
+    for tick in range(80):  # 50 frames a second: calibrates in 0.6 s, touched from 1.0 s on
+        clock.now = 99 + tick / 50
+        for modality, encoding in (("vision", "rgb8"), ("touch", "bgr8")):
+            node.image(modality, message(rigs[modality].read(), encoding))
+    assert warned == ["touch 0 is calibrated without contact"]
+    kinds = [kind for kind, _ in sent]
+    assert kinds.count("prediction") == kinds.count("embedding") == pytest.approx(30, abs=2)
+    said = json.loads(sent[0][1])
+    assert said["touch"] == 1 and said["pattern"]["class"] in engine.classes["pattern"]
+    assert len(sent[1][1]) == 128
+    node.image("touch", SimpleNamespace(encoding="mono8"))
+    assert "publish rgb8 or bgr8" in warned[-1]
+
+
+def test_a_message_is_read_as_rgb() -> None:
+    image = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    to_rgb = load_example("ros2_node").to_rgb
+    for encoding in ("rgb8", "bgr8"):
+        assert np.array_equal(to_rgb(message(image, encoding)), image)
