@@ -189,7 +189,8 @@ def test_frame_137_pairs_with_frame_137(official: Pack) -> None:
 def test_jpegs_and_videos_give_the_same_pairs(official: Pack, tmp_path: Path) -> None:
     pack = packed(write_tree(tmp_path, jpegs=True), tmp_path / "pack", split="official")
     check_pairs(pack)
-    assert pack.table.equals(official.table)
+    pixels = ["crc_vision", "crc_touch"]  # which two codecs do not leave alike
+    assert pack.table.drop_columns(pixels).equals(official.table.drop_columns(pixels))
 
 
 def test_a_video_is_preferred_and_the_choice_can_be_forced(tree: Path, tmp_path: Path) -> None:
@@ -210,7 +211,7 @@ def test_a_recording_is_read_in_bounded_pieces(tree: Path, tmp_path: Path) -> No
     (tmp_path / "dataset").symlink_to(tree / "dataset")
     (tmp_path / "label.txt").write_text("\n".join(f"{n}/{i:010d}.jpg,{i % 3}" for n in NAMES[:2] for i in range(160)))
     source = TouchAndGoConfig(root=tmp_path, size=32).source()
-    assert source.num_samples() == 320 and len(source.items()) == 2 and source.items_per_part == 1
+    assert source.num_samples() == 320 and len(source.items()) == 2
     assert all(sample.touch.nbytes == 32 * 32 * 3 for sample in source.read(0))  # type: ignore[union-attr]
     assert CHUNK * 2 * 256 * 256 * 3 < 128e6
 
@@ -246,7 +247,7 @@ def test_the_official_split_is_the_lists(official: Pack) -> None:
     seen = official.rows("train", "unlabelled")
     assert len(seen) == 7 * 25 and set(frame[seen]) == {*range(20, 30), *range(130, 145)}
     # A method that learns from labels is not told those of the rough test list, whose frames it sees.
-    assert (official.labels(rough, "train")[np.isin(place, (2, 3))] == -1).all()
+    assert (official.labels(rough.name, "train")[np.isin(place, (2, 3))] == -1).all()
     assert (official.column("label_rough")[seen][np.isin(place[seen], (2, 3))] >= 0).any()
     assert official.spec.notes[0] == "official split: 7 of 7 test recordings are also in train (other touches)"
     assert official.spec.notes[1] == "official split: 8 of 16 rough/smooth test frames are in the pre-training list"

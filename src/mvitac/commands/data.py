@@ -71,6 +71,8 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
     if lost := pack.meta["damaged"]:
         text = f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {": ".join(lost[0])}'
         console.print(text, soft_wrap=True, highlight=False, markup=False)
+    for note in pack.spec.notes:
+        console.print(f"note: {note}", soft_wrap=True, highlight=False, markup=False)
 
 
 def sheet(argv: list[str]) -> None:
