@@ -86,3 +86,10 @@ def test_unknown_names_are_hinted() -> None:
     value["optim"]["learning_rate"] = 1
     with pytest.raises(ValueError, match=r"field in run\.optim 'learning_rate'"):
         Run.load(value)
+
+
+@pytest.mark.parametrize("name", ["modern", "demo"])
+def test_a_grasps_phases_are_not_each_others_positives(name: str) -> None:
+    """Alike before, during and after the grip would mean blind to the contact."""
+    assert recipe(name, GraspsConfig()).positives == "same-image"
+    assert recipe(name, MaterialsConfig()).positives == "same-touch"

@@ -52,16 +52,18 @@ def modern(data: DatasetConfig) -> Run:
     - momentum .99 rising to 1 (BYOL, MoCo v3): the keys settle as the queries do; .99 suits long runs.
     - one-per-touch batches: consecutive frames of one touch are near-duplicates, and as negatives they teach nonsense.
     - same-touch positives: two views of one image share lamp, background and sensor, which solves L_vv and L_tt without
-      looking at the material (docs/simulator.md has the figures); another row of the touch shares only the thing.
+      looking at the material (docs/simulator.md has the figures); another row of the touch shares only the thing. Not for
+      grasps: rows of one differ by before, during and after, and what tells these apart is the contact itself.
     """
     base = paper(data)
+    phased = isinstance(data, (GraspsConfig, CalandraConfig))
     return replace(
         base,
         recipe="modern",
         method=MViTacConfig(head_norm=True, momentum_end=1.0),
         optim=Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=1e-4, schedule="cosine", warmup=0.05),
         sampler="one-per-touch",
-        positives="same-touch",
+        positives="same-image" if phased else "same-touch",
         precision="bf16",
     )
 
