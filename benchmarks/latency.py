@@ -95,7 +95,7 @@ def main() -> None:
         calls[name] = engine._call
 
     rows = pack.rows("test")
-    pairs = [[pack.images[m][r : r + 1].copy() for m in graph.modalities] for r in rows[:32]]
+    pairs = [[pack.images[m][r : r + 1].copy() for m in graph.modalities] for r in rows[:8]]
     wanted = [calls["eager"](pair) for pair in pairs]
     result = {}
     for name, call in calls.items():
