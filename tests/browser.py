@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +92,14 @@ class Browser:
                 return
             time.sleep(0.05)
         raise AssertionError(f"never true: {code}; {self.problems}")
+
+    def until(self, code: str, act: Callable[[], None], tries: int = 20) -> None:
+        """``act`` again and again until ``code`` is true: a page that is still being laid out moves under the pointer."""
+        for _ in range(tries):
+            act()
+            with contextlib.suppress(AssertionError):
+                return self.wait(code, seconds=3)
+        raise AssertionError(f"never true in {tries} tries: {code}; {self.problems}")
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)

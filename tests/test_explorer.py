@@ -162,14 +162,19 @@ def test_the_page_in_a_browser(
         browser.wait(f"{POINTS} == {len(pack.rows('test'))}")
         assert browser.run("document.querySelectorAll('.map canvas').length") == 2
         row = int(pack.rows("test")[0])
-        x, y = centre_of_a_point(browser, land, row)
-        browser.mouse("mouseMoved", x, y)
-        browser.wait("document.querySelector('.tip').style.display == 'block'")
+
+        def hover() -> None:
+            browser.mouse("mouseMoved", 1, 1)
+            browser.mouse("mouseMoved", *centre_of_a_point(browser, land, row))
+
+        browser.until("document.querySelector('.tip').style.display == 'block'", hover)
         shown = browser.run("document.querySelector('.tip').textContent")
         pictured = browser.run("document.querySelectorAll('.tip img').length")
         assert pictured == 2 and shown.split(" ·")[0] in pack.column("id")
-        browser.click(x, y)
-        browser.wait("document.querySelectorAll('.grid-wrap img, .gallery-item img').length >= 12")
+        browser.until(
+            "document.querySelectorAll('.grid-wrap img, .gallery-item img').length >= 12",
+            lambda: browser.click(*centre_of_a_point(browser, land, row)),
+        )
         browser.run(CLICK_BOX)
         wrong = len(land.shown("test", "pattern", mistakes=True))
         browser.wait(f"{POINTS} == {wrong}")
