@@ -322,6 +322,30 @@ def test_missing_recordings_are_named_and_may_be_left_out(tree: Path, tmp_path: 
     assert set(touch.column("group")) == set(NAMES) - {NAMES[1]} and touch.spec.modalities == ("touch",)
 
 
+def test_the_doctor_is_told_what_the_lists_name_and_the_download_lacks(tree: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tree, tmp_path / "tree")
+    whole = {count.what: count for count in TouchAndGoConfig(root=root).source().expected()}
+    assert (whole["rows of train.txt"].published, whole["rows of train.txt"].found) == (91_982, 7 * 25)
+    assert (whole["rows of test_rough.txt"].published, whole["rows of test_rough.txt"].found) == (8_085, 2 * 8)
+    for what, num in (("listed recordings", 8), ("listed frames in their recordings", 239)):
+        assert (whole[what].published, whole[what].found, whole[what].detail) == (num, num, "")
+
+    shutil.rmtree(root / "dataset" / NAMES[1])
+    write_video(root / "dataset" / NAMES[2] / "gelsight.mp4", 135, lambda i: numbered(i, "touch"))
+    (root / "dataset" / NAMES[3] / "video.mp4").write_bytes(b"no film")
+    part = {count.what: count for count in TouchAndGoConfig(root=root, partial=True).source().expected()}
+    assert part["listed recordings"].found == 7 and NAMES[1] in part["listed recordings"].detail
+    inside = part["listed frames in their recordings"]
+    own = {name: sum(name in row for row in _listed(root)) for name in NAMES}
+    assert inside.found == 239 - own[NAMES[1]] - own[NAMES[3]] - 10
+    assert f"{NAMES[2]} has 135 frames, listed up to 144" in inside.detail
+    assert f"{NAMES[3]} has 0 frames" in inside.detail and "video.mp4" in inside.detail
+
+
+def _listed(root: Path) -> set[str]:
+    return {row.split(",")[0] for file in root.glob("*.txt") for row in file.read_text().split()}
+
+
 def test_a_damaged_stretch_is_left_out_and_listed(tree: Path, tmp_path: Path) -> None:
     root = shutil.copytree(tree, tmp_path / "tree")
     path = root / "dataset" / NAMES[2] / "gelsight.mp4"

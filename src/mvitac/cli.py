@@ -4,6 +4,7 @@ A user's mistake ends in one line on stderr and exit code 2; Ctrl-C in 130; anyt
 """
 
 import importlib
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -67,6 +68,9 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
+    # OpenMP's threads spin while they wait for each other, unless told so before torch loads it. Beside any other busy
+    # program the one they wait for is not running, and a training step takes ten times as long (docs/speed.md).
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP, end="")

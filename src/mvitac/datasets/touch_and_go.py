@@ -28,15 +28,17 @@ from mvitac.datasets.touch_and_go_lists import (
     CLASSES,
     LIST_FILES,
     LISTS_AT,
+    NUM_ROWS,
     SOFT,
     Frame,
     assign_by_recording,
     assign_official,
     find_touches,
     leaks,
+    read_list,
     read_lists,
 )
-from mvitac.pack import Lost, Sample, Source, fit
+from mvitac.pack import Count, Lost, Sample, Source, fit
 from mvitac.record import digest, digest_file
 from mvitac.registry import to_json
 from mvitac.spec import MODALITIES, DataSpec, Task
@@ -191,6 +193,7 @@ class TouchAndGo(Source):
         listed = read_lists(folder)
         if config.split == "official" and listed[0].listed == "label":
             raise ValueError(f"{folder} has no train.txt and test.txt, which the official split is: see {LISTS_AT}")
+        self._lists, self._num_listed = folder, len(listed)
         names = sorted({frame.recording for frame in listed})
         recordings, missing = find_recordings(config.root, names, config)
         if config.unlabelled:
@@ -208,6 +211,7 @@ class TouchAndGo(Source):
         extra = _unlabelled(listed, recordings, config) if config.unlabelled else []
 
         self._config = config
+        self._missing, self._num_names = missing, len(names)
         self._recordings = {recording.name: recording for recording in recordings}
         by_name: dict[str, list[Frame]] = defaultdict(list)
         for frame in [*listed, *extra]:
@@ -239,6 +243,33 @@ class TouchAndGo(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         return self._fingerprint
+
+    def expected(self) -> list[Count]:
+        """The lists against their published lengths; the recordings and frames they name against those that are there."""
+        counts = []
+        for name in NUM_ROWS:
+            if (self._lists / name).is_file():
+                rows = read_list(self._lists / name, len(CLASSES))
+                counts.append(Count(f"rows of {name}", NUM_ROWS[name], len(rows)))
+        absent = missing_report(self._missing, self._num_names) if self._missing else ""
+        counts.append(Count("listed recordings", self._num_names, self._num_names - len(self._missing), absent))
+        there, short = 0, []
+        by_name: dict[str, list[int]] = defaultdict(list)
+        for frame in (f for chunk in self._chunks for f in chunk if f.listed or f.listed_rough):
+            by_name[frame.recording].append(frame.number)
+        for name, numbers in by_name.items():
+            try:
+                end, why = self._recordings[name].num_frames(), ""
+            except (ValueError, OSError) as error:
+                end, why = 0, f" ({error})"
+            there += sum(number < end for number in numbers)
+            if numbers[-1] >= end:
+                short.append(f"{name} has {end} frames, listed up to {numbers[-1]}{why}")
+        rest = f"; and {len(short) - 8} more" if len(short) > 8 else ""
+        counts.append(
+            Count("listed frames in their recordings", self._num_listed, there, "; ".join(short[:8]) + rest)
+        )
+        return counts
 
     def read(self, item: int) -> list[Sample | Lost]:
         chunk, lost = self._chunks[item], {}
