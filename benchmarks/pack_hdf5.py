@@ -18,7 +18,8 @@ import h5py
 import numpy as np
 
 from mvitac.datasets.calandra import PHASES, CalandraConfig
-from mvitac.pack import build, fit
+from mvitac.pack import fit
+from mvitac.packing import build
 from mvitac.record import provenance, write_json
 
 SHAPES = {"gelsightA": (960, 1280, 3), "gelsightB": (960, 1280, 3), "kinectA_rgb": (540, 960, 3)}

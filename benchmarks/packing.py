@@ -4,7 +4,7 @@ Sources are made by code in Touch and Go's layout (640 x 480, mpeg4 with a key f
 300, as in the published lists), two processes' worth of nothing else. For each:
 
 - ``bare``: a loop that decodes and resizes every listed pair, in as many processes as packing gets, and keeps nothing
-- ``pack``: ``mvitac.pack.build``, the whole way to a finished, sealed pack on disk; ratio = bare time / pack time
+- ``pack``: ``mvitac.packing.build``, the whole way to a finished, sealed pack on disk; ratio = bare time / pack time
 - ``owners`` (videos only): seek both videos to each listed frame, write both as JPEG, read them back, resize
 
 The ways take turns; medians over rounds. Another source is one more function in ``SOURCES``.
@@ -32,8 +32,9 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from PIL import Image
 
 from mvitac.datasets.touch_and_go import TouchAndGoConfig
-from mvitac.pack import Source, build
+from mvitac.packing import build
 from mvitac.record import provenance, write_json
+from mvitac.source import Source
 
 SIZE, PERIOD, TOUCH = 256, 300, 30
 STEMS = ("video", "gelsight")

@@ -32,7 +32,7 @@ from PIL import Image
 from toy import Toy
 
 import mvitac
-from mvitac import pack as pack_module
+from mvitac import packing
 from mvitac import probe as probe_module
 from mvitac import train as train_module
 from mvitac.cli import main
@@ -41,7 +41,8 @@ from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, safetensors_digest
-from mvitac.pack import Pack, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.record import digest, digest_file
 from mvitac.registry import to_json
@@ -94,7 +95,7 @@ def refused(
         if not work:
             for module, name in (
                 (train_module, "make_views"),
-                (pack_module, "_write_part"),
+                (packing, "_write_part"),
                 (probe_module, "features"),
             ):
                 monkeypatch.setattr(module, name, trap(name))
@@ -798,7 +799,7 @@ def test_bad_samples_make_no_pack(tmp_path: Path, change: Any, says: str) -> Non
 def test_unfinished_pack_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str) -> None:
     """A damaged leftover is named, and deleting it is enough to go on."""
     with monkeypatch.context() as patch:
-        patch.setattr(pack_module, "_finish", trap("finish"))
+        patch.setattr(packing, "_finish", trap("finish"))
         with pytest.raises(WorkBegan):
             build(Toy(num=40), tmp_path / "p", size=32, quiet=True)
     DAMAGES[damage](tmp_path / "p.partial" / name)

@@ -31,7 +31,8 @@ from mvitac.datasets.calandra import (
 )
 from mvitac.datasets.packed import PackConfig
 from mvitac.feed import Feed
-from mvitac.pack import Pack, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.probe import Session, parts, probe_runs
 from mvitac.recipes import recipe
 from mvitac.tables import markdown, print_summary

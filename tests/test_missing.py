@@ -13,9 +13,11 @@ from toy import Toy
 from mvitac import probe as probe_module
 from mvitac import train as train_module
 from mvitac.datasets.packed import PackConfig
-from mvitac.pack import Pack, Sample, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.probe import Session, parts, probe_runs
 from mvitac.recipes import recipe
+from mvitac.source import Sample
 from mvitac.train import partners, train
 
 

@@ -29,9 +29,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mvitac.datasets.base import DatasetConfig
-from mvitac.pack import Count, Sample, Source
 from mvitac.record import brief, digest
 from mvitac.registry import to_json, unknown
+from mvitac.source import Count, Sample, Source
 from mvitac.spec import DataSpec, Task
 
 VERSION = 1
