@@ -33,8 +33,9 @@ from mvitac.datasets.packed import PackConfig
 from mvitac.feed import Feed
 from mvitac.pack import Pack
 from mvitac.packing import build
-from mvitac.probe import Session, parts, probe_runs
+from mvitac.probe import parts
 from mvitac.recipes import recipe
+from mvitac.session import Session, probe_runs
 from mvitac.tables import markdown, print_summary
 from mvitac.train import make_views, train
 

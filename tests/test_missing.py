@@ -15,8 +15,9 @@ from mvitac import train as train_module
 from mvitac.datasets.packed import PackConfig
 from mvitac.pack import Pack
 from mvitac.packing import build
-from mvitac.probe import Session, parts, probe_runs
+from mvitac.probe import parts
 from mvitac.recipes import recipe
+from mvitac.session import Session, probe_runs
 from mvitac.source import Sample
 from mvitac.train import partners, train
 
