@@ -34,6 +34,8 @@ from benchmarks.floor import Floor, clock, peak
 from benchmarks.typical import TypicalStep, typical_batches, write_jpegs
 from mvitac.allocator import keep_freed_memory
 from mvitac.batch import Views
+from mvitac.batches import feed_parts
+from mvitac.device import describe
 from mvitac.distributed import World
 from mvitac.encoders import SCRATCH, EncoderConfig
 from mvitac.heads import EPOCHS, train_heads
@@ -46,7 +48,6 @@ from mvitac.run import Run
 from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec
 from mvitac.step import Step
-from mvitac.train import describe, feed_parts
 
 PAPER_PAIRS, PAPER_EPOCHS = 91_982, 240
 

@@ -32,9 +32,9 @@ from PIL import Image
 from toy import Toy
 
 import mvitac
+from mvitac import batches as batches_module
 from mvitac import packing
 from mvitac import probe as probe_module
-from mvitac import train as train_module
 from mvitac.cli import main
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
@@ -94,7 +94,7 @@ def refused(
             words = [word.replace(f"{{{name}}}", str(place)) for word in words]
         if not work:
             for module, name in (
-                (train_module, "make_views"),
+                (batches_module, "make_views"),
                 (packing, "_write_part"),
                 (probe_module, "features"),
             ):
@@ -535,7 +535,7 @@ def test_out_of_memory_is_one_line(refused: Callable[..., str], monkeypatch: pyt
     def allocate(*_: object) -> None:
         torch.empty(1 << 50, dtype=torch.uint8)  # what torch itself raises
 
-    monkeypatch.setattr(train_module, "make_views", allocate)
+    monkeypatch.setattr(batches_module, "make_views", allocate)
     refused(PRETRAIN, "not enough memory", "--batch-size", left=("out",), work=True)
 
 
@@ -1150,7 +1150,7 @@ def test_random_damage_to_a_model(finished: Path, model: Model, tmp_path: Path) 
 @pytest.mark.parametrize("kind", ["run.json", "checkpoint.pt"])
 def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """Resuming trains, or refuses in one line; it never shows a traceback."""
-    monkeypatch.setattr(train_module, "make_views", trap("make_views"))
+    monkeypatch.setattr(batches_module, "make_views", trap("make_views"))
     shutil.copytree(finished, tmp_path / "r")
     (tmp_path / "r" / MODEL).unlink()
     data, rng = (finished / kind).read_bytes(), np.random.default_rng(13)

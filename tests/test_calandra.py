@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from mvitac.batches import make_views
 from mvitac.cli import main
 from mvitac.datasets.calandra import (
     AUTHORS_TEST,
@@ -37,7 +38,7 @@ from mvitac.probe import parts
 from mvitac.recipes import recipe
 from mvitac.session import Session, probe_runs
 from mvitac.tables import markdown, print_summary
-from mvitac.train import make_views, train
+from mvitac.train import train
 
 GEL, KINECT = (24, 32, 3), (54, 96, 3)
 OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_other_thing")

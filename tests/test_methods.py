@@ -126,7 +126,7 @@ def test_resumed_equals_straight_and_loads(
     pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """Cut after step 3 of 6 and resumed: queues, banks and their constants come back with the weights."""
-    from mvitac import train as module
+    from mvitac import batches as module
 
     run = replace(with_method(smoke(pack, steps=6, checkpoint_every=2, eval_every=0), name))
     train(run, tmp_path / "straight", quiet=True)

@@ -18,13 +18,15 @@ import safetensors.torch
 import torch
 from toy import toy_pack
 
+from mvitac.batches import epoch_order, partners
 from mvitac.datasets.packed import PackConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
 from mvitac.pack import Pack
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
-from mvitac.train import Diverged, epoch_order, evaluate, partners, train
+from mvitac.train import Diverged, train
+from mvitac.validation import evaluate
 
 
 def smoke(pack: Pack, **changes: object) -> Run:
@@ -64,7 +66,7 @@ def test_stopped_and_resumed_equals_straight(
     """Also across a change of epoch, with dropout, and with a checkpoint older than the stop."""
     run = smoke(pack, checkpoint_every=2)
     seen = 0
-    from mvitac import train as module
+    from mvitac import batches as module
 
     real = module.make_views
 
@@ -89,7 +91,7 @@ def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path, monkeypatch: pyt
     method = replace(smoke(pack).method, dropout=0.5)  # type: ignore[call-arg]
     run = smoke(pack, method=method, optim=Optim(name="sgd", lr=0.05, schedule="cosine"), checkpoint_every=1)
     train(run, tmp_path / "straight", quiet=True)
-    from mvitac import train as module
+    from mvitac import batches as module
 
     real, seen = module.make_views, []
 
@@ -210,7 +212,7 @@ def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
 
 def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import mvitac
-    from mvitac import train as module
+    from mvitac import validation as module
 
     used: list[np.ndarray] = []
     real = module.pack_features

@@ -24,7 +24,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvitac.batches import training_rows
 from mvitac.controls import controls_of
+from mvitac.device import describe, pick_device
 from mvitac.encoders import SCRATCH
 from mvitac.model import load
 from mvitac.pack import Pack
@@ -34,7 +36,7 @@ from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.session import Session, chosen, probe_runs
 from mvitac.stress import stress
-from mvitac.train import Diverged, describe, pick_device, train, training_rows
+from mvitac.train import Diverged, train
 
 
 @dataclass(frozen=True)
