@@ -18,18 +18,8 @@ from rich.console import Console
 
 from mvitac.batches import make_views
 from mvitac.cli import main
-from mvitac.datasets.calandra import (
-    AUTHORS_TEST,
-    AUTHORS_TRAIN,
-    NUM_SHARDS,
-    PHASES,
-    Calandra,
-    CalandraConfig,
-    crop_kinect,
-    doubtful,
-    most_attempted,
-    owners_shuffle,
-)
+from mvitac.datasets.calandra import NUM_SHARDS, PHASES, Calandra, CalandraConfig, crop_kinect
+from mvitac.datasets.calandra_objects import AUTHORS_TEST, AUTHORS_TRAIN, doubtful, most_attempted, owners_shuffle
 from mvitac.datasets.packed import PackConfig
 from mvitac.feed import Feed
 from mvitac.pack import Pack
