@@ -13,8 +13,8 @@ class QueueConfig(MethodConfig, ABC):
     """Base of their configs; no method by itself."""
 
     queue: int = 4096
-    """K, keys remembered for each head; MoCo's 65,536 are 5 % of ImageNet, 4,096 are 5 % of Touch and Go. Never more than half the
-    training rows, so that a row seldom meets its own older key."""
+    """K, keys remembered for each head; MoCo's 65,536 are 5 % of ImageNet, 4,096 are 5 % of Touch and Go. Never more than
+    half the training rows, so that a row seldom meets its own older key."""
     momentum: float = 0.999
     """m of the key towers (MoCo: .999)."""
     momentum_end: float | None = None
