@@ -16,11 +16,11 @@ from rich.console import Console
 
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.probe import Session, probe_runs
 from mvitac.recipes import recipe
 from mvitac.record import provenance, write_json
 from mvitac.registry import default
 from mvitac.run import Optim
+from mvitac.session import Session, probe_runs
 from mvitac.tables import print_summary
 from mvitac.train import train
 

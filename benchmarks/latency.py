@@ -27,7 +27,8 @@ from mvitac.encoders import EncoderConfig
 from mvitac.export import Tolerance, export
 from mvitac.graph import Graph
 from mvitac.model import fresh
-from mvitac.pack import Pack, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.record import provenance
 from mvitac.runtime import Call, Engine, cosines

@@ -1,20 +1,23 @@
-"""How near packing comes to bare decoding, and what it saves over the owners' way with videos.
+"""How near packing comes to a bare loop that reads and resizes the same images and keeps nothing.
 
-Sources are made by code in Touch and Go's layout (640 x 480, mpeg4 with a key frame every 12, touches of 30 frames every
-300, as in the published lists), two processes' worth of nothing else. For each:
+Sources are made by code in their owners' layouts: Touch and Go as extracted frames (``jpeg``) and as videos (``mp4``; 640 x
+480, a key frame every 12, touches of 30 frames), Calandra as shards in full resolution (``hdf5``; GelSight 960 x 1280,
+Kinect 540 x 960, gzip). For each:
 
-- ``bare``: a loop that decodes and resizes every listed pair, in as many processes as packing gets, and keeps nothing
-- ``pack``: ``mvitac.pack.build``, the whole way to a finished, sealed pack on disk; ratio = bare time / pack time
-- ``owners`` (videos only): seek both videos to each listed frame, write both as JPEG, read them back, resize
+- ``bare``: a loop that decodes and resizes every image, in as many processes as packing gets
+- ``pack``: ``mvitac.packing.build``, the whole way to a finished, sealed pack on disk; ratio = bare time / pack time
+- ``bare, every frame`` (mp4): from the first to the last listed frame, where ``bare`` seeks each touch
+- ``owners`` (mp4; needs OpenCV): seek both videos to each listed frame, write both as JPEG, read them back, resize
 
-The ways take turns; medians over rounds. Another source is one more function in ``SOURCES``.
+The ways take turns; medians over rounds. Another source is one more ``Case`` in ``CASES``.
 
-    python -m benchmarks.packing [--rounds N] [--workers N] [--recordings N] [--touches N] [--json FILE]
+    python -m benchmarks.packing [jpeg] [mp4] [hdf5] [--quick] [--rounds N] [--workers N] [--json FILE]
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import multiprocessing
 import shutil
 import statistics
@@ -27,16 +30,29 @@ from pathlib import Path
 from typing import Any
 
 import av
+import h5py
 import numpy as np
 from av.video.reformatter import Interpolation, VideoReformatter
 from PIL import Image
 
+from mvitac.datasets.calandra import PHASES, CalandraConfig
 from mvitac.datasets.touch_and_go import TouchAndGoConfig
-from mvitac.pack import Source, build
+from mvitac.pack import fit
+from mvitac.packing import build
 from mvitac.record import provenance, write_json
+from mvitac.source import Source
 
-SIZE, PERIOD, TOUCH = 256, 300, 30
+TOUCH, NUM_PICTURES = 30, 48
 STEMS = ("video", "gelsight")
+SHAPES = {"gelsightA": (960, 1280, 3), "gelsightB": (960, 1280, 3), "kinectA_rgb": (540, 960, 3)}
+
+Jobs = list[tuple[Path, list[int]]]
+"""A file or folder, and the numbers of the frames or grasps that are read of it."""
+Way = Callable[[Path, list[int], int], int]
+"""Read what one job names, at a side of so many pixels, and return how many images that were."""
+
+
+# -- Touch and Go ------------------------------------------------------------------------------------------------------
 
 
 def paint(recording: int, stem: str, number: int) -> np.ndarray:
@@ -48,59 +64,72 @@ def paint(recording: int, stem: str, number: int) -> np.ndarray:
     return np.ascontiguousarray(fine[y : y + 480, x : x + 640])
 
 
-def make_videos(root: Path, recordings: int, touches: int) -> Path:
-    """A tree of mp4 files with lists; nearly all frames are between the touches, as in the real one."""
+def write_lists(root: Path, options: argparse.Namespace) -> None:
+    """train.txt and test.txt: a touch in every ``options.period`` frames, so that most frames are between touches."""
     lines: dict[str, list[str]] = {"train": [], "test": []}
-    for recording in range(recordings):
-        name = f"20220501_{recording:06d}"
-        for stem in STEMS:
-            path = root / "dataset" / name / f"{stem}.mp4"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with av.open(str(path), "w") as container:
-                stream: Any = container.add_stream("mpeg4", rate=27)
-                stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 640, 480, "yuv420p", 2_000_000
-                stream.codec_context.gop_size = 12
-                pictures = [av.VideoFrame.from_ndarray(paint(recording, stem, i), format="rgb24") for i in range(48)]
-                for number in range(touches * PERIOD):
-                    picture = pictures[number % 48]
-                    picture.pts = number
-                    container.mux(stream.encode(picture))
-                container.mux(stream.encode())
-        for touch in range(touches):
-            start = touch * PERIOD + 101
+    for recording in range(options.recordings):
+        for touch in range(options.touches):
+            start = touch * options.period + options.period // 3
             side = lines["test" if touch % 4 == 3 else "train"]
-            side += [f"{name}/{i:010d}.jpg,{recording % 20}" for i in range(start, start + TOUCH)]
+            side += [f"20220501_{recording:06d}/{i:010d}.jpg,{recording % 20}" for i in range(start, start + TOUCH)]
+    root.mkdir(parents=True)
     for side, rows in lines.items():
         (root / f"{side}.txt").write_text("\n".join(rows))
-    return root
 
 
-def make_jpegs(root: Path, recordings: int, touches: int) -> Path:
-    """The same lists over extracted frames."""
-    made = make_videos(root, recordings, touches)
-    for line in [row for side in ("train", "test") for row in (root / f"{side}.txt").read_text().split()]:
-        name, number = line[:15], int(line[16:26])
-        for stem in STEMS:
-            path = root / "dataset" / name / f"{stem}_frame" / f"{number:010d}.jpg"
-            path.parent.mkdir(exist_ok=True)
-            Image.fromarray(paint(int(name[9:]), stem, number)).save(path, quality=95)
-    for path in (root / "dataset").glob("*/*.mp4"):
-        path.unlink()
-    return made
-
-
-def listed(root: Path) -> dict[str, list[int]]:
+def listed(root: Path) -> Jobs:
+    """The recordings of the lists, each with its listed frames in order."""
     found: dict[str, list[int]] = {}
     for side in ("train", "test"):
         for line in (root / f"{side}.txt").read_text().split():
             found.setdefault(line[:15], []).append(int(line[16:26]))
-    return {name: sorted(numbers) for name, numbers in sorted(found.items())}
+    return [(root / "dataset" / name, sorted(numbers)) for name, numbers in sorted(found.items())]
 
 
-# -- bare loops and the owners' way: one recording per call --------------------------------------------------------------
+def make_videos(root: Path, options: argparse.Namespace) -> None:
+    write_lists(root, options)
+    for folder, _ in listed(root):
+        folder.mkdir(parents=True)
+        for stem in STEMS:
+            pictures = [paint(int(folder.name[9:]), stem, i) for i in range(NUM_PICTURES)]
+            with av.open(str(folder / f"{stem}.mp4"), "w") as container:
+                stream: Any = container.add_stream("mpeg4", rate=27)
+                stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 640, 480, "yuv420p", 2_000_000
+                stream.codec_context.gop_size = 12
+                frames = [av.VideoFrame.from_ndarray(picture, format="rgb24") for picture in pictures]
+                for number in range(options.touches * options.period):
+                    frame = frames[number % NUM_PICTURES]
+                    frame.pts = number
+                    container.mux(stream.encode(frame))
+                container.mux(stream.encode())
 
 
-def bare_video(folder: Path, numbers: list[int]) -> int:
+def make_jpegs(root: Path, options: argparse.Namespace) -> None:
+    write_lists(root, options)
+    for folder, numbers in listed(root):
+        for stem in STEMS:
+            place = folder / f"{stem}_frame"
+            place.mkdir(parents=True)
+            for number in numbers:
+                picture = Image.fromarray(paint(int(folder.name[9:]), stem, number))
+                picture.save(place / f"{number:010d}.jpg", quality=95)
+
+
+def touch_and_go(root: Path, options: argparse.Namespace) -> Source:
+    return TouchAndGoConfig(root=root, size=options.size).source()
+
+
+def bare_jpeg(folder: Path, numbers: list[int], size: int) -> int:
+    num = 0
+    for stem in STEMS:
+        for number in numbers:
+            with Image.open(folder / f"{stem}_frame" / f"{number:010d}.jpg") as image:
+                shrunk = image.convert("RGB").resize((size, size), Image.Resampling.BILINEAR)
+                num += np.asarray(shrunk).shape[0] == size
+    return num
+
+
+def bare_video(folder: Path, numbers: list[int], size: int) -> int:
     """Every frame of both videos from the first to the last listed one, as a plain loop over PyAV decodes them."""
     wanted, num = set(numbers), 0
     for stem in STEMS:
@@ -109,14 +138,14 @@ def bare_video(folder: Path, numbers: list[int]) -> int:
             container.streams.video[0].codec_context.thread_count = 1
             for i, frame in enumerate(container.decode(video=0)):
                 if i in wanted:
-                    made = shrink.reformat(frame, SIZE, SIZE, "rgb24", interpolation=Interpolation.BILINEAR)
-                    num += made.to_ndarray().shape[0] == SIZE
+                    made = shrink.reformat(frame, size, size, "rgb24", interpolation=Interpolation.BILINEAR)
+                    num += made.to_ndarray().shape[0] == size
                 if i >= numbers[-1]:
                     break
     return num
 
 
-def bare_touches(folder: Path, numbers: list[int]) -> int:
+def bare_touches(folder: Path, numbers: list[int], size: int) -> int:
     """The least a video costs: one seek per touch, decoding from the key frame before it to its end."""
     num = 0
     starts = [n for n in numbers if n - 1 not in set(numbers)]
@@ -131,24 +160,14 @@ def bare_touches(folder: Path, numbers: list[int]) -> int:
                 for frame in container.decode(stream):
                     number = round(frame.pts / step)  # type: ignore[operator]
                     if number >= start:
-                        made = shrink.reformat(frame, SIZE, SIZE, "rgb24", interpolation=Interpolation.BILINEAR)
-                        num += made.to_ndarray().shape[0] == SIZE
+                        made = shrink.reformat(frame, size, size, "rgb24", interpolation=Interpolation.BILINEAR)
+                        num += made.to_ndarray().shape[0] == size
                     if number >= start + TOUCH - 1:
                         break
     return num
 
 
-def bare_jpeg(folder: Path, numbers: list[int]) -> int:
-    num = 0
-    for stem in STEMS:
-        for number in numbers:
-            with Image.open(folder / f"{stem}_frame" / f"{number:010d}.jpg") as image:
-                shrunk = image.convert("RGB").resize((SIZE, SIZE), Image.Resampling.BILINEAR)
-                num += np.asarray(shrunk).shape[0] == SIZE
-    return num
-
-
-def owners_way(folder: Path, numbers: list[int]) -> int:
+def owners_way(folder: Path, numbers: list[int], size: int) -> int:
     """Seek per frame and write JPEGs (OpenCV, as in their extract_frame.py), then load and resize them with Pillow."""
     import cv2
 
@@ -161,77 +180,143 @@ def owners_way(folder: Path, numbers: list[int]) -> int:
                 player.set(cv2.CAP_PROP_POS_FRAMES, number)
                 cv2.imwrite(f"{place}/{stem}_frame/{number:010d}.jpg", player.read()[1])
             player.release()
-        return bare_jpeg(Path(place), numbers)
+        return bare_jpeg(Path(place), numbers, size)
 
 
-def in_processes(way: Callable[[Path, list[int]], int], root: Path, workers: int) -> int:
-    """``way`` over all recordings; processes are started anew, as packing starts them."""
-    jobs = [(root / "dataset" / name, numbers) for name, numbers in listed(root).items()]
-    if workers == 1:
-        return sum(way(*job) for job in jobs)
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        return sum(pool.map(way, *zip(*jobs, strict=True)))
+# -- Calandra ----------------------------------------------------------------------------------------------------------
 
 
-# -- sources -----------------------------------------------------------------------------------------------------------
+def make_shards(root: Path, options: argparse.Namespace) -> None:
+    """``options.recordings`` shards of ``options.touches`` grasps, of smooth pictures with noise."""
+    root.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for shard in range(options.recordings):
+        with h5py.File(root / f"calandra_corl2017_{shard:03d}.h5", "w") as file:
+            for index in range(options.touches):
+                group = file.create_group(f"data/i{index}")
+                group.attrs["object_name"] = np.bytes_(("lemon", "potato", "soft_zebra")[index % 3])
+                group.attrs["is_gripping"] = np.bool_(index % 2)
+                for sensor, shape in SHAPES.items():
+                    for phase in PHASES:
+                        y, x, c = np.ogrid[: shape[0], : shape[1], :3]
+                        smooth = 128 + 60 * np.sin(x / (40 + index)) * np.cos(y / 60 + c)
+                        image = (smooth + rng.integers(0, 8, shape)).astype(np.uint8)
+                        group.create_dataset(f"{sensor}_{phase}", data=image, compression="gzip", compression_opts=1)
+
+
+def grasps(root: Path) -> Jobs:
+    """The shards, each with the numbers of its grasps."""
+    found: Jobs = []
+    for path in sorted(root.glob("calandra_corl2017_*.h5")):
+        with h5py.File(path) as file:
+            data: Any = file["data"]
+            found.append((path, sorted(int(name[1:]) for name in data)))
+    return found
+
+
+def calandra(root: Path, options: argparse.Namespace) -> Source:
+    return CalandraConfig(path=root, size=options.size, split="object").source()
+
+
+def bare_hdf5(path: Path, numbers: list[int], size: int) -> int:
+    num = 0
+    with h5py.File(path) as file:
+        data: Any = file["data"]
+        for number in numbers:
+            for sensor in SHAPES:
+                for phase in PHASES:
+                    num += fit(data[f"i{number}/{sensor}_{phase}"][()], size).shape[0] == size
+    return num
+
+
+# -- all of them -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Case:
-    """A source on disk, and other ways through the same images, by name."""
+    """A source on disk, and other ways through the same images, by name; the first is what packing is held against."""
 
-    source: Callable[[Path], Source]
-    make: Callable[[Path, int, int], Path]
-    ways: dict[str, Callable[[Path, list[int]], int]]
+    make: Callable[[Path, argparse.Namespace], None]
+    source: Callable[[Path, argparse.Namespace], Source]
+    jobs: Callable[[Path], Jobs]
+    num_images: int
+    """Images of one frame or grasp."""
+    ways: dict[str, Way]
 
 
-def touch_and_go(root: Path) -> Source:
-    return TouchAndGoConfig(root=root, size=SIZE).source()
-
-
-SOURCES = {
-    "jpeg": Case(touch_and_go, make_jpegs, {"bare": bare_jpeg}),
+CASES = {
+    "jpeg": Case(make_jpegs, touch_and_go, listed, 2, {"bare": bare_jpeg}),
     "mp4": Case(
-        touch_and_go, make_videos, {"bare": bare_touches, "bare, every frame": bare_video, "owners": owners_way}
+        make_videos,
+        touch_and_go,
+        listed,
+        2,
+        {"bare": bare_touches, "bare, every frame": bare_video, "owners": owners_way},
     ),
+    "hdf5": Case(make_shards, calandra, grasps, 9, {"bare": bare_hdf5}),
 }
 
 
+def in_processes(way: Way, jobs: Jobs, size: int, workers: int) -> int:
+    """``way`` over all ``jobs``; processes are started anew, as packing starts them."""
+    if workers == 1:
+        return sum(way(*job, size) for job in jobs)
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        return sum(pool.map(way, *zip(*jobs, strict=True), [size] * len(jobs)))
+
+
 def measure(name: str, options: argparse.Namespace, place: Path) -> dict[str, Any]:
-    case = SOURCES[name]
-    root = case.make(place / name, options.recordings, options.touches)
-    num = sum(map(len, listed(root).values()))
+    """Seconds of every way by round, their medians, and the medians as shares of packing's."""
+    case = CASES[name]
+    root = options.shards if name == "hdf5" and options.shards else place / name
+    if root == place / name:
+        case.make(root, options)
+    jobs = case.jobs(root)
+    num = case.num_images * sum(len(numbers) for _, numbers in jobs)
+    ways = {way: f for way, f in case.ways.items() if f is not owners_way or importlib.util.find_spec("cv2")}
     seconds: dict[str, list[float]] = {}
-    for _ in range(options.rounds):
-        for way, function in [("pack", None), *case.ways.items()]:
+    for number in range(-1, options.rounds):
+        for way, function in [("pack", None), *ways.items()]:
             began = time.perf_counter()
             if function is None:
-                build(case.source(root), place / "pack", size=SIZE, workers=options.workers, quiet=True)
+                source = case.source(root, options)
+                build(source, place / "pack", size=options.size, workers=options.workers, quiet=True)
             else:
-                assert in_processes(function, root, options.workers) == 2 * num
-            seconds.setdefault(way, []).append(time.perf_counter() - began)
+                assert in_processes(function, jobs, options.size, options.workers) == num, way
+            if number >= 0:  # one round before them fills the page cache and imports what is imported late
+                seconds.setdefault(way, []).append(time.perf_counter() - began)
             shutil.rmtree(place / "pack", ignore_errors=True)
     median = {way: statistics.median(values) for way, values in seconds.items()}
-    ratios = {way: median[way] / median["pack"] for way in case.ways}
-    print(f"{name}: {num} pairs, pack {num / median['pack']:.0f} pairs/s;", end=" ")
-    print(", ".join(f"{way} takes {ratio:.2f} x the time of pack" for way, ratio in ratios.items()))
-    return {"pairs": num, "seconds": seconds, "median": median, "ratio to pack": ratios}
+    ratios = {way: median[way] / median["pack"] for way in ways}
+    print(f"{name}: {num} images, pack {num / median['pack']:.0f} images/s;", end=" ")
+    print(", ".join(f"{way} takes {ratio:.2f} x the time of pack" for way, ratio in ratios.items()), flush=True)
+    return {"images": num, "seconds": seconds, "median": median, "ratio to pack": ratios}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sources", nargs="*", choices=[*SOURCES, []], help="default: all")
+    parser.add_argument("cases", nargs="*", choices=[*CASES, []], help="default: all")
+    parser.add_argument(
+        "--quick", action="store_true", help="two small files and one round, in seconds: no measurement"
+    )
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--recordings", type=int, default=4)
-    parser.add_argument("--touches", type=int, default=8, help="per recording, of 30 frames, one in every 300 frames")
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--recordings", type=int, default=4, help="recordings, or shards")
+    parser.add_argument("--touches", type=int, default=8, help="per recording, of 30 frames each; or grasps per shard")
+    parser.add_argument("--period", type=int, default=300, help="frames from touch to touch, 45 or more")
+    parser.add_argument("--shards", type=Path, help="hdf5: a folder of real shards instead of made ones")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    if options.period < TOUCH * 3 // 2:
+        parser.error(f"--period {options.period}: give {TOUCH * 3 // 2} or more, else a touch would run into the next")
+    if options.quick:
+        options.rounds, options.recordings, options.touches, options.period = 1, 2, 4, 60
     with tempfile.TemporaryDirectory() as place:
-        results = {name: measure(name, options, Path(place)) for name in options.sources or SOURCES}
+        results = {name: measure(name, options, Path(place)) for name in options.cases or CASES}
     if options.json:
-        given = {k: v for k, v in vars(options).items() if k not in ("json", "sources")}
-        write_json(options.json, {"results": results, "options": given, "size": SIZE, **provenance()})
+        given = {k: v for k, v in vars(options).items() if k not in ("json", "cases", "shards")}
+        write_json(options.json, {"results": results, "options": given, **provenance()})
 
 
 if __name__ == "__main__":

@@ -13,10 +13,10 @@ import torch.distributed as dist
 
 from benchmarks.speed import Scale, interleave, our_run
 from mvitac.batch import Views
+from mvitac.device import pick_device
 from mvitac.distributed import World, join, local_device, synchronise_norms
 from mvitac.spec import DataSpec
 from mvitac.step import Step
-from mvitac.train import pick_device
 
 
 def main() -> None:

@@ -34,17 +34,20 @@ from benchmarks.floor import Floor, clock, peak
 from benchmarks.typical import TypicalStep, typical_batches, write_jpegs
 from mvitac.allocator import keep_freed_memory
 from mvitac.batch import Views
+from mvitac.batches import feed_parts
+from mvitac.device import describe
 from mvitac.distributed import World
 from mvitac.encoders import SCRATCH, EncoderConfig
 from mvitac.heads import EPOCHS, train_heads
 from mvitac.model import Model, pack_features
-from mvitac.pack import Pack, Sample, Source, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.record import provenance, write_json
 from mvitac.run import Run
+from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec
 from mvitac.step import Step
-from mvitac.train import describe, feed_parts
 
 PAPER_PAIRS, PAPER_EPOCHS = 91_982, 240
 

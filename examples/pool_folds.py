@@ -12,7 +12,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from mvitac.probe import summarise
+from mvitac.scores import summarise
 from mvitac.tables import markdown
 
 Record = dict[str, Any]

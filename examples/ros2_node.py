@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.capture import Source, Stream
+from mvitac.cameras import Source
+from mvitac.capture import Stream
 from mvitac.realtime import Live
 from mvitac.runtime import Engine
 

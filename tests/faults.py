@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.capture import Ended, Event, Source, Stream
+from mvitac.cameras import Ended, Source
+from mvitac.capture import Event, Stream
 from mvitac.realtime import Live, LiveConfig
 from mvitac.runtime import Engine
 

@@ -19,9 +19,10 @@ from mvitac.artifact import read_manifest, seal
 from mvitac.cli import main
 from mvitac.model import pack_features
 from mvitac.pack import Pack
-from mvitac.probe import Session, parts, probe_runs
+from mvitac.probe import parts
 from mvitac.publish import fit_readouts, push
 from mvitac.record import digest_file
+from mvitac.session import Session, probe_runs
 
 
 @pytest.fixture
@@ -74,7 +75,7 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
 
 
 def test_a_probe_gives_scikit_learns_probabilities(smoke_run: Path, pack: Pack) -> None:
-    from mvitac.probe import fit_linear
+    from mvitac.heads import fit_linear
 
     model = mvitac.load(smoke_run)
     for task in pack.spec.tasks:  # one of three classes, one of two

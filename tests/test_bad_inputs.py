@@ -32,16 +32,17 @@ from PIL import Image
 from toy import Toy
 
 import mvitac
-from mvitac import pack as pack_module
+from mvitac import batches as batches_module
+from mvitac import packing
 from mvitac import probe as probe_module
-from mvitac import train as train_module
 from mvitac.cli import main
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, safetensors_digest
-from mvitac.pack import Pack, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.record import digest, digest_file
 from mvitac.registry import to_json
@@ -93,8 +94,8 @@ def refused(
             words = [word.replace(f"{{{name}}}", str(place)) for word in words]
         if not work:
             for module, name in (
-                (train_module, "make_views"),
-                (pack_module, "_write_part"),
+                (batches_module, "make_views"),
+                (packing, "_write_part"),
                 (probe_module, "features"),
             ):
                 monkeypatch.setattr(module, name, trap(name))
@@ -534,7 +535,7 @@ def test_out_of_memory_is_one_line(refused: Callable[..., str], monkeypatch: pyt
     def allocate(*_: object) -> None:
         torch.empty(1 << 50, dtype=torch.uint8)  # what torch itself raises
 
-    monkeypatch.setattr(train_module, "make_views", allocate)
+    monkeypatch.setattr(batches_module, "make_views", allocate)
     refused(PRETRAIN, "not enough memory", "--batch-size", left=("out",), work=True)
 
 
@@ -798,7 +799,7 @@ def test_bad_samples_make_no_pack(tmp_path: Path, change: Any, says: str) -> Non
 def test_unfinished_pack_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str) -> None:
     """A damaged leftover is named, and deleting it is enough to go on."""
     with monkeypatch.context() as patch:
-        patch.setattr(pack_module, "_finish", trap("finish"))
+        patch.setattr(packing, "_finish", trap("finish"))
         with pytest.raises(WorkBegan):
             build(Toy(num=40), tmp_path / "p", size=32, quiet=True)
     DAMAGES[damage](tmp_path / "p.partial" / name)
@@ -1149,7 +1150,7 @@ def test_random_damage_to_a_model(finished: Path, model: Model, tmp_path: Path) 
 @pytest.mark.parametrize("kind", ["run.json", "checkpoint.pt"])
 def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """Resuming trains, or refuses in one line; it never shows a traceback."""
-    monkeypatch.setattr(train_module, "make_views", trap("make_views"))
+    monkeypatch.setattr(batches_module, "make_views", trap("make_views"))
     shutil.copytree(finished, tmp_path / "r")
     (tmp_path / "r" / MODEL).unlink()
     data, rng = (finished / kind).read_bytes(), np.random.default_rng(13)

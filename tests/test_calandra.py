@@ -16,26 +16,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from mvitac.batches import make_views
 from mvitac.cli import main
-from mvitac.datasets.calandra import (
-    AUTHORS_TEST,
-    AUTHORS_TRAIN,
-    NUM_SHARDS,
-    PHASES,
-    Calandra,
-    CalandraConfig,
-    crop_kinect,
-    doubtful,
-    most_attempted,
-    owners_shuffle,
-)
+from mvitac.datasets.calandra import NUM_SHARDS, PHASES, Calandra, CalandraConfig, crop_kinect
+from mvitac.datasets.calandra_objects import AUTHORS_TEST, AUTHORS_TRAIN, doubtful, most_attempted, owners_shuffle
 from mvitac.datasets.packed import PackConfig
 from mvitac.feed import Feed
-from mvitac.pack import Pack, build
-from mvitac.probe import Session, parts, probe_runs
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.probe import parts
 from mvitac.recipes import recipe
+from mvitac.session import Session, probe_runs
 from mvitac.tables import markdown, print_summary
-from mvitac.train import make_views, train
+from mvitac.train import train
 
 GEL, KINECT = (24, 32, 3), (54, 96, 3)
 OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_other_thing")

@@ -23,8 +23,9 @@ from mvitac.datasets.packed import PackConfig
 from mvitac.pack import Pack
 from mvitac.paper_tables import lines_of, write_tables
 from mvitac.plans import ABLATION, PLANS, TABLE1, TABLE2, Plan, Row, changed, find_plan, setting, slug
-from mvitac.probe import Session, paired_difference
 from mvitac.recipes import RECIPES, recipe
+from mvitac.scores import paired_difference
+from mvitac.session import Session
 
 ROWS = (
     Row(label="MViTac", printed={"touch": {"pattern": 57.6}}),

@@ -24,7 +24,9 @@ from mvitac.datasets.lerobot_out import write_lerobot
 from mvitac.datasets.rows import RowsConfig
 from mvitac.datasets.videos import nearest
 from mvitac.datasets.webdataset import WebDatasetConfig
-from mvitac.pack import Pack, Sample, build
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.source import Sample
 
 
 def packed(config: RowsConfig, out: Path) -> Pack:

@@ -15,7 +15,9 @@ from mvitac.cli import main
 from mvitac.doctor import Finding, examine, examine_pack, examine_source, exit_code
 from mvitac.doctor.looks import area_means, look_at
 from mvitac.doctor.pictures import MAX_LAG, motion_correlations
-from mvitac.pack import Count, Pack, Sample, Source, build
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.source import Count, Sample, Source
 from mvitac.spec import DataSpec, Task
 
 NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32

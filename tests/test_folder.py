@@ -22,7 +22,8 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.images import decode
 from mvitac.datasets.rows import Rows
 from mvitac.datasets.splits import deal
-from mvitac.pack import Pack, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.record import cache_dir
 from mvitac.registry import from_json, to_json

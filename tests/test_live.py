@@ -11,7 +11,8 @@ import pytest
 from faults import Clock, Rig, World, faulty
 from PIL import Image
 
-from mvitac.capture import CaptureThread, Folder, Simulated, Stream, source
+from mvitac.cameras import Folder, Simulated, source
+from mvitac.capture import CaptureThread, Stream
 from mvitac.cli import main
 from mvitac.pack import Pack
 from mvitac.realtime import Contact, Live, LiveConfig

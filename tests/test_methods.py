@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_train import assert_equal_weights, smoke
+from test_train import assert_equal_weights, power_cut, smoke
 from toy import Toy
 
 from mvitac.batch import Views
@@ -122,26 +122,12 @@ def test_survives_its_record(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_resumed_equals_straight_and_loads(
-    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_resumed_equals_straight_and_loads(pack: Pack, tmp_path: Path, name: str) -> None:
     """Cut after step 3 of 6 and resumed: queues, banks and their constants come back with the weights."""
-    from mvitac import train as module
-
     run = replace(with_method(smoke(pack, steps=6, checkpoint_every=2, eval_every=0), name))
     train(run, tmp_path / "straight", quiet=True)
-    real, seen = module.make_views, []
-
-    def dying(*args: object) -> object:
-        seen.append(0)
-        if len(seen) == 4:
-            raise RuntimeError("power cut")
-        return real(*args)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(module, "make_views", dying)
-    with pytest.raises(RuntimeError, match="power cut"):
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(run, tmp_path / "cut", quiet=True)
-    monkeypatch.setattr(module, "make_views", real)
     train(run, tmp_path / "cut", resume=True, quiet=True)
     assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
     checkpoints = [torch.load(tmp_path / place / "checkpoint.pt")["method"] for place in ("straight", "cut")]

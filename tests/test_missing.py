@@ -10,13 +10,17 @@ import pytest
 import torch
 from toy import Toy
 
+from mvitac import batches as batches_module
 from mvitac import probe as probe_module
-from mvitac import train as train_module
+from mvitac.batches import partners
 from mvitac.datasets.packed import PackConfig
-from mvitac.pack import Pack, Sample, build
-from mvitac.probe import Session, parts, probe_runs
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.probe import parts
 from mvitac.recipes import recipe
-from mvitac.train import partners, train
+from mvitac.session import Session, probe_runs
+from mvitac.source import Sample
+from mvitac.train import train
 
 
 @dataclass
@@ -64,9 +68,9 @@ def test_an_image_must_agree_with_its_mark(tmp_path: Path, column: bool | None) 
 
 def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    real = train_module.make_views
+    real = batches_module.make_views
     monkeypatch.setattr(
-        train_module, "make_views", lambda run, pack, rows, *rest: seen.extend(rows) or real(run, pack, rows, *rest)
+        batches_module, "make_views", lambda run, pack, rows, *rest: seen.extend(rows) or real(run, pack, rows, *rest)
     )
     run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=4, eval_every=4, positives="same-touch")
     train(run, tmp_path / "run", quiet=True)

@@ -22,7 +22,8 @@ from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
 from mvitac.datasets.splits import folds
 from mvitac.datasets.videos import num_frames, spread
 from mvitac.datasets.vt60 import VT60Config
-from mvitac.pack import Pack, build, fit
+from mvitac.pack import Pack, fit
+from mvitac.packing import build
 
 
 def plain(path: Path, value: int) -> None:

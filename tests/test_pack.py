@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from toy import Toy, toy_pack
 
-from mvitac import pack as pack_module
-from mvitac.pack import Pack, build
+from mvitac import packing
+from mvitac.pack import Pack
+from mvitac.packing import build
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
@@ -44,7 +45,7 @@ def test_two_processes_give_the_bytes_of_one(pack: Pack, tmp_path: Path) -> None
 def test_interrupted_build_resumes_to_the_same_bytes(
     pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parts_before_the_kill: int
 ) -> None:
-    real, calls = pack_module._write_part, []
+    real, calls = packing._write_part, []
 
     def dying(job: object) -> range:
         if len(calls) == parts_before_the_kill:
@@ -52,11 +53,11 @@ def test_interrupted_build_resumes_to_the_same_bytes(
         calls.append(job)
         return real(job)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(pack_module, "_write_part", dying)
+    monkeypatch.setattr(packing, "_write_part", dying)
     with pytest.raises(KeyboardInterrupt):
         toy_pack(tmp_path / "p")
     assert not (tmp_path / "p").exists()
-    monkeypatch.setattr(pack_module, "_write_part", real)
+    monkeypatch.setattr(packing, "_write_part", real)
     toy_pack(tmp_path / "p")
     assert contents(tmp_path / "p") == contents(pack.path)
     assert not (tmp_path / "p.partial").exists()
@@ -67,7 +68,7 @@ def test_unfinished_pack_of_something_else_is_not_continued(tmp_path: Path, monk
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(pack_module, "_write_part", die)
+        patch.setattr(packing, "_write_part", die)
         with pytest.raises(KeyboardInterrupt):
             toy_pack(tmp_path / "p")
     with pytest.raises(ValueError, match="unfinished pack of something else"):
@@ -138,7 +139,7 @@ def test_never_overwrites(pack: Pack) -> None:
 
 
 def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pack_module.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))  # type: ignore[attr-defined]
+    monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="packing needs about"):
         toy_pack(tmp_path / "p")
     assert not list(tmp_path.iterdir())

@@ -12,13 +12,15 @@ import torch
 from sklearn.linear_model import LogisticRegression
 from toy import toy_pack
 
-from mvitac import probe
+from mvitac import features as features_module
 from mvitac.datasets.packed import PackConfig
-from mvitac.heads import train_heads
+from mvitac.heads import fit_paper, train_heads
 from mvitac.model import fresh
 from mvitac.pack import Pack
-from mvitac.probe import Session, cross_modal, interval, parts, probe_features, probe_runs, summarise
+from mvitac.probe import cross_modal, parts, probe_all, probe_features
 from mvitac.recipes import recipe
+from mvitac.scores import interval, summarise
+from mvitac.session import Session, probe_runs
 from mvitac.tables import markdown
 from mvitac.train import train
 
@@ -69,10 +71,10 @@ def test_the_papers_probe_learns_and_repeats() -> None:
     rng = np.random.default_rng(0)
     y = rng.integers(0, 3, 2048)
     x = (10 * np.repeat(np.eye(3)[y], 100, axis=1) + rng.normal(0, 5, (2048, 300))).astype(np.float32)
-    predict = probe.fit_paper(x, y, 3, seed=0)
+    predict = fit_paper(x, y, 3, seed=0)
     assert (predict(x).argmax(1) == y).mean() > 0.9
-    assert np.array_equal(predict(x), probe.fit_paper(x, y, 3, seed=0)(x))
-    assert not np.array_equal(predict(x), probe.fit_paper(x, y, 3, seed=1)(x))
+    assert np.array_equal(predict(x), fit_paper(x, y, 3, seed=0)(x))
+    assert not np.array_equal(predict(x), fit_paper(x, y, 3, seed=1)(x))
 
 
 def test_linear_equals_scikit_learn(pack: Pack) -> None:
@@ -194,7 +196,7 @@ def test_features_are_computed_once(runs: list[Path], monkeypatch: pytest.Monkey
     def never(*_: object, **__: object) -> None:
         raise AssertionError("the features were in the cache")
 
-    monkeypatch.setattr(probe, "pack_features", never)
+    monkeypatch.setattr(features_module, "pack_features", never)
     assert probe_runs(runs[:1], session)["records"] == first["records"]
 
 
@@ -245,7 +247,7 @@ def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
     def matrix(modality: str, rows: np.ndarray) -> np.ndarray:
         return x[[int(np.flatnonzero(order == row)[0]) for row in rows]]
 
-    records = probe._probe_all(matrix, pack, tasks, ["touch"], ["paper"], 3)
+    records = probe_all(matrix, pack, tasks, ["touch"], ["paper"], 3)
     for task, record in zip(tasks, records, strict=True):
         alone = probe_features(x, pack, task, parts(pack, task), "paper", 3)
         assert record["accuracy"] == alone["accuracy"] and record["confusion"] == alone["confusion"]

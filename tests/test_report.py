@@ -20,11 +20,14 @@ from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.gallery import nearest_groups
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.pack import Pack, Sample, Source, build
-from mvitac.probe import Session, probe_runs, summarise
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.report import wall_seconds, write_report
 from mvitac.run import Run
+from mvitac.scores import summarise
+from mvitac.session import Session, probe_runs
+from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec, Task
 from mvitac.tables import cell, columns_of
 from mvitac.train import train

@@ -16,7 +16,8 @@ from mvitac import video
 from mvitac.datasets import rows as rows_module
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.places import difference
-from mvitac.pack import Pack, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 
 Table = list[dict[str, Any]]
 

@@ -12,7 +12,9 @@ from toy import Toy
 
 from mvitac import sheet
 from mvitac.cli import main
-from mvitac.pack import Pack, Sample, build
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.source import Sample
 
 
 def test_strips_hold_their_class_and_spread_over_groups(pack: Pack) -> None:

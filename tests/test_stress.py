@@ -15,12 +15,14 @@ from mvitac import stress as module
 from mvitac.cli import main
 from mvitac.compare import do_all, gather, lay_out
 from mvitac.datasets.packed import PackConfig
+from mvitac.features import features
 from mvitac.model import Model, load
 from mvitac.pack import Pack
 from mvitac.paper_tables import write_tables
-from mvitac.probe import Session, features, parts, probe_features, probe_runs
+from mvitac.probe import parts, probe_features
 from mvitac.recipes import recipe
 from mvitac.run import Optim
+from mvitac.session import Session, probe_runs
 from mvitac.stress import MISSING, NOISE, STRESSES, stress
 from mvitac.train import train
 

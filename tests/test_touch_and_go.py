@@ -27,7 +27,8 @@ from mvitac.datasets.touch_and_go_lists import (
     read_list,
     read_lists,
 )
-from mvitac.pack import Pack, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.probe import parts
 from mvitac.video import frames
 

@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,17 +20,35 @@ import safetensors.torch
 import torch
 from toy import toy_pack
 
+from mvitac import batches
+from mvitac.batches import epoch_order, make_views, partners
 from mvitac.datasets.packed import PackConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
 from mvitac.pack import Pack
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
-from mvitac.train import Diverged, epoch_order, evaluate, partners, train
+from mvitac.train import Diverged, train
+from mvitac.validation import evaluate
 
 
 def smoke(pack: Pack, **changes: object) -> Run:
     return replace(recipe("smoke", PackConfig(path=pack.path)), **changes)  # type: ignore[arg-type]
+
+
+@contextmanager
+def power_cut(after: int) -> Iterator[None]:
+    """Training dies (RuntimeError "power cut") when it asks for its views after ``after`` batches."""
+    left = iter(range(after))
+
+    def dying(*args: object) -> object:
+        if next(left, None) is None:
+            raise RuntimeError("power cut")
+        return make_views(*args)  # type: ignore[arg-type]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batches, "make_views", dying)
+        yield
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -58,51 +78,23 @@ def test_leaves_the_promised_files(straight: Path) -> None:
 
 
 @pytest.mark.parametrize("stop_after", [1, 3, 7])
-def test_stopped_and_resumed_equals_straight(
-    pack: Pack, straight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int
-) -> None:
+def test_stopped_and_resumed_equals_straight(pack: Pack, straight: Path, tmp_path: Path, stop_after: int) -> None:
     """Also across a change of epoch, with dropout, and with a checkpoint older than the stop."""
     run = smoke(pack, checkpoint_every=2)
-    seen = 0
-    from mvitac import train as module
-
-    real = module.make_views
-
-    def dying(*args: object) -> object:
-        nonlocal seen
-        seen += 1
-        if seen > stop_after:
-            raise RuntimeError("power cut")
-        return real(*args)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(module, "make_views", dying)
-    with pytest.raises(RuntimeError, match="power cut"):
+    with power_cut(stop_after), pytest.raises(RuntimeError, match="power cut"):
         train(run, tmp_path / "r", quiet=True)
-    monkeypatch.setattr(module, "make_views", real)
     train(run, tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(straight, tmp_path / "r")
     steps = [json.loads(line)["step"] for line in (tmp_path / "r" / "log.jsonl").read_text().splitlines()]
     assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
 
 
-def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:
     method = replace(smoke(pack).method, dropout=0.5)  # type: ignore[call-arg]
     run = smoke(pack, method=method, optim=Optim(name="sgd", lr=0.05, schedule="cosine"), checkpoint_every=1)
     train(run, tmp_path / "straight", quiet=True)
-    from mvitac import train as module
-
-    real, seen = module.make_views, []
-
-    def dying(*args: object) -> object:
-        seen.append(0)
-        if len(seen) == 5:
-            raise RuntimeError("power cut")
-        return real(*args)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(module, "make_views", dying)
-    with pytest.raises(RuntimeError):
+    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
         train(run, tmp_path / "cut", quiet=True)
-    monkeypatch.setattr(module, "make_views", real)
     train(run, tmp_path / "cut", resume=True, quiet=True)
     assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
 
@@ -210,7 +202,7 @@ def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
 
 def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import mvitac
-    from mvitac import train as module
+    from mvitac import validation as module
 
     used: list[np.ndarray] = []
     real = module.pack_features

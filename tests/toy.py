@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.pack import Pack, Sample, Source, build
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec, Task
 
 NUM_CLASSES = 3

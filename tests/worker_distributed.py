@@ -11,11 +11,12 @@ import torch.distributed as dist
 from test_distributed import RUN, build, gradients, views
 from test_step import split
 
-from mvitac import train as module
+from mvitac import batches
 from mvitac.datasets.packed import PackConfig
 from mvitac.distributed import join, synchronise_norms
 from mvitac.recipes import recipe
 from mvitac.step import Step
+from mvitac.train import train as pretrain
 
 
 def step(folder: Path) -> None:
@@ -33,7 +34,7 @@ def step(folder: Path) -> None:
 def train(pack: Path, out: Path, die_after: int) -> None:
     """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw."""
     run = replace(recipe("smoke", PackConfig(path=pack)), steps=4, checkpoint_every=2, log_every=1)
-    real, seen = module.make_views, []
+    real, seen = batches.make_views, []
 
     def watched(*args: object) -> object:
         if len(seen) == die_after:
@@ -41,8 +42,8 @@ def train(pack: Path, out: Path, die_after: int) -> None:
         seen.append(args[2].tolist())  # type: ignore[attr-defined]
         return real(*args)  # type: ignore[arg-type]
 
-    module.make_views = watched  # type: ignore[assignment]
-    module.train(run, out, resume=True, quiet=True)
+    batches.make_views = watched  # type: ignore[assignment]
+    pretrain(run, out, resume=True, quiet=True)
     torch.save(seen, out.with_name(f"{out.name}-rows{join().rank}.pt"))
 
 

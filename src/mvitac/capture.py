@@ -1,25 +1,21 @@
-"""Frames from cameras, files and the simulator: the newest one wins, and every fault is named.
+"""Streams of frames: the newest one wins, and every fault is named.
 
-A ``Source`` opens, reads and closes; a ``Stream`` keeps its newest frame, counts what was dropped and says what is wrong
-with it. Time comes from a clock that is given, so all of it runs on a fake one. Frames are uint8 RGB [H, W, 3].
+A ``Stream`` keeps its source's newest frame (``cameras.py``), counts what was dropped and says what is wrong with it. Time
+comes from a clock that is given, so all of it runs on a fake one. Frames are uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from mvitac.cameras import Ended, Source
 from mvitac.record import brief
-
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 
 
 @dataclass(frozen=True)
@@ -39,175 +35,6 @@ class Event:
     stream: str
     what: str
     text: str
-
-
-class Ended(Exception):
-    """A source has no more frames, and never will."""
-
-
-class Source(ABC):
-    """Where frames come from. ``read`` raises OSError where the device is gone, ValueError for one damaged frame."""
-
-    fps: float = 30.0
-    """Nominal rate."""
-    paced: bool = True
-    """Whether the device itself makes ``read`` wait for the next frame."""
-
-    @abstractmethod
-    def open(self) -> None: ...
-
-    @abstractmethod
-    def read(self) -> np.ndarray: ...
-
-    def close(self) -> None:  # noqa: B027 - most have nothing to close
-        pass
-
-
-class Camera(Source):
-    """A UVC camera by index, device path or USB serial number; DIGIT and GelSight Mini are such cameras."""
-
-    def __init__(self, which: str) -> None:
-        self.which = which
-
-    def open(self) -> None:
-        import cv2
-
-        target: int | str = int(self.which) if self.which.isdigit() else self.which
-        if isinstance(target, str) and not target.startswith("/"):
-            links = sorted(Path("/dev/v4l/by-id").glob(f"*{target}*-index0")) if Path("/dev/v4l/by-id").is_dir() else []
-            if not links:
-                raise OSError(f"no camera with serial {target} is plugged in")
-            target = str(links[0].resolve())
-        self.capture = cv2.VideoCapture(target)
-        self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame in a queue is worse than none
-        if not self.capture.isOpened():
-            raise OSError(f"camera {self.which} cannot be opened")
-        self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
-
-    def read(self) -> np.ndarray:
-        good, image = self.capture.read()
-        if not good:
-            raise OSError(f"camera {self.which} gives no frames")
-        return np.ascontiguousarray(image[..., ::-1])  # OpenCV's frames are BGR
-
-    def close(self) -> None:
-        if hasattr(self, "capture"):
-            self.capture.release()
-
-
-class Video(Source):
-    """A video file, at its own rate."""
-
-    paced = False
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def open(self) -> None:
-        import cv2
-
-        self.capture = cv2.VideoCapture(str(self.path))
-        if not self.capture.isOpened():
-            raise OSError(f"{self.path} cannot be read as a video")
-        self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
-
-    def read(self) -> np.ndarray:
-        good, image = self.capture.read()
-        if not good:
-            raise Ended
-        return np.ascontiguousarray(image[..., ::-1])
-
-    def close(self) -> None:
-        if hasattr(self, "capture"):
-            self.capture.release()
-
-
-class Folder(Source):
-    """The pictures of a folder in name order."""
-
-    paced = False
-
-    def __init__(self, path: Path, fps: float = 30.0) -> None:
-        self.path, self.fps = path, fps
-
-    def open(self) -> None:
-        self.left = deque(sorted(p for p in self.path.iterdir() if p.suffix.lower() in PICTURES))
-        if not self.left:
-            raise OSError(f"{self.path} holds no pictures ({', '.join(PICTURES)})")
-
-    def read(self) -> np.ndarray:
-        from PIL import Image
-
-        if not self.left:
-            raise Ended
-        path = self.left.popleft()
-        try:
-            with Image.open(path) as image:
-                return np.array(image.convert("RGB"))
-        except (OSError, SyntaxError) as error:  # Pillow's kinds for a damaged file
-            raise ValueError(f"{path.name}: {brief(error)}") from None
-
-
-class Simulated(Source):
-    """A simulated sensor: one second of nothing, two of a touch of a new material, and so on; camera and gel agree."""
-
-    paced = False
-    rest, hold = 1.0, 2.0
-
-    def __init__(self, modality: str, seed: int = 0, fps: float = 30.0, size: int = 72) -> None:
-        self.modality, self.seed, self.fps, self.size = modality, seed, fps, size
-
-    def open(self) -> None:
-        self.number, self.touch = 0, -1
-        self.noise = np.random.default_rng([self.seed, self.modality == "touch"])
-
-    def read(self) -> np.ndarray:
-        from mvitac.sim import gel, materials
-
-        when = self.number / self.fps
-        touch, phase = divmod(when, self.rest + self.hold)
-        if int(touch) != self.touch:
-            self.touch = int(touch)
-            rng = np.random.default_rng([self.seed, self.touch])
-            sensors = {name: s for name, s in materials.SENSORS.items() if not s.held_out}
-            while True:  # all touches by one sensor, as a robot has one
-                address = int(rng.integers(len(materials.CLASSES))), int(rng.integers(60)), int(rng.integers(5))
-                pair = materials.touch(self.seed, *address, size=self.size)
-                if pair["sensor"] == min(sensors):
-                    break
-            quiet = np.zeros((self.size, self.size), np.float32)
-            blank = gel.render(quiet, sensors[pair["sensor"]], rng, pixel_mm=12.8 / self.size, unit=1)
-            self.pictures = {"vision": (pair["vision"],) * 2, "touch": (blank, pair["touch"])}
-        self.number += 1
-        image = self.pictures[self.modality][phase >= self.rest].astype(np.float32)
-        image += self.noise.normal(0, 1.0, image.shape[:2])[..., None]
-        return np.clip(image + 0.5, 0, 255).astype(np.uint8)
-
-
-def source(text: str, modality: str) -> Source:
-    """A source from its name: ``0``, ``/dev/video2``, ``serial:D20345``, a video, a folder[@fps], or ``sim``[:seed]."""
-    if text == "sim" or text.startswith("sim:"):
-        seed = text.partition(":")[2] or "0"
-        if not seed.isdigit():
-            raise ValueError(f"source {text!r}: give sim or sim:NUMBER")
-        return Simulated(modality, int(seed))
-    if text.isdigit() or text.startswith("/dev/"):
-        return Camera(text)
-    if text.startswith("serial:"):
-        return Camera(text.removeprefix("serial:"))
-    name, at, rate = text.rpartition("@")
-    path, fps = (Path(name), rate) if at and not Path(text).exists() else (Path(text), "30")
-    if path.is_dir():
-        try:
-            return Folder(path, float(fps))
-        except ValueError:
-            raise ValueError(f"source {text!r}: {fps!r} is no frame rate, give e.g. {path}@30") from None
-    if path.is_file() and path.suffix.lower() in VIDEOS:
-        return Video(path)
-    raise ValueError(
-        f"source {text!r}: give a camera number, /dev/videoN, serial:NAME, a video file ({', '.join(VIDEOS)}),"
-        " a folder of pictures[@fps], or sim"
-    )
 
 
 class Stream:

@@ -24,16 +24,19 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvitac.batches import training_rows
+from mvitac.controls import controls_of
+from mvitac.device import describe, pick_device
 from mvitac.encoders import SCRATCH
 from mvitac.model import load
 from mvitac.pack import Pack
 from mvitac.plans import Plan, Row, slug
-from mvitac.probe import Session, chosen, controls_of, probe_runs
 from mvitac.record import digest, provenance, read_json, write_json
 from mvitac.registry import to_json
 from mvitac.run import Run
+from mvitac.session import Session, chosen, probe_runs
 from mvitac.stress import stress
-from mvitac.train import Diverged, describe, pick_device, train, training_rows
+from mvitac.train import Diverged, train
 
 
 @dataclass(frozen=True)
@@ -249,7 +252,7 @@ def _controls(work: Work, out: Path, session: Session) -> tuple[list[dict[str, A
     if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
         return kept["records"], kept["retrieval"]
     tasks, modalities = chosen(work.pack, session)
-    records, retrieval = controls_of(beside, work.pack, tasks, modalities, session)
+    records, retrieval = controls_of(beside, work.pack, tasks, modalities, session.probes, session.imagenet)
     write_json(path, {"key": key, "records": records, "retrieval": retrieval})
     return records, retrieval
 

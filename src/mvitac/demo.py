@@ -8,10 +8,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mvitac.probe import Session, probe_runs
 from mvitac.record import write_json
 from mvitac.report import write_report
 from mvitac.run import Run
+from mvitac.session import Session, probe_runs
 from mvitac.tables import print_retrieval, print_summary
 from mvitac.train import train
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from timm.models.resnet import BasicBlock, ResNet
 from torch import Tensor, nn
 
 from mvitac.record import brief
+from mvitac.spec import DataSpec
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -106,3 +108,12 @@ class Projected(nn.Module):
 def num_features(trunk: nn.Module) -> int:
     """Width D of a trunk's pooled features."""
     return int(trunk.num_features)  # type: ignore[arg-type]
+
+
+def build_towers(config: EncoderConfig, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
+    """A ``Projected`` per modality of ``spec``, with fresh weights drawn in its order; ``head`` makes one for D features."""
+    towers = nn.ModuleDict()
+    for modality in spec.modalities:
+        trunk = build_trunk(config, spec.channels(modality))
+        towers[modality] = Projected(trunk, head(num_features(trunk)))
+    return towers

@@ -15,9 +15,9 @@ from mvitac import figures, page, tables
 from mvitac.figures import HUES, MODALITY_HUES, Line
 from mvitac.model import Model
 from mvitac.pack import Pack
-from mvitac.probe import interval, summarise
 from mvitac.record import write_atomic
 from mvitac.run import Run
+from mvitac.scores import interval, summarise
 
 WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}
 """What a probe was given, in words."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mvitac import diagnostics, figures, page
 from mvitac.evidence import Study
-from mvitac.probe import features
+from mvitac.features import features
 
 NUM_MAP, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
 

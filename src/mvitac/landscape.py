@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvitac.features import features
 from mvitac.model import Model
 from mvitac.pack import Pack
-from mvitac.probe import features
 from mvitac.publish import with_readouts
 from mvitac.registry import unknown
 from mvitac.retrieval import nearest

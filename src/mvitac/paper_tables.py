@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from mvitac.plans import Plan
-from mvitac.probe import END_TO_END, paired_difference, summarise
 from mvitac.record import write_atomic, write_json
 from mvitac.registry import from_json
+from mvitac.scores import paired_difference, summarise
+from mvitac.session import END_TO_END
 from mvitac.stress import STRESSES
 from mvitac.tables import MODALITY_ORDER, PROBE_NAMES, retrieval_means
 

@@ -12,12 +12,15 @@ import numpy as np
 import safetensors.torch
 
 from mvitac.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, read_manifest, seal
+from mvitac.features import features
+from mvitac.heads import fit_linear, spread_out
 from mvitac.model import Model, load, load_run
 from mvitac.pack import Pack
-from mvitac.probe import features, fit_linear, parts, score, spread_out
+from mvitac.probe import parts
 from mvitac.readout import Question, Readout, constant, from_logistic
 from mvitac.record import brief, check_place, digest_file, write_atomic, write_json
 from mvitac.registry import to_json
+from mvitac.scores import score
 
 
 def fit_readouts(model: Model, pack: Pack) -> dict[str, Readout]:

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.pack import Pack, Sample, Source, build
+from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.record import check_place, digest_file, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json
+from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec
 
 SPOOL = 64

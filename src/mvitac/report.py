@@ -16,10 +16,11 @@ from mvitac import __version__, evidence, gallery, page, tables
 from mvitac.evidence import WORDS, Finished, Study
 from mvitac.model import load, load_run
 from mvitac.pack import Pack
-from mvitac.probe import Session, cross_modal, parts, probe_runs
+from mvitac.probe import cross_modal, parts
 from mvitac.record import write_atomic
 from mvitac.registry import to_json
 from mvitac.run import Run
+from mvitac.session import Session, probe_runs
 
 
 def write_report(

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mvitac.log import Sink
 from mvitac.registry import to_json, unknown
 from mvitac.run import Run
-from mvitac.train import Sink
 
 SINKS = ("tensorboard", "wandb", "trackio")
 

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvitac.features import features
 from mvitac.model import Model
 from mvitac.pack import Pack
-from mvitac.probe import Parts, features, parts, probe_features
+from mvitac.probe import Parts, parts, probe_features
 from mvitac.spec import Task
 
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}

@@ -18,10 +18,10 @@ def compare(argv: list[str]) -> None:
     from mvitac.datasets import DatasetConfig
     from mvitac.paper_tables import write_tables
     from mvitac.plans import PLANS, find_plan, setting
-    from mvitac.probe import Session
     from mvitac.recipes import RECIPES
     from mvitac.record import check_place, write_json
     from mvitac.registry import default, to_json, unknown
+    from mvitac.session import Session
 
     plan = find_plan(given.get("--plan", "table1"))
     if "--recipe" in given and given["--recipe"] not in RECIPES:

@@ -41,7 +41,7 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
     import tyro
     from rich.console import Console
 
-    from mvitac.pack import build
+    from mvitac.packing import build
     from mvitac.record import check_place
 
     @dataclass(frozen=True, kw_only=True)

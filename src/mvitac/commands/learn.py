@@ -68,8 +68,9 @@ def probe(argv: list[str]) -> None:
 
     from mvitac.model import load
     from mvitac.pack import Pack
-    from mvitac.probe import Session, chosen, probe_runs, summarise
     from mvitac.record import check_place, write_json
+    from mvitac.scores import summarise
+    from mvitac.session import Session, chosen, probe_runs
     from mvitac.stress import STRESSES, stress
     from mvitac.tables import print_retrieval, print_summary
 

@@ -21,7 +21,8 @@ def live(argv: list[str]) -> None:
     from rich.console import Console
     from rich.live import Live as Screen
 
-    from mvitac.capture import CaptureThread, Stream, source
+    from mvitac.cameras import source
+    from mvitac.capture import CaptureThread, Stream
     from mvitac.realtime import Live, LiveConfig, neighbours
     from mvitac.record import check_place, write_json
     from mvitac.recording import Recorder, finish

@@ -3,7 +3,17 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tyro.conf import Positional
+
 from mvitac.options import parse
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Embedding:
+    pack: Positional[Path]
+    """Folder of the pack."""
+    model: str
+    """A run's or an artifact's folder, or owner/name on the Hub."""
 
 
 def embed(argv: list[str]) -> None:
@@ -12,7 +22,6 @@ def embed(argv: list[str]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
     from rich.console import Console
-    from tyro.conf import Positional
 
     from mvitac.artifact import load
     from mvitac.pack import Pack
@@ -20,13 +29,9 @@ def embed(argv: list[str]) -> None:
     from mvitac.retrieval import check_pack, describe, embeddings
 
     @dataclass(frozen=True, kw_only=True)
-    class Options:
+    class Options(_Embedding):
         """Embeddings of every row of a pack, with ids, groups, splits and labels."""
 
-        pack: Positional[Path]
-        """Folder of the pack."""
-        model: str
-        """A run's or an artifact's folder, or owner/name on the Hub."""
         out: Path
         """The file: .npz (numpy) or .parquet."""
         shared: bool = False
@@ -57,20 +62,15 @@ def embed(argv: list[str]) -> None:
 def index(argv: list[str]) -> None:
     """mvitac index PACK --model M --out DIR"""
     from rich.console import Console
-    from tyro.conf import Positional
 
     from mvitac.artifact import load
     from mvitac.pack import Pack
     from mvitac.retrieval import build
 
     @dataclass(frozen=True, kw_only=True)
-    class Options:
+    class Options(_Embedding):
         """Index the pairs of a pack, to find the nearest known touches and pictures with mvitac find."""
 
-        pack: Positional[Path]
-        """Folder of the pack."""
-        model: str
-        """A run's or an artifact's folder, or owner/name on the Hub."""
         out: Path
         """The new folder."""
         splits: tuple[str, ...] = ()
@@ -100,7 +100,7 @@ def find(argv: list[str]) -> None:
     class Options:
         """The nearest known pairs to a picture, by exact cosine in the space that vision and touch share."""
 
-        image: tyro.conf.Positional[tuple[Path, ...]]
+        image: Positional[tuple[Path, ...]]
         """Picture files; a two-sensor touch is two files, left then right."""
         index: Annotated[Path, tyro.conf.arg(name="in")]
         """Folder of the index."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from mvitac.pack import Pack, Source, build, check_request
+from mvitac.pack import Pack
+from mvitac.packing import build, check_request
 from mvitac.record import cache_dir, check_place, digest
 from mvitac.registry import Registered
+from mvitac.source import Source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from mvitac.datasets.base import DatasetConfig
-from mvitac.pack import Pack, Source
+from mvitac.pack import Pack
+from mvitac.source import Source
 
 
 @dataclass(frozen=True, kw_only=True)

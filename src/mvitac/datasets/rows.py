@@ -20,9 +20,10 @@ from mvitac.datasets.manifest import Condition, Manifest
 from mvitac.datasets.named import check_files, check_present, image_columns, read_backgrounds
 from mvitac.datasets.places import Place, difference, mean_image, read_all
 from mvitac.datasets.splits import BY_GROUP, check_leak, check_sides, check_split_names, deal
-from mvitac.pack import Sample, Source, fit
+from mvitac.pack import fit
 from mvitac.record import digest
 from mvitac.registry import to_json
+from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec
 
 VERSION = 2

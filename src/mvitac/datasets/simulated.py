@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mvitac.datasets.base import DatasetConfig
-from mvitac.pack import Sample, Source
 from mvitac.sim import grasps, materials
+from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec, Task
 
 LICENCE = "Apache-2.0 (made by this package)"

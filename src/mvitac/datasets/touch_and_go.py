@@ -38,9 +38,10 @@ from mvitac.datasets.touch_and_go_lists import (
     read_list,
     read_lists,
 )
-from mvitac.pack import Count, Lost, Sample, Source, fit
+from mvitac.pack import fit
 from mvitac.record import digest, digest_file
 from mvitac.registry import to_json
+from mvitac.source import Count, Lost, Sample, Source
 from mvitac.spec import MODALITIES, DataSpec, Task
 from mvitac.video import frames, num_frames
 

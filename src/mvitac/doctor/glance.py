@@ -13,7 +13,9 @@ from mvitac.doctor import copies, pictures, tables
 from mvitac.doctor.finding import Finding
 from mvitac.doctor.looks import look_at
 from mvitac.doctor.sheet import Strips, strips_of
-from mvitac.pack import Count, Lost, Pack, Sample, Source, build
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.source import Count, Lost, Sample, Source
 from mvitac.spec import DataSpec
 
 

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from mvitac.doctor.finding import Finding, Verdict, share, some
-from mvitac.pack import SPLITS, Count, Pack
+from mvitac.pack import SPLITS, Pack
+from mvitac.source import Count
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
 """Columns that, where a dataset has them, should not lie on two sides of a split either."""

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Projected, build_trunk, num_features
+from mvitac.encoders import EncoderConfig, build_towers
 from mvitac.memory import Bank
 from mvitac.methods.base import Method, MethodConfig
 from mvitac.spec import DataSpec
@@ -79,10 +79,7 @@ class CMC(Method):
     def __init__(self, config: CMCConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.towers = nn.ModuleDict()
-        for modality in spec.modalities:
-            trunk = build_trunk(encoder, spec.channels(modality))
-            self.towers[modality] = Projected(trunk, nn.Linear(num_features(trunk), config.out))
+        self.towers = build_towers(encoder, spec, lambda width: nn.Linear(width, config.out))
         self.banks = nn.ModuleDict()
         self.register_buffer("rows", torch.zeros(0, dtype=torch.int64))
         self.register_buffer("z_norm", torch.zeros(2))  # Z of vision's and of touch's queries; 0 = not fixed yet

@@ -23,43 +23,30 @@ from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig
 from mvitac.losses import queue_nce
 from mvitac.memory import Queue
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Method
 from mvitac.methods.mvitac import MViTac, MViTacConfig
+from mvitac.methods.queued import QueueConfig
 from mvitac.spec import DataSpec
 
 SIDES = ("intra", "inter")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MCTConfig(MethodConfig):
+class MCTConfig(QueueConfig):
     """MViTac's towers with a queue and a margin, as in the method it adapts."""
 
     name: ClassVar[str] = "mct"
 
-    queue: int = 4096
-    """Keys remembered per modality and head; never more than half the training rows (see moco)."""
     margin: float = 0.2
     """By how much a pair's cosine must exceed that of a query with a key of the queue; not known for MCT."""
     temperature: float = 0.07
     """tau of the intra-modal losses."""
     lambda_inter: float = 1.0
     """Weight of the two inter-modal losses."""
-    momentum: float = 0.999
-    """m of the key towers (MoCo, which MCT builds on: .999)."""
-    momentum_end: float | None = None
-    """If given, m rises to this along a half cosine."""
-    out: int = 128
-    """Width of the embeddings."""
-    hidden: int = 512
-    """Hidden width of the 2-layer heads."""
-    head_norm: bool = False
-    """BatchNorm after the heads' first layer."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.check_fields(positive=("temperature",), weight=("margin", "lambda_inter"))
-        self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
-        if not 1 <= self.queue <= 1 << 24:
-            raise ValueError(f"queue {self.queue}: give 1 to {1 << 24} keys")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MCT:
         self.check_pairs(spec)
@@ -89,7 +76,7 @@ class MCT(Method):
         self.pending: dict[str, tuple[Tensor, Tensor]] = {}
 
     def prepare(self, rows: Tensor) -> None:
-        size = min(self.config.queue, max(1, len(rows) // 2))
+        size = self.config.queue_size(len(rows))
         names = [f"{m}_{side}" for m in self.towers.query for side in SIDES]
         self.queues = nn.ModuleDict({name: Queue(size, self.config.out) for name in names})
 

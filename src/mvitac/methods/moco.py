@@ -13,40 +13,27 @@ import torch
 from torch import Tensor, nn
 
 from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Head, Projected, build_trunk, num_features
+from mvitac.encoders import EncoderConfig, Head, build_towers
 from mvitac.losses import queue_nce
 from mvitac.memory import Queue
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Method
+from mvitac.methods.queued import QueueConfig
 from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
 
 
 @dataclass(frozen=True, kw_only=True)
-class MoCoConfig(MethodConfig):
+class MoCoConfig(QueueConfig):
     """Momentum contrast with a queue, per modality."""
 
     name: ClassVar[str] = "moco"
 
-    queue: int = 4096
-    """K, keys remembered; MoCo's 65,536 are 5 % of ImageNet, 4,096 are 5 % of Touch and Go. Never more than half the
-    training rows, so that a row seldom meets its own older key."""
     temperature: float = 0.2
     """tau (MoCo v2: .2)."""
-    momentum: float = 0.999
-    """m of the key tower (MoCo: .999)."""
-    momentum_end: float | None = None
-    """If given, m rises to this along a half cosine."""
-    out: int = 128
-    """Width of the embeddings (MoCo: 128)."""
-    hidden: int = 512
-    """Hidden width of the 2-layer head (MoCo v2: the trunk's own width)."""
-    head_norm: bool = False
-    """BatchNorm after the head's first layer (MoCo v2: none)."""
 
     def __post_init__(self) -> None:
-        self.check_fields(positive=("temperature",), share=("momentum", "momentum_end"), width=("out", "hidden"))
-        if not 1 <= self.queue <= 1 << 24:
-            raise ValueError(f"queue {self.queue}: give 1 to {1 << 24} keys")
+        super().__post_init__()
+        self.check_fields(positive=("temperature",))
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MoCo:
         return MoCo(self, spec, encoder)
@@ -60,17 +47,15 @@ class MoCo(Method):
     def __init__(self, config: MoCoConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.query = nn.ModuleDict()
-        for modality in spec.modalities:
-            trunk = build_trunk(encoder, spec.channels(modality))
-            head = Head(num_features(trunk), config.hidden, config.out, norm=config.head_norm)
-            self.query[modality] = Projected(trunk, head)
+        self.query = build_towers(
+            encoder, spec, lambda width: Head(width, config.hidden, config.out, norm=config.head_norm)
+        )
         self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.query.items()})
         self.queues = nn.ModuleDict()
         self.pending: dict[str, Tensor] = {}
 
     def prepare(self, rows: Tensor) -> None:
-        size = min(self.config.queue, max(1, len(rows) // 2))
+        size = self.config.queue_size(len(rows))
         self.queues = nn.ModuleDict({m: Queue(size, self.config.out) for m in self.query})
 
     def forward(self, batch: Views) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Head, Projected, build_trunk, num_features
+from mvitac.encoders import EncoderConfig, Head, build_towers
 from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.spec import DataSpec
 
@@ -59,11 +59,9 @@ class SimCLR(Contrastive):
     def __init__(self, config: SimCLRConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.towers = nn.ModuleDict()
-        for modality in spec.modalities:
-            trunk = build_trunk(encoder, spec.channels(modality))
-            head = Head(num_features(trunk), config.hidden, config.out, norm=config.head_norm)
-            self.towers[modality] = Projected(trunk, head)
+        self.towers = build_towers(
+            encoder, spec, lambda width: Head(width, config.hidden, config.out, norm=config.head_norm)
+        )
 
     def queries(self, batch: Views) -> dict[str, Tensor]:
         return {f"{m}_{i}": tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}

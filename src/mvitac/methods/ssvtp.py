@@ -17,7 +17,7 @@ from typing import ClassVar
 from torch import Tensor, nn
 
 from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Projected, build_trunk, num_features
+from mvitac.encoders import EncoderConfig, build_towers
 from mvitac.losses import info_nce
 from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.spec import DataSpec
@@ -48,10 +48,7 @@ class SSVTP(Contrastive):
     def __init__(self, config: SSVTPConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.towers = nn.ModuleDict()
-        for modality in spec.modalities:
-            trunk = build_trunk(encoder, spec.channels(modality))
-            self.towers[modality] = Projected(trunk, nn.Linear(num_features(trunk), config.out))
+        self.towers = build_towers(encoder, spec, lambda width: nn.Linear(width, config.out))
 
     def queries(self, batch: Views) -> dict[str, Tensor]:
         return {m: tower(batch.images[m][0]) for m, tower in self.towers.items()}

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Projected, build_trunk, num_features
+from mvitac.encoders import EncoderConfig, build_towers
 from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.spec import DataSpec
 
@@ -68,14 +68,15 @@ class VICReg(Contrastive):
     def __init__(self, config: VICRegConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.towers = nn.ModuleDict()
-        for modality in spec.modalities:
-            trunk, hidden = build_trunk(encoder, spec.channels(modality)), config.hidden
+        hidden = config.hidden
+
+        def expander(features: int) -> nn.Module:
             layers: list[nn.Module] = []
-            for width in (num_features(trunk), hidden):
+            for width in (features, hidden):
                 layers += [nn.Linear(width, hidden), nn.BatchNorm1d(hidden), nn.ReLU()]
-            expander = nn.Sequential(*layers, nn.Linear(hidden, hidden, bias=False))
-            self.towers[modality] = Projected(trunk, expander)
+            return nn.Sequential(*layers, nn.Linear(hidden, hidden, bias=False))
+
+        self.towers = build_towers(encoder, spec, expander)
 
     def queries(self, batch: Views) -> dict[str, Tensor]:
         return {f"{m}_{i}": tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}

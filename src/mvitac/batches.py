@@ -1,0 +1,143 @@
+"""What each step learns from: which rows, in which order, and the random views of them.
+
+All of it is a function of (seed, step), so a resumed run sees what it would have seen, and two processes see what one sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvitac.augment import random_view
+from mvitac.batch import Views
+from mvitac.distributed import World
+from mvitac.feed import Feed, ahead
+from mvitac.pack import Pack
+from mvitac.run import Run
+from mvitac.step import Part
+
+
+def training_rows(run: Run, pack: Pack) -> np.ndarray:
+    """Pack rows to pre-train on; a method that learns from labels sees only rows that carry one it needs."""
+    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)  # a pair with a hole in it is no pair
+    tasks = run.method.labels_needed(pack.spec)
+    if not tasks:
+        return rows
+    labels = {task: pack.labels(task, "train")[rows] >= 0 for task in tasks}
+    for task, there in labels.items():
+        if not there.any():
+            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+    return rows[np.logical_or.reduce(list(labels.values()))]
+
+
+def mix(*numbers: int) -> int:
+    """One 63-bit seed from several numbers, by numpy's SeedSequence."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
+
+
+def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) -> Iterator[np.ndarray]:
+    """Pack rows of each step from ``start`` on; an epoch's order depends on (seed, epoch) alone."""
+    per_epoch = run.steps_per_epoch(len(rows))
+    touch_groups = pack.touch_groups[rows] if run.sampler == "one-per-touch" else None
+    order, ordered_epoch = rows, -1
+    for step in range(start, num_steps):
+        epoch, place = divmod(step, per_epoch)
+        if epoch != ordered_epoch:
+            order, ordered_epoch = rows[epoch_order(len(rows), touch_groups, mix(run.seed, 1, epoch))], epoch
+        yield order[place * run.batch_size : (place + 1) * run.batch_size]
+
+
+def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
+    """A permutation of 0..num-1; with ``groups``, all first rows of every group come first, then all second ones, ...
+
+    so that any stretch not longer than the number of groups holds hardly two rows of one group.
+    """
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(num)
+    if groups is None:
+        return order
+    _, inverse, counts = np.unique(groups[order], return_inverse=True, return_counts=True)
+    by_group = np.argsort(inverse, kind="stable")
+    occurrence = np.empty(num, np.int64)
+    occurrence[by_group] = np.arange(num) - np.repeat(np.cumsum(counts) - counts, counts)
+    return order[np.argsort(occurrence, kind="stable")]
+
+
+def feed_parts(
+    run: Run,
+    pack: Pack,
+    rows: np.ndarray,
+    num_views: int,
+    device: torch.device,
+    world: World,
+    start: int,
+    num_steps: int,
+) -> Iterator[list[Part]]:
+    """The parts of each step's batch that this process embeds: chunk by chunk of its own share of the rows.
+
+    Views depend on (seed, step, part) alone, so two processes see what one process sees with a chunk of half the batch.
+    """
+    feed = Feed(pack, device)
+    share = run.batch_size // world.size
+    per_process = share // (run.chunk or share)
+    num_parts = per_process * world.size
+
+    def part(step: int, batch: np.ndarray, number: int) -> Views:
+        seed = mix(run.seed, step) if num_parts == 1 else mix(run.seed, step, number)
+        chunk = np.split(batch, num_parts)[number]
+        return make_views(run, pack, chunk, num_views, torch.Generator().manual_seed(seed), device, feed)
+
+    numbers = range(per_process * world.rank, per_process * (world.rank + 1))
+    steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
+    if device.type == "cuda" and per_process == 1:
+        for made in ahead((part(step, batch, numbers[0]) for step, batch in steps), device):
+            yield [partial(_same, made)]
+        return
+    for step, batch in steps:
+        yield [partial(part, step, batch, number) for number in numbers]
+
+
+def _same(views: Views) -> Views:
+    return views
+
+
+def make_views(
+    run: Run,
+    pack: Pack,
+    rows: np.ndarray,
+    num_views: int,
+    generator: torch.Generator,
+    device: torch.device,
+    feed: Feed,
+) -> Views:
+    """Random views of the pack's ``rows`` on ``device``, in the precision the networks read them in."""
+    sources = [rows] * num_views
+    if run.positives == "same-touch":
+        sources[1:] = [partners(pack, rows, generator) for _ in range(num_views - 1)]
+    dtype = torch.bfloat16 if run.precision == "bf16" else torch.float32
+    images: dict[str, list[Tensor]] = {}
+    for modality in pack.spec.modalities:
+        config, images[modality] = getattr(run.augment, modality), []
+        for source in sources:
+            view = random_view(feed(modality, source), config, run.augment.size, generator, dtype)
+            images[modality].append(view)
+    labels = {t.name: torch.from_numpy(pack.labels(t.name, "train")[rows]).to(device) for t in pack.spec.tasks}
+    return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
+
+
+def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
+    """For each of ``rows`` a random other row of its touch group in the same split, or itself if it is alone there."""
+    groups, split = pack.touch_groups, pack.column("split")
+    whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
+    draws = torch.rand(len(rows), generator=generator).numpy()
+    found = rows.copy()
+    for i, row in enumerate(rows):
+        others = pack.rows_of(int(groups[row]))
+        others = others[(others != row) & (split[others] == split[row]) & whole[others]]
+        if len(others):
+            found[i] = others[int(draws[i] * len(others))]
+    return found

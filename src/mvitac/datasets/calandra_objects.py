@@ -1,0 +1,89 @@
+"""Calandra's objects: the authors' lists, the repair of cut and misspelt names, and the owners' way of dealing them.
+
+Sources: github.com/robertocalandra/the-feeling-of-success (repairs, shuffle); github.com/ligerfotis/mvitac (the lists).
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+_TEST = """international_travel_adapter 3d_printed_blue_connector soft_zebra fake_flower_in_pot metal_can french_dip
+metal_cylinder_with_holes soft_beer_bottle_holder"""
+_TRAIN = """cinnamon potato aspirin red_turtle happy_fall_stone monster_truck soft_red_cube lime ogx_shampoo peanut_butter
+chocolate_shake webcam_box rubics_cube muffin red_bull purple_small_plastic_fruit onion soft_blue_hexagon plastic_cow
+fox_head small_coffe_cup lemon red_apple 3d_printed_white_ball set_small_plastic_men_police_man dog_toy_ice_cream_cone
+playdoh_container bandaid_box emergency_stop_button_for_sawyer plastic_duck brown_paper_cup_2_upside mentos_gum_can"""
+AUTHORS_TEST, AUTHORS_TRAIN = tuple(_TEST.split()), tuple(_TRAIN.split())
+"""The paper's 40 most attempted objects as its authors list them (spelling theirs)."""
+
+
+REPAIRS = {
+    "plastic_duc": "plastic_duck",
+    "hair_dryer_": "hair_dryer_spiky_nozzle",
+    "light_blue_": "light_blue_translucent_object",
+    "brown_paper": "brown_paper_bag",
+    "beans_in_pa": "beans_in_paper_container",
+    "shampoo_whi": "shampoo_white_bottle",
+    "small_blue_": "small_blue_plastic_spoon",
+    "dove_deodor": "dove_deodorant",
+    "yellow_bulb": "yellow_bulb_man",
+    "toy_person_with_hat": "set_small_plastic_men_yellow_construction_worker",
+}
+"""Names as some recordings hold them (cut to 11 letters, or another word) -> the object, as the owners repair them."""
+
+
+def object_name(value: Any, repairs: dict[str, str]) -> str:
+    """An object_name attribute (bytes, text, or an array of one) as a repaired name."""
+    value = np.asarray(value).reshape(-1)
+    if len(value) != 1 or not isinstance(value[0], (bytes, str)):
+        raise ValueError(f"it is {value.tolist()}, not one name")
+    text = value[0].decode("utf-8") if isinstance(value[0], bytes) else str(value[0])
+    name = text.strip(" \0\n\r\t")
+    if not name:
+        raise ValueError("it is empty")
+    return repairs.get(name, name)
+
+
+def most_attempted(counts: Counter[str], num: int = 40) -> list[str]:
+    """The ``num`` objects with most attempts; ties go by name."""
+    return sorted(counts, key=lambda name: (-counts[name], name))[:num]
+
+
+def doubtful(counts: Counter[str]) -> list[tuple[str, str]]:
+    """Pairs (name, the name it may stand for): the rarer begins the other, or differs from it by one letter."""
+    names = sorted(counts, key=lambda name: (-counts[name], name))
+    pairs = []
+    for i, name in enumerate(names):
+        for likely in names[:i]:
+            cut = len(name) >= 8 and likely.startswith(name)
+            slip = len(name) >= 5 and abs(len(name) - len(likely)) <= 1 and _one_edit(name, likely)
+            if cut or slip:
+                pairs.append((name, likely))
+                break
+    return pairs
+
+
+def _one_edit(a: str, b: str) -> bool:
+    """Whether one letter added, dropped or changed turns ``a`` into ``b``."""
+    a, b = sorted((a, b), key=len)
+    same = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
+    return a[same:] == b[same + 1 :] or a[same + 1 :] == b[same + 1 :]
+
+
+def doubtful_text(counts: Counter[str]) -> str:
+    pairs = [f"{name} ({counts[name]}) for {likely} ({counts[likely]})?" for name, likely in doubtful(counts)]
+    return f"{'; '.join(pairs)} repair with --data.repairs written=right" if pairs else ""
+
+
+def owners_shuffle(names: Sequence[str], seed: int) -> list[str]:
+    """Sorted ``names`` in the order of the owners' script: Python 2's random.shuffle after random.seed(seed)."""
+    dealt, generator = sorted(names), random.Random(seed)
+    for i in reversed(range(1, len(dealt))):
+        j = int(generator.random() * (i + 1))
+        dealt[i], dealt[j] = dealt[j], dealt[i]
+    return dealt

@@ -1,0 +1,24 @@
+"""Features of a pack's rows by a frozen model, computed once: kept in the cache by weights, data and rows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvitac.model import Model, pack_features
+from mvitac.pack import Pack
+from mvitac.record import cache_dir, digest, write_atomic
+
+
+def features(model: Model, pack: Pack, modality: str, rows: np.ndarray) -> np.ndarray:
+    """Features [len(rows), D] float32, computed once and cached by weights, data and rows."""
+    device = next(model.parameters()).device
+    key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type])
+    path = cache_dir() / "features" / f"{key[:32]}.npy"
+    if path.exists():
+        try:
+            return np.load(path, allow_pickle=False)
+        except (ValueError, EOFError, OSError):
+            path.unlink()  # damaged: compute it again
+    values = pack_features(model, pack, modality, rows).numpy()
+    write_atomic(path, lambda file: np.save(file, values))
+    return values

@@ -1,0 +1,73 @@
+"""What a run says of itself while it trains: log.jsonl, the progress line, and the sinks one may add."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from mvitac.record import naming, write_atomic
+
+Sink = Callable[[int, dict[str, float]], None]
+
+
+class Log:
+    """log.jsonl, the progress line, and the sinks; on resume, lines after the checkpoint are dropped."""
+
+    def __init__(self, out: Path, start: int, num_steps: int, quiet: bool, sinks: tuple[Sink, ...]) -> None:
+        path = out / "log.jsonl"
+        kept = []
+        if path.exists():
+            for line in path.read_text(errors="replace").splitlines():
+                try:
+                    entry = json.loads(line)
+                    early = entry["step"] <= start
+                except (ValueError, TypeError, KeyError):
+                    break  # the line that was being written when the run was killed
+                if early:
+                    kept.append(line + "\n")
+        write_atomic(path, lambda file: file.write("".join(kept).encode()))
+        self.path, self.file = path, path.open("a")
+        self.sinks, self.start, self.since, self.since_step = sinks, start, time.perf_counter(), start
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn())
+        times = (TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[text]}"))
+        self.progress = Progress(*columns, *times, disable=quiet)
+        self.bar = self.progress.add_task("pre-training", total=num_steps, completed=start, text="")
+
+    def __enter__(self) -> Log:
+        self.progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.progress.stop()
+        with naming(self.path):
+            self.file.close()
+
+    def step(self, step: int, losses: dict[str, float], lr: float, batch_size: int) -> None:
+        now = time.perf_counter()
+        speed = (step - self.since_step) * batch_size / max(1e-9, now - self.since)
+        self.since, self.since_step = now, step
+        self._write({"step": step, **losses, "lr": lr, "pairs_per_s": round(speed, 1)})
+        text = " ".join(f"{name} {value:.2f}" for name, value in losses.items())
+        self.progress.update(self.bar, text=f"{text}  {speed:.0f}/s")
+
+    def advance(self, step: int) -> None:
+        self.progress.update(self.bar, completed=step)
+
+    def evaluation(self, step: int, values: dict[str, float]) -> None:
+        self._write({"step": step, "eval": values})
+        best = [f"{name} {value:.3f}" for name, value in values.items() if "knn" in name or name.endswith("R@5")]
+        if not self.progress.disable:
+            self.progress.console.print(f"step {step}: " + ", ".join(best), soft_wrap=True, highlight=False)
+
+    def _write(self, entry: dict[str, Any]) -> None:
+        with naming(self.path):
+            self.file.write(json.dumps(entry) + "\n")
+            self.file.flush()
+        flat = {k: v for k, v in {**entry, **entry.get("eval", {})}.items() if isinstance(v, float)}
+        for sink in self.sinks:
+            sink(entry["step"], flat)

@@ -1,0 +1,107 @@
+"""What predictions are worth: scores by test group, their intervals, and differences between methods on the same groups.
+
+A record is one probe of one source on one task: ``score`` writes its ``group_sizes`` and ``group_correct``, and every
+interval resamples those groups (near-copies of one another inside, independent of one another outside) and the seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
+
+NUM_DRAWS = 2000
+"""Bootstrap draws behind every interval."""
+
+
+def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_classes: int) -> dict[str, Any]:
+    """Scores of one probe on test rows; ``groups`` are the rows' group numbers, for intervals."""
+    guess = probabilities.argmax(1)
+    present = np.unique(y)
+    num_groups = int(groups.max()) + 1
+    auroc = None
+    no_division: dict[str, Any] = {"zero_division": 0}  # a class that is never guessed has precision 0
+    if num_classes == 2 and len(present) == 2:
+        auroc = float(roc_auc_score(y, probabilities[:, 1]))
+    return {
+        "accuracy": float((guess == y).mean()),
+        "balanced_accuracy": float(recall_score(y, guess, labels=present, average="macro", **no_division)),
+        "macro_f1": float(f1_score(y, guess, labels=present, average="macro", **no_division)),
+        "auroc": auroc,
+        "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist(),
+        "num_test": len(y),
+        "group_sizes": np.bincount(groups, minlength=num_groups).tolist(),
+        "group_correct": np.bincount(groups, weights=guess == y, minlength=num_groups).astype(int).tolist(),
+    }
+
+
+def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
+    """Mean accuracy over runs and its 95 % interval, by a two-level bootstrap over test groups and over seeds.
+
+    All records must score the same test groups. Groups (not rows) are drawn, since rows of a group are near-copies.
+    One group says nothing about others: its interval is all of 0 to 1.
+    """
+    sizes = np.array(records[0]["group_sizes"], float)
+    correct = np.array([r["group_correct"] for r in records], float)  # [S, G]
+    if len(sizes) < 2:
+        return float(correct.sum(1).mean() / sizes.sum()), 0.0, 1.0
+    rng = np.random.default_rng(0)
+    seeds = rng.integers(0, len(correct), (NUM_DRAWS, len(correct)))
+    groups = rng.integers(0, len(sizes), (NUM_DRAWS, len(sizes)))
+    weights = np.stack([np.bincount(g, minlength=len(sizes)) for g in groups])  # [draws, G]
+    per_seed = weights @ correct.T / np.maximum(weights @ sizes, 1)[:, None]  # [draws, S]
+    means = np.take_along_axis(per_seed, seeds, axis=1).mean(1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(correct.sum(1).mean() / sizes.sum()), float(low), float(high)
+
+
+def paired_difference(
+    ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]
+) -> tuple[float, float, float, float]:
+    """Accuracy of ``ours`` minus that of ``theirs`` over the same test groups: mean, 95 % interval, two-sided p.
+
+    Bootstrap over test groups, the same ones drawn for both, and over seeds: together where both have the same seeds
+    (equal seeds share batches and views), apart otherwise. p is twice the share of draws on the other side of zero, at
+    least 2 / (draws + 1). One group says nothing about others: p is 1.
+    """
+    sizes = np.array(ours[0]["group_sizes"], float)
+    assert all(list(r["group_sizes"]) == list(sizes) for r in (*ours, *theirs)), "scored on different test rows"
+    a, b = (np.array([r["group_correct"] for r in found], float) for found in (ours, theirs))  # [S, G]
+    mean = float((a.sum(1).mean() - b.sum(1).mean()) / sizes.sum())
+    if len(sizes) < 2:
+        return mean, -1.0, 1.0, 1.0
+    rng = np.random.default_rng(0)
+    drawn_a = rng.integers(0, len(a), (NUM_DRAWS, len(a)))
+    together = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
+    drawn_b = drawn_a if together else rng.integers(0, len(b), (NUM_DRAWS, len(b)))
+    groups = rng.integers(0, len(sizes), (NUM_DRAWS, len(sizes)))
+    weights = np.stack([np.bincount(g, minlength=len(sizes)) for g in groups])  # [draws, G]
+    total = np.maximum(weights @ sizes, 1)[:, None]
+    gaps = [
+        np.take_along_axis(weights @ x.T / total, drawn, axis=1).mean(1) for x, drawn in ((a, drawn_a), (b, drawn_b))
+    ]
+    draws = gaps[0] - gaps[1]
+    low, high = np.percentile(draws, [2.5, 97.5])
+    tail = min(int((draws <= 0).sum()), int((draws >= 0).sum()))
+    return mean, float(low), float(high), min(1.0, 2 * (tail + 1) / (NUM_DRAWS + 1))
+
+
+def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
+    """task -> modality -> method or control -> mean, low, high, seeds (accuracy; see ``interval``).
+
+    A source that was not probed by ``probe`` (majority, pixels, ...) shows the one probe it has.
+    """
+    asked = {record["source"] for record in records if record["probe"] == probe}
+    gathered: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    for record in records:
+        if record["probe"] == probe or record["source"] not in asked:
+            gathered.setdefault((record["task"], record["modality"], record["source"]), []).append(record)
+    summary: dict[str, Any] = {}
+    for (task, modality, source), found in gathered.items():
+        mean, low, high = interval(found)
+        seeds = [record["seed"] for record in found if record["seed"] is not None]
+        cell = {"mean": mean, "low": low, "high": high, "seeds": seeds}
+        summary.setdefault(task, {}).setdefault(modality, {})[source] = cell
+    return summary
