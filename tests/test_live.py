@@ -13,7 +13,8 @@ from PIL import Image
 
 from mvitac.capture import CaptureThread, Folder, Simulated, Stream, source
 from mvitac.cli import main
-from mvitac.pack import Pack
+from mvitac.datasets.lerobot import LeRobotConfig
+from mvitac.pack import Pack, build
 from mvitac.realtime import Contact, Live, LiveConfig
 from mvitac.recording import Recorder, finish
 from mvitac.runtime import Engine
@@ -221,8 +222,8 @@ def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
 
     world = World(engine, record=record)
     world.run(40)
-    pack = recorder.close()
-    assert pack is not None and pack.num == pytest.approx(200, abs=4)
+    assert recorder.close() == pytest.approx(200, abs=4)
+    pack = Pack(tmp_path / "pack")
     times = dict(kept)
     for row in (0, 77, pack.num - 1):
         assert np.array_equal(pack.images["touch"][row], times[pack.column("time")[row]])
@@ -232,17 +233,58 @@ def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
         Recorder(tmp_path / "pack", {"vision": 3, "touch": 3})
 
 
-def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "pack", {"touch": 3}, fps=1.0)
+def test_a_recording_is_a_lerobot_dataset(engine: Engine, tmp_path: Path) -> None:
+    """Our reader finds every recorded pair again, bit for bit, at the time it was seen; an episode is one touch."""
+    recorder = Recorder(tmp_path / "set", {"vision": 3, "touch": 3}, fps=5.0, form="lerobot")
+    kept: dict[float, dict[str, np.ndarray]] = {}
+
+    def record(images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
+        kept[columns["time"]] = images
+        recorder(images, columns)
+
+    world = World(engine, record=record)
+    world.run(20)
+    num = recorder.close()
+    assert num == pytest.approx(100, abs=4) and not list(tmp_path.glob("*.spool"))
+    config = LeRobotConfig(path=tmp_path / "set", size=32, group="group")
+    back = build(config.source(), tmp_path / "back", size=32, quiet=True)
+    assert back.num == num and set(back.column("split")) == {"unlabelled"}
+    for row, time in enumerate(back.column("time").astype(float)):
+        for modality, images in back.images.items():
+            assert np.array_equal(images[row], kept[time][modality])
+    touched = back.column("group")[back.column("contact") == "True"]
+    assert set(touched) == {f"touch-{i:06d}" for i in range(1, world.live.num_touches + 1)}
+    episodes = {tuple(pair) for pair in np.stack([back.column("episode"), back.column("group")], 1)}
+    assert len(episodes) == len(set(back.column("episode"))) == len(set(back.column("group")))
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert info["fps"] == 5 and info["total_frames"] == num
+
+
+def test_a_rate_that_cannot_be_recorded(tmp_path: Path) -> None:
+    for form, fps, says in (("lerobot", 2.5, "fps 2.5: .* whole number"), ("pack", 0.0, "more than 0")):
+        with pytest.raises(ValueError, match=says):
+            Recorder(tmp_path / "out", {"touch": 3}, fps=fps, form=form)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("form", ["pack", "lerobot"])
+def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    recorder = Recorder(out, {"touch": 3}, fps=1.0, form=form)
     image = np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
         recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch": i // 2})
     del recorder  # killed: two of three parts are on disk
     with pytest.raises(ValueError, match="not finished: `mvitac live --finish"):
-        Recorder(tmp_path / "pack", {"touch": 3})
-    assert main(["live", "--finish", str(tmp_path / "pack")]) == 0
-    pack = Pack(tmp_path / "pack")
-    assert pack.num == 128 and pack.images["touch"][100, 0, 0, 0] == 100
+        Recorder(out, {"touch": 3})
+    assert main(["live", "--finish", str(out)]) == 0
+    if form == "lerobot":
+        source = LeRobotConfig(path=out, size=16).source()
+        pack = build(source, tmp_path / "pack", size=16, quiet=True)
+    else:
+        pack = Pack(out)
+    assert pack.num == 128
+    assert np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
     with pytest.raises(ValueError, match="no unfinished recording"):
         finish(tmp_path / "other")
 

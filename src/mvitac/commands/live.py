@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
-    from typing import Annotated
+    from typing import Annotated, Literal
 
     import tyro
     from rich.console import Console
@@ -28,7 +28,7 @@ def live(argv: list[str]) -> None:
     from mvitac.retrieval import Index
 
     if argv[:1] == ["--finish"] and len(argv) == 2:
-        Console().print(f"{finish(Path(argv[1])).path}", soft_wrap=True, highlight=False)
+        Console().print(f"{argv[1]}: {finish(Path(argv[1]))} pairs", soft_wrap=True, highlight=False)
         return
 
     @dataclass(frozen=True, kw_only=True)
@@ -49,9 +49,11 @@ def live(argv: list[str]) -> None:
         index: Path | None = None
         """Show the nearest known touches from this index."""
         record: Path | None = None
-        """Record what comes in as a pack, in this new folder."""
+        """Record what comes in, in this new folder."""
+        record_as: Literal["pack", "lerobot"] = "pack"
+        """What the recording becomes: a pack, or a LeRobotDataset v3 (an episode per touch)."""
         record_fps: float = 10.0
-        """Pairs a second to record."""
+        """Pairs a second to record; a whole number for lerobot."""
         seconds: float | None = None
         """Stop after so long."""
         threads: int = 0
@@ -80,7 +82,8 @@ def live(argv: list[str]) -> None:
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
     recorder = None
     if options.record:
-        recorder = Recorder(options.record, {m: s[2] for m, s in engine.inputs.items()}, fps=options.record_fps)
+        channels = {m: s[2] for m, s in engine.inputs.items()}
+        recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
     nearest = neighbours(index, options.live.neighbours) if index else None
     # What happened is printed above the picture, so that it stays in the scrollback and in a log file.
     loop = Live(
@@ -117,8 +120,8 @@ def live(argv: list[str]) -> None:
             thread.join(2.0)  # a device that hangs must not hang us
     summary = loop.summary()
     if recorder:
-        pack = recorder.close()
-        console.print(f"recorded: {pack.path}, {pack.num} pairs" if pack else "nothing was recorded", soft_wrap=True)
+        num = recorder.close()
+        console.print(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded", soft_wrap=True)
     _conclude(summary, console)
     if options.json:
         write_json(options.json, summary)
