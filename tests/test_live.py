@@ -18,6 +18,7 @@ from mvitac.pack import Pack, build
 from mvitac.realtime import Contact, Live, LiveConfig
 from mvitac.recording import Recorder, finish
 from mvitac.runtime import Engine
+from mvitac.window import Window, draw
 
 
 @pytest.fixture(scope="module")
@@ -287,6 +288,62 @@ def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
     assert np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
     with pytest.raises(ValueError, match="no unfinished recording"):
         finish(tmp_path / "other")
+
+
+@pytest.mark.parametrize("modalities", [("vision", "touch"), ("touch",)])
+def test_the_picture_shows_frames_contact_and_answers(engine: Engine, modalities: tuple[str, ...]) -> None:
+    class Part:
+        """The engine, of some of its inputs."""
+
+        inputs, classes = {m: engine.inputs[m] for m in modalities}, engine.classes
+
+        def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+            zeros = {m: np.zeros((1, *shape), np.uint8) for m, shape in engine.inputs.items()}
+            return engine(**{**zeros, **images})
+
+    world = World(engine)
+    world.live = Live(Part(), {m: world.streams[m] for m in modalities}, LiveConfig(calibration=8), clock=world.clock)  # type: ignore[arg-type]
+    empty = draw(world.live)
+    while not world.live.num_predictions:
+        world.run(0.1)
+    world.rigs["vision"].fault = "unplugged"
+    world.run(0.1)
+    picture = draw(world.live)
+    assert picture.dtype == np.uint8 and picture.shape == empty.shape == (256 + 24 * 4, 512, 3)
+    for i, modality in enumerate(modalities):
+        frame = Image.fromarray(world.rigs[modality].picture).resize((248, 248), Image.Resampling.BICUBIC)
+        assert np.array_equal(picture[4:252, 256 * i + 4 : 256 * i + 252], np.asarray(frame))
+        assert tuple(picture[0, 256 * i + 9]) == ((60, 170, 90) if modality == "touch" else (200, 60, 50))
+    shown = (picture[256 + 24 : 256 + 48, 256:] == 130).all(2).any(0).sum()  # the bar of the first answer
+    _, confidence = next(iter(world.live.answers(world.live.touch).values()))
+    assert shown >= round(confidence * (256 - 60)) > 0
+    assert not (empty[256 + 24 :, 256:] == 130).all(2).any()
+
+
+def test_a_window_or_why_not(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2 = pytest.importorskip("cv2")
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["live", "any", "--window"]) == 2
+    said = capsys.readouterr().err
+    assert "there is no display" in said and said.count("\n") == 1
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(cv2, "currentUIFramework", lambda: "")
+    with pytest.raises(ValueError, match=r"has no windows .*install opencv-python in its place"):
+        Window()
+    shown: list[np.ndarray] = []
+    keys = iter([-1, ord("q"), -1])
+    monkeypatch.setattr(cv2, "currentUIFramework", lambda: "GTK3")
+    monkeypatch.setattr(cv2, "namedWindow", lambda title: None)
+    monkeypatch.setattr(cv2, "imshow", lambda title, image: shown.append(image))
+    monkeypatch.setattr(cv2, "waitKey", lambda wait: next(keys))
+    monkeypatch.setattr(cv2, "getWindowProperty", lambda title, name: float(len(shown) < 3))
+    window = Window()
+    picture = np.zeros((4, 6, 3), np.uint8)
+    picture[..., 0] = 200
+    assert window.show(picture) and not window.show(picture) and not window.show(picture)
+    assert (shown[0] == (0, 0, 200)).all()  # red, as OpenCV orders it
 
 
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

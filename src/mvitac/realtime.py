@@ -234,6 +234,11 @@ class Live:
         if event.what in ("resolution changed", "back") and event.stream in self.contacts:
             self.contacts[event.stream].forget()
 
+    def state(self, stream: Stream) -> str:
+        """What a stream is doing, in a word: its fault, "calibrating" or "good"."""
+        contact = self.contacts.get(stream.name)
+        return stream.fault or ("calibrating" if contact and contact.background is None else "good")
+
     def answers(self, touch: Touch | None) -> dict[str, tuple[str, float]]:
         """(class, confidence) by task of a touch."""
         if touch is None or not touch.num_frames:
