@@ -125,7 +125,12 @@ def experiment(model: Model, pack: Pack, seeds: int, candidates: int) -> dict[st
     played: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for seed in range(seeds):
         chance = np.random.default_rng([seed, 1]).random(len(y))
-        for name, p in {"first grasp": np.ones(len(y)), "chance": chance, **known, "oracle": y.astype(float)}.items():
+        for name, p in {
+            "first grasp": np.full(len(y), np.inf),
+            "chance": chance,
+            **known,
+            "oracle": y.astype(float),
+        }.items():
             both = played.setdefault(name, {"again": [], "best": []})
             for rule, threshold in (("again", 0.5), ("best", NEVER)):
                 both[rule].append({"seed": seed, **play(p, y, objects, hands[seed], threshold)})
