@@ -261,6 +261,24 @@ def test_a_recording_is_a_lerobot_dataset(engine: Engine, tmp_path: Path) -> Non
     assert info["fps"] == 5 and info["total_frames"] == num
 
 
+def test_a_recording_of_a_gripper_is_packed_again_as_it_was(tmp_path: Path) -> None:
+    """Two gels: the dataset's own columns must not pass for images."""
+    recorder = Recorder(tmp_path / "set", {"vision": 3, "touch": 6}, fps=1.0, form="lerobot")
+    rng = np.random.default_rng(3)
+    kept = [
+        {m: rng.integers(0, 256, (16, 16, c), dtype=np.uint8) for m, c in (("vision", 3), ("touch", 6))}
+        for _ in range(4)
+    ]
+    for i, images in enumerate(kept):
+        recorder(images, {"time": float(i), "contact": True, "touch_number": 1})
+    assert recorder.close() == 4
+    command = ["data", "pack", "--data", "lerobot", "--path", str(tmp_path / "set"), "--size", "16", "--quiet"]
+    assert main([*command, "--out", str(tmp_path / "back")]) == 0
+    back = Pack(tmp_path / "back")
+    for modality, images in back.images.items():
+        assert np.array_equal(images, np.stack([pair[modality] for pair in kept]))
+
+
 def test_a_rate_that_cannot_be_recorded(tmp_path: Path) -> None:
     for form, fps, says in (("lerobot", 2.5, "fps 2.5: .* whole number"), ("pack", 0.0, "more than 0")):
         with pytest.raises(ValueError, match=says):
@@ -274,7 +292,7 @@ def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
     recorder = Recorder(out, {"touch": 3}, fps=1.0, form=form)
     image = np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
-        recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch": i // 2})
+        recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})
     del recorder  # killed: two of three parts are on disk
     with pytest.raises(ValueError, match="not finished: `mvitac live --finish"):
         Recorder(out, {"touch": 3})

@@ -196,7 +196,7 @@ class Live:
         else:
             self._release(now)
         if self.record:
-            self.record(images, {"time": now, "contact": bool(self.contact), "touch": self.num_touches})
+            self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return made
 
     @property

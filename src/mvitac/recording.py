@@ -60,7 +60,7 @@ class Recorder:
         self._next = float("-inf")
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
-        """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch."""
+        """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch_number."""
         if columns["time"] < self._next:
             return
         # Counted from the last due time, not from this pair's: else every delay would lower the rate.
@@ -140,7 +140,7 @@ class Recorded(Source):
         for i in range(len(columns["time"])):
             own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
             # Frames between touches belong to nothing; each touch is a group of near-copies.
-            group = f"touch-{own['touch']:06d}" if own["contact"] else f"rest-{own['touch']:06d}"
+            group = f"touch-{own['touch_number']:06d}" if own["contact"] else f"rest-{own['touch_number']:06d}"
             own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled"}
             samples.append(Sample(vision=pick("vision", i), touch=pick("touch", i), columns=own))
         return samples
