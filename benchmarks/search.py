@@ -1,23 +1,65 @@
-"""Exact search over a million embeddings: time, memory and agreement beside scikit-learn's brute force.
+"""Exact search over a million embeddings: time, memory and agreement beside scikit-learn's brute force and vector libraries.
 
-    python -m benchmarks.search --num 1000000 --dim 512 --out FILE.json
+    python -m benchmarks.search [--quick] [--num 1000000] [--dim 512] [--out FILE.json]
 
-Random unit vectors; batch-1 queries, one at a time, taking turns. Memory is the process's anonymous resident set (the
-memory-mapped bank lives in the page cache and can be dropped by the system at any time), read after each engine's turn in
-a process of its own.
+faiss (IndexFlatIP, which copies the bank) and usearch (exact=True, which does not) take part where they are installed
+(`pip install faiss-cpu usearch`); else the result says "not installed". No approximate index is compared.
+
+Random unit vectors; batch-1 queries, one at a time, taking turns. Memory is the process's anonymous resident set above
+that of the imported library (the memory-mapped bank lives in the page cache and can be dropped by the system at any
+time), read after each engine's turn in a process of its own.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import importlib.util
 import json
 import multiprocessing
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+OURS = "mvitac"
+ENGINES = {OURS: "mvitac.retrieval", "scikit-learn": "sklearn.neighbors", "faiss": "faiss", "usearch": "usearch.index"}
+"""Engine -> the module it needs."""
+
+
+def installed() -> list[str]:
+    """The engines that can run here, ours first."""
+    return [name for name, module in ENGINES.items() if importlib.util.find_spec(module.split(".")[0])]
+
+
+def searcher(name: str, bank: np.ndarray, k: int, threads: int) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from unit queries [Q, E] to the rows [Q, k] of ``bank`` [N, E] nearest by cosine, exactly, best first."""
+    if name == OURS:
+        from mvitac.retrieval import nearest
+
+        return lambda queries: nearest(bank, queries, k)[0]
+    if name == "scikit-learn":
+        from sklearn.neighbors import NearestNeighbors
+
+        fitted = NearestNeighbors(n_neighbors=k, algorithm="brute", metric="cosine").fit(bank)
+        return lambda queries: fitted.kneighbors(queries, return_distance=False)
+    if name == "faiss":
+        import faiss  # pyright: ignore[reportMissingImports]
+
+        faiss.omp_set_num_threads(threads)
+        flat = faiss.IndexFlatIP(bank.shape[1])
+        flat.add(bank)
+        return lambda queries: flat.search(queries, k)[1]
+    from usearch.index import MetricKind, search  # pyright: ignore[reportMissingImports]
+
+    def find(queries: np.ndarray) -> np.ndarray:
+        # One query's keys are [k], several queries' [Q, k].
+        return np.atleast_2d(search(bank, queries, k, MetricKind.IP, exact=True, threads=threads).keys)
+
+    return find
 
 
 def anonymous_mb() -> dict[str, float]:
@@ -31,22 +73,13 @@ def measure(name: str, path: str, num_queries: int, k: int, threads: int, connec
         os.environ[variable] = str(threads)
     from threadpoolctl import threadpool_limits
 
-    from mvitac.retrieval import nearest
-
+    importlib.import_module(ENGINES[name])
     with threadpool_limits(threads):
         before = anonymous_mb()
         bank = np.load(path, mmap_mode="r")
         queries = np.random.default_rng(1).normal(size=(num_queries, bank.shape[1])).astype(np.float32)
         queries /= np.linalg.norm(queries, axis=1, keepdims=True)
-        fitted: Any = None
-        if name == "scikit-learn":
-            from sklearn.neighbors import NearestNeighbors
-
-            fitted = NearestNeighbors(n_neighbors=k, algorithm="brute", metric="cosine").fit(bank)
-
-        def search(q: np.ndarray) -> np.ndarray:
-            return fitted.kneighbors(q, return_distance=False) if fitted else nearest(bank, q, k)[0]
-
+        search = searcher(name, bank, k, threads)
         search(queries[:1])
         peak = anonymous_mb()["RssAnon"]
         connection.send("ready")
@@ -79,9 +112,17 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=32)
     parser.add_argument("--k", type=int, default=10)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--bank", type=Path, default=Path("bank.npy"), help="where to keep the random bank")
+    parser.add_argument("--quick", action="store_true", help="20,000 x 128: whether it runs, no figure to report")
+    parser.add_argument("--bank", type=Path, help="where to keep the random bank (default: bank-NxE.npy)")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    if options.quick:
+        options.num, options.dim = 20_000, 128
+    options.bank = options.bank or Path(f"bank-{options.num}x{options.dim}.npy")
+    if options.bank.exists() and (shape := np.load(options.bank, mmap_mode="r").shape) != (options.num, options.dim):
+        parser.error(
+            f"--bank {options.bank} holds {shape}, ({options.num}, {options.dim}) asked: delete it or name another"
+        )
     if not options.bank.exists():
         bank = np.lib.format.open_memmap(options.bank, "w+", np.float32, (options.num, options.dim))
         rng = np.random.default_rng(0)
@@ -91,7 +132,8 @@ def main() -> None:
         bank.flush()
     context = multiprocessing.get_context("spawn")
     ends, workers = {}, []
-    for name in ("mvitac", "scikit-learn"):
+    names = installed()
+    for name in names:
         ends[name], other = context.Pipe()
         arguments = (name, str(options.bank), options.queries, options.k, options.threads, other)
         workers.append(context.Process(target=measure, args=arguments))
@@ -101,15 +143,15 @@ def main() -> None:
         for end in ends.values():
             end.send(query)
             end.recv()
-    result: dict[str, Any] = {}
+    result: dict[str, Any] = dict.fromkeys(ENGINES, "not installed")
     for name, end in ends.items():
         end.send("stop")
         result[name] = end.recv()
     for worker in workers:
         worker.join()
-    found = {name: values.pop("found") for name, values in result.items()}
-    same = np.mean([a == b for a, b in zip(found["mvitac"], found["scikit-learn"], strict=True)])
-    result |= {"same_results": float(same), "num": options.num, "dim": options.dim, "threads": options.threads}
+    found = {name: result[name].pop("found") for name in names}
+    same = {n: float(np.mean([a == b for a, b in zip(found[OURS], found[n], strict=True)])) for n in names[1:]}
+    result |= {"same_results": same, "num": options.num, "dim": options.dim, "threads": options.threads}
     result["load"] = os.getloadavg()[0]
     print(json.dumps(result, indent=1))
     if options.out:

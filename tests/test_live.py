@@ -14,10 +14,13 @@ from PIL import Image
 from mvitac.cameras import Folder, Simulated, source
 from mvitac.capture import CaptureThread, Stream
 from mvitac.cli import main
+from mvitac.datasets.lerobot import LeRobotConfig
 from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.realtime import Contact, Live, LiveConfig
 from mvitac.recording import Recorder, finish
 from mvitac.runtime import Engine
+from mvitac.window import Window, draw
 
 
 @pytest.fixture(scope="module")
@@ -222,8 +225,8 @@ def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
 
     world = World(engine, record=record)
     world.run(40)
-    pack = recorder.close()
-    assert pack is not None and pack.num == pytest.approx(200, abs=4)
+    assert recorder.close() == pytest.approx(200, abs=4)
+    pack = Pack(tmp_path / "pack")
     times = dict(kept)
     for row in (0, 77, pack.num - 1):
         assert np.array_equal(pack.images["touch"][row], times[pack.column("time")[row]])
@@ -233,19 +236,134 @@ def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
         Recorder(tmp_path / "pack", {"vision": 3, "touch": 3})
 
 
-def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "pack", {"touch": 3}, fps=1.0)
+def test_a_recording_is_a_lerobot_dataset(engine: Engine, tmp_path: Path) -> None:
+    """Our reader finds every recorded pair again, bit for bit, at the time it was seen; an episode is one touch."""
+    recorder = Recorder(tmp_path / "set", {"vision": 3, "touch": 3}, fps=5.0, form="lerobot")
+    kept: dict[float, dict[str, np.ndarray]] = {}
+
+    def record(images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
+        kept[columns["time"]] = images
+        recorder(images, columns)
+
+    world = World(engine, record=record)
+    world.run(20)
+    num = recorder.close()
+    assert num == pytest.approx(100, abs=4) and not list(tmp_path.glob("*.spool"))
+    config = LeRobotConfig(path=tmp_path / "set", size=32, group="group")
+    back = build(config.source(), tmp_path / "back", size=32, quiet=True)
+    assert back.num == num and set(back.column("split")) == {"unlabelled"}
+    for row, time in enumerate(back.column("time").astype(float)):
+        for modality, images in back.images.items():
+            assert np.array_equal(images[row], kept[time][modality])
+    touched = back.column("group")[back.column("contact") == "True"]
+    assert set(touched) == {f"touch-{i:06d}" for i in range(1, world.live.num_touches + 1)}
+    episodes = {tuple(pair) for pair in np.stack([back.column("episode"), back.column("group")], 1)}
+    assert len(episodes) == len(set(back.column("episode"))) == len(set(back.column("group")))
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert info["fps"] == 5 and info["total_frames"] == num
+
+
+def test_a_recording_of_a_gripper_is_packed_again_as_it_was(tmp_path: Path) -> None:
+    """Two gels: the dataset's own columns must not pass for images."""
+    recorder = Recorder(tmp_path / "set", {"vision": 3, "touch": 6}, fps=1.0, form="lerobot")
+    rng = np.random.default_rng(3)
+    kept = [
+        {m: rng.integers(0, 256, (16, 16, c), dtype=np.uint8) for m, c in (("vision", 3), ("touch", 6))}
+        for _ in range(4)
+    ]
+    for i, images in enumerate(kept):
+        recorder(images, {"time": float(i), "contact": True, "touch_number": 1})
+    assert recorder.close() == 4
+    command = ["data", "pack", "--data", "lerobot", "--path", str(tmp_path / "set"), "--size", "16", "--quiet"]
+    assert main([*command, "--out", str(tmp_path / "back")]) == 0
+    back = Pack(tmp_path / "back")
+    for modality, images in back.images.items():
+        assert np.array_equal(images, np.stack([pair[modality] for pair in kept]))
+
+
+def test_a_rate_that_cannot_be_recorded(tmp_path: Path) -> None:
+    for form, fps, says in (("lerobot", 2.5, "fps 2.5: .* whole number"), ("pack", 0.0, "more than 0")):
+        with pytest.raises(ValueError, match=says):
+            Recorder(tmp_path / "out", {"touch": 3}, fps=fps, form=form)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("form", ["pack", "lerobot"])
+def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    recorder = Recorder(out, {"touch": 3}, fps=1.0, form=form)
     image = np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
-        recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch": i // 2})
+        recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})
     del recorder  # killed: two of three parts are on disk
     with pytest.raises(ValueError, match="not finished: `mvitac live --finish"):
-        Recorder(tmp_path / "pack", {"touch": 3})
-    assert main(["live", "--finish", str(tmp_path / "pack")]) == 0
-    pack = Pack(tmp_path / "pack")
-    assert pack.num == 128 and pack.images["touch"][100, 0, 0, 0] == 100
+        Recorder(out, {"touch": 3})
+    assert main(["live", "--finish", str(out)]) == 0
+    if form == "lerobot":
+        source = LeRobotConfig(path=out, size=16).source()
+        pack = build(source, tmp_path / "pack", size=16, quiet=True)
+    else:
+        pack = Pack(out)
+    assert pack.num == 128
+    assert np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
     with pytest.raises(ValueError, match="no unfinished recording"):
         finish(tmp_path / "other")
+
+
+@pytest.mark.parametrize("modalities", [("vision", "touch"), ("touch",)])
+def test_the_picture_shows_frames_contact_and_answers(engine: Engine, modalities: tuple[str, ...]) -> None:
+    class Part:
+        """The engine, of some of its inputs."""
+
+        inputs, classes = {m: engine.inputs[m] for m in modalities}, engine.classes
+
+        def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+            zeros = {m: np.zeros((1, *shape), np.uint8) for m, shape in engine.inputs.items()}
+            return engine(**{**zeros, **images})
+
+    world = World(engine)
+    world.live = Live(Part(), {m: world.streams[m] for m in modalities}, LiveConfig(calibration=8), clock=world.clock)  # type: ignore[arg-type]
+    empty = draw(world.live)
+    while not world.live.num_predictions:
+        world.run(0.1)
+    world.rigs["vision"].fault = "unplugged"
+    world.run(0.1)
+    picture = draw(world.live)
+    assert picture.dtype == np.uint8 and picture.shape == empty.shape == (256 + 24 * 4, 512, 3)
+    for i, modality in enumerate(modalities):
+        frame = Image.fromarray(world.rigs[modality].picture).resize((248, 248), Image.Resampling.BICUBIC)
+        assert np.array_equal(picture[4:252, 256 * i + 4 : 256 * i + 252], np.asarray(frame))
+        assert tuple(picture[0, 256 * i + 9]) == ((60, 170, 90) if modality == "touch" else (200, 60, 50))
+    shown = (picture[256 + 24 : 256 + 48, 256:] == 130).all(2).any(0).sum()  # the bar of the first answer
+    _, confidence = next(iter(world.live.answers(world.live.touch).values()))
+    assert shown >= round(confidence * (256 - 60)) > 0
+    assert not (empty[256 + 24 :, 256:] == 130).all(2).any()
+
+
+def test_a_window_or_why_not(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2 = pytest.importorskip("cv2")
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["live", "any", "--window"]) == 2
+    said = capsys.readouterr().err
+    assert "there is no display" in said and said.count("\n") == 1
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(cv2, "currentUIFramework", lambda: "")
+    with pytest.raises(ValueError, match=r"has no windows .*install opencv-python in its place"):
+        Window()
+    shown: list[np.ndarray] = []
+    keys = iter([-1, ord("q"), -1])
+    monkeypatch.setattr(cv2, "currentUIFramework", lambda: "GTK3")
+    monkeypatch.setattr(cv2, "namedWindow", lambda title: None)
+    monkeypatch.setattr(cv2, "imshow", lambda title, image: shown.append(image))
+    monkeypatch.setattr(cv2, "waitKey", lambda wait: next(keys))
+    monkeypatch.setattr(cv2, "getWindowProperty", lambda title, name: float(len(shown) < 3))
+    window = Window()
+    picture = np.zeros((4, 6, 3), np.uint8)
+    picture[..., 0] = 200
+    assert window.show(picture) and not window.show(picture) and not window.show(picture)
+    assert (shown[0] == (0, 0, 200)).all()  # red, as OpenCV orders it
 
 
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -85,8 +85,8 @@ def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
         encoder({**seen, "observation.state": torch.zeros(1, 3)})
 
 
-def load_example(name: str) -> Any:
-    path = Path(__file__).parents[1] / "examples" / f"{name}.py"
+def load_example(name: str, folder: str = "examples") -> Any:
+    path = Path(__file__).parents[1] / folder / f"{name}.py"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from test_policy import load_example
 
 import mvitac
 from mvitac.cli import main
@@ -129,3 +130,22 @@ def test_without_a_shared_space_only_like_finds_like(pack: Pack, tmp_path: Path,
     assert index.find(model, pack.images["touch"][row], "touch", "touch", 1)[0].tolist() == [[3]]
     with pytest.raises(ValueError, match="no space that vision and touch share"):
         index.find(model, pack.images["touch"][row], "touch", "vision", 1)
+
+
+@pytest.mark.parametrize("engine", ["scikit-learn", "faiss", "usearch"])
+def test_the_benchmark_compares_equal_answers(engine: str) -> None:
+    """Every engine beside ours is exact, and gets the same question."""
+    search = load_example("search", "benchmarks")
+    if engine not in search.installed():
+        pytest.skip(f"{engine} is not installed")
+    rng = np.random.default_rng(4)
+    bank, queries = unit(rng, 500, 16), unit(rng, 7, 16)
+    expected = search.searcher("mvitac", bank, 5, 1)(queries)
+    found = search.searcher(engine, bank, 5, 1)
+    assert np.array_equal(found(queries), expected) and np.array_equal(found(queries[:1]), expected[:1])
+
+
+def test_the_benchmark_leaves_out_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = load_example("search", "benchmarks")
+    monkeypatch.setitem(search.ENGINES, "faiss", "no_such_module")
+    assert search.installed()[:2] == ["mvitac", "scikit-learn"] and "faiss" not in search.installed()

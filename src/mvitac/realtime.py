@@ -196,7 +196,7 @@ class Live:
         else:
             self._release(now)
         if self.record:
-            self.record(images, {"time": now, "contact": bool(self.contact), "touch": self.num_touches})
+            self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return made
 
     @property
@@ -233,6 +233,11 @@ class Live:
         # Another lens, crop or gel: what was learned of the background no longer holds.
         if event.what in ("resolution changed", "back") and event.stream in self.contacts:
             self.contacts[event.stream].forget()
+
+    def state(self, stream: Stream) -> str:
+        """What a stream is doing, in a word: its fault, "calibrating" or "good"."""
+        contact = self.contacts.get(stream.name)
+        return stream.fault or ("calibrating" if contact and contact.background is None else "good")
 
     def answers(self, touch: Touch | None) -> dict[str, tuple[str, float]]:
         """(class, confidence) by task of a touch."""

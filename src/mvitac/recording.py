@@ -1,4 +1,5 @@
-"""Record live input: pairs go to a spool on disk as they come, and become a pack at the end (or later, after a crash)."""
+"""Record live input: pairs go to a spool on disk as they come, and become a pack or a LeRobotDataset at the end (or later,
+after a crash)."""
 
 from __future__ import annotations
 
@@ -6,11 +7,11 @@ import io
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from mvitac.pack import Pack
+from mvitac.datasets.lerobot_out import check_fps, write_lerobot
 from mvitac.packing import build
 from mvitac.record import check_place, digest_file, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json
@@ -22,10 +23,19 @@ SPOOL = 64
 
 
 class Recorder:
-    """Call it with every pair; ``close`` makes the pack. At most ``fps`` pairs a second are kept."""
+    """Call it with every pair; ``close`` makes the pack or dataset. At most ``fps`` pairs a second are kept."""
 
-    def __init__(self, out: Path, channels: dict[str, int], *, fps: float = 10.0) -> None:
-        """``channels`` by modality, of the images that will come, uint8 [S, S, C]."""
+    def __init__(
+        self, out: Path, channels: dict[str, int], *, fps: float = 10.0, form: Literal["pack", "lerobot"] = "pack"
+    ) -> None:
+        """``channels`` by modality, of the images that will come, uint8 [S, S, C].
+
+        ``form``: what ``out`` becomes; a LeRobotDataset has a whole ``fps``. ValueError says what is not possible.
+        """
+        if not fps > 0:
+            raise ValueError(f"fps {fps:g}: give pairs a second, more than 0")
+        if form == "lerobot":
+            check_fps(fps)
         if out.exists():
             raise ValueError(f"{out} already exists: choose another --record, or delete it first")
         check_place(out)
@@ -33,7 +43,7 @@ class Recorder:
         self.spool = out.with_name(out.name + ".spool")
         if self.spool.exists():
             raise ValueError(
-                f"{self.spool} holds a recording that was not finished: `mvitac live --finish {out}` makes a pack of it"
+                f"{self.spool} holds a recording that was not finished: `mvitac live --finish {out}` finishes it"
             )
         spec = DataSpec(
             name="recording",
@@ -45,13 +55,13 @@ class Recorder:
             source="mvitac live",
         )
         self.spool.mkdir(parents=True)
-        write_json(self.spool / "spec.json", to_json(spec))
+        write_json(self.spool / "recording.json", {"spec": to_json(spec), "form": form, "fps": fps})
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num = 0
         self._next = float("-inf")
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
-        """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch."""
+        """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch_number."""
         if columns["time"] < self._next:
             return
         # Counted from the last due time, not from this pair's: else every delay would lower the rate.
@@ -71,21 +81,26 @@ class Recorder:
         self.num += len(self.waiting)
         self.waiting = []
 
-    def close(self) -> Pack | None:
-        """Write what is left and make the pack; None if nothing was recorded."""
+    def close(self) -> int:
+        """Write what is left and make the pack or dataset; how many pairs it has (0: nothing is made)."""
         self._flush()
         if not self.num:
             shutil.rmtree(self.spool)
-            return None
+            return 0
         return finish(self.out)
 
 
-def finish(out: Path) -> Pack:
-    """The pack ``out`` from its spool, which is then deleted."""
+def finish(out: Path) -> int:
+    """Make ``out`` of its spool, which is then deleted; returns how many pairs it has."""
     spool = Recorded(out.with_name(out.name + ".spool"))
-    pack = build(spool, out, size=spool.size(), quiet=True)
+    if spool.form == "lerobot":
+        packed = spool.path / "pack"
+        shutil.rmtree(packed, ignore_errors=True)
+        num = write_lerobot(build(spool, packed, size=spool.size(), quiet=True), out, fps=int(spool.fps))
+    else:
+        num = build(spool, out, size=spool.size(), quiet=True).num
     shutil.rmtree(spool.path)
-    return pack
+    return num
 
 
 class Recorded(Source):
@@ -94,15 +109,17 @@ class Recorded(Source):
     def __init__(self, path: Path) -> None:
         self.path = path
         if not path.is_dir():
-            raise ValueError(f"{path} does not exist: there is no unfinished recording to make a pack of")
+            raise ValueError(f"{path} does not exist: there is no unfinished recording to finish")
         self.files = sorted(path.glob("*.npz"))
+        meta = read_json(path / "recording.json", "an unfinished recording")
+        self.form, self.fps, self._spec = meta["form"], meta["fps"], meta["spec"]
 
     def spec(self) -> DataSpec:
-        return from_json(DataSpec, read_json(self.path / "spec.json", "an unfinished recording"), "spec")
+        return from_json(DataSpec, self._spec, "spec")
 
     def size(self) -> int:
         if not self.files:
-            raise ValueError(f"{self.path} holds no pairs: nothing to make a pack of")
+            raise ValueError(f"{self.path} holds no pairs: there is nothing to finish")
         return next(len(s.touch if s.touch is not None else s.vision) for s in self.read(0))  # type: ignore[arg-type]
 
     def items(self) -> Sequence[str]:
@@ -124,7 +141,7 @@ class Recorded(Source):
         for i in range(len(columns["time"])):
             own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
             # Frames between touches belong to nothing; each touch is a group of near-copies.
-            group = f"touch-{own['touch']:06d}" if own["contact"] else f"rest-{own['touch']:06d}"
+            group = f"touch-{own['touch_number']:06d}" if own["contact"] else f"rest-{own['touch_number']:06d}"
             own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled"}
             samples.append(Sample(vision=pick("vision", i), touch=pick("touch", i), columns=own))
         return samples

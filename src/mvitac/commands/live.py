@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
-    from typing import Annotated
+    from typing import Annotated, Literal
 
     import tyro
     from rich.console import Console
@@ -27,9 +27,10 @@ def live(argv: list[str]) -> None:
     from mvitac.record import check_place, write_json
     from mvitac.recording import Recorder, finish
     from mvitac.retrieval import Index
+    from mvitac.window import Window, draw
 
     if argv[:1] == ["--finish"] and len(argv) == 2:
-        Console().print(f"{finish(Path(argv[1])).path}", soft_wrap=True, highlight=False)
+        Console().print(f"{argv[1]}: {finish(Path(argv[1]))} pairs", soft_wrap=True, highlight=False)
         return
 
     @dataclass(frozen=True, kw_only=True)
@@ -50,9 +51,13 @@ def live(argv: list[str]) -> None:
         index: Path | None = None
         """Show the nearest known touches from this index."""
         record: Path | None = None
-        """Record what comes in as a pack, in this new folder."""
+        """Record what comes in, in this new folder."""
+        record_as: Literal["pack", "lerobot"] = "pack"
+        """What the recording becomes: a pack, or a LeRobotDataset v3 (an episode per touch)."""
         record_fps: float = 10.0
-        """Pairs a second to record."""
+        """Pairs a second to record; a whole number for lerobot."""
+        window: bool = False
+        """Show the frames and answers in a window too; q or Esc in it ends. Needs a display and opencv-python."""
         seconds: float | None = None
         """Stop after so long."""
         threads: int = 0
@@ -67,6 +72,7 @@ def live(argv: list[str]) -> None:
     if options.json:
         check_place(options.json)
     console = Console()
+    window = Window() if options.window else None
     engine = _engine(options.model, options.threads, console)
     index = Index(options.index) if options.index else None
     if index and index.meta["weights"] != engine.meta["weights"]:
@@ -81,7 +87,8 @@ def live(argv: list[str]) -> None:
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
     recorder = None
     if options.record:
-        recorder = Recorder(options.record, {m: s[2] for m, s in engine.inputs.items()}, fps=options.record_fps)
+        channels = {m: s[2] for m, s in engine.inputs.items()}
+        recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
     nearest = neighbours(index, options.live.neighbours) if index else None
     # What happened is printed above the picture, so that it stays in the scrollback and in a log file.
     loop = Live(
@@ -108,6 +115,8 @@ def live(argv: list[str]) -> None:
                 spoken = _speak(loop, console, spoken)
                 if time.monotonic() - drawn > 0.1:
                     screen.update(view(loop), refresh=True)
+                    if window and not window.show(draw(loop)):
+                        break
                     drawn = time.monotonic()
     except KeyboardInterrupt:
         console.print("stopped")
@@ -116,10 +125,12 @@ def live(argv: list[str]) -> None:
             thread.stopping.set()
         for thread in threads:
             thread.join(2.0)  # a device that hangs must not hang us
+        if window:
+            window.close()
     summary = loop.summary()
     if recorder:
-        pack = recorder.close()
-        console.print(f"recorded: {pack.path}, {pack.num} pairs" if pack else "nothing was recorded", soft_wrap=True)
+        num = recorder.close()
+        console.print(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded", soft_wrap=True)
     _conclude(summary, console)
     if options.json:
         write_json(options.json, summary)
@@ -170,9 +181,8 @@ def view(loop: "Live") -> Any:
     for column in ("stream", "fps", "age ms", "dropped", "state"):
         streams.add_column(column, justify="left" if column in ("stream", "state") else "right")
     for s in loop.all:
-        state = s.fault or ("calibrating" if s.name in loop.contacts and not _calibrated(loop, s.name) else "good")
         age = f"{1000 * s.age():.0f}" if s.num_frames else "-"
-        streams.add_row(s.name, f"{s.rate():.1f}", age, str(s.num_dropped), state)
+        streams.add_row(s.name, f"{s.rate():.1f}", age, str(s.num_dropped), loop.state(s))
     lines: list[Any] = [streams]
     for name, contact in loop.contacts.items():
         bar = "#" * min(30, round(10 * contact.level))
@@ -188,10 +198,6 @@ def view(loop: "Live") -> Any:
         text = "age p50 {p50:.1f}  p99 {p99:.1f}  max {max:.1f} ms".format(**age)
         lines.append(Text(f"{text}   predictions {loop.num_predictions}   stale {loop.num_stale}"))
     return Group(*lines)
-
-
-def _calibrated(loop: "Live", name: str) -> bool:
-    return loop.contacts[name].background is not None
 
 
 def _conclude(summary: dict[str, Any], console: Any) -> None:

@@ -31,10 +31,15 @@ NUM_FOR_STATS = 256
 ONE_FILE = "chunk-000/file-000.parquet"
 
 
+def check_fps(fps: float) -> None:
+    """ValueError if no LeRobotDataset can have this rate."""
+    if not (1 <= fps <= 1000 and fps == int(fps)):
+        raise ValueError(f"fps {fps:g}: give the nominal rate, a whole number from 1 to 1000")
+
+
 def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
     """Write ``pack`` to the new folder ``out`` and return how many rows it got: those that have every modality."""
-    if not 1 <= fps <= 1000:
-        raise ValueError(f"fps {fps}: give the nominal rate, 1 to 1000")
+    check_fps(fps)
     check_place(out)
     if out.exists():
         raise ValueError(f"{out} already exists: choose another --out, or delete it first")
@@ -99,7 +104,7 @@ def _carried(pack: Pack) -> dict[str, str]:
             if pa.types.is_integer(kind)
             else "bool"
             if pa.types.is_boolean(kind)
-            else "float32"
+            else ("float64" if pa.types.is_float64(kind) else "float32")
             if pa.types.is_floating(kind)
             else "string"
         )
@@ -121,7 +126,14 @@ def _write_data(
 ) -> list[tuple[int, int]]:
     """The data files; returns (chunk, file) of every episode, each of which lies in one file."""
     picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    kinds = {"int64": pa.int64(), "float32": pa.float32(), "bool": pa.bool_(), "string": pa.string(), "image": picture}
+    kinds = {
+        "int64": pa.int64(),
+        "float32": pa.float32(),
+        "float64": pa.float64(),
+        "bool": pa.bool_(),
+        "string": pa.string(),
+        "image": picture,
+    }
     schema = pa.schema([(name, kinds[feature["dtype"]]) for name, feature in features.items()])
     homes: list[tuple[int, int]] = []
     writer: pq.ParquetWriter | None = None

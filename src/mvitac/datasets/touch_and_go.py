@@ -267,9 +267,7 @@ class TouchAndGo(Source):
             if numbers[-1] >= end:
                 short.append(f"{name} has {end} frames, listed up to {numbers[-1]}{why}")
         rest = f"; and {len(short) - 8} more" if len(short) > 8 else ""
-        counts.append(
-            Count("listed frames in their recordings", self._num_listed, there, "; ".join(short[:8]) + rest)
-        )
+        counts.append(Count("listed frames in their recordings", self._num_listed, there, "; ".join(short[:8]) + rest))
         return counts
 
     def read(self, item: int) -> list[Sample | Lost]:
