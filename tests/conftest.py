@@ -5,6 +5,10 @@ from pathlib import Path
 
 # Before anything imports the hub's client, which reads it once: no test reaches the network.
 os.environ["HF_HUB_OFFLINE"] = "1"
+# Before torch starts its threads, here and in every process that a test starts: sums in one order, whatever the machine,
+# and no waiting in circles on one that is busy.
+os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 import pytest
 import torch
@@ -12,7 +16,7 @@ from toy import toy_pack
 
 from mvitac.pack import Pack
 
-torch.set_num_threads(1)  # sums in one order, whatever the machine
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
