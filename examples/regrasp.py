@@ -92,7 +92,7 @@ def predict(x: np.ndarray, y: np.ndarray, rows: Parts) -> np.ndarray:
 
 
 def play(p: np.ndarray, y: np.ndarray, objects: np.ndarray, hands: np.ndarray, threshold: float) -> dict[str, Any]:
-    """Episodes and lifts that held, by object, and grasps tried on average: a record of ``mvitac.probe.interval``."""
+    """Episodes and lifts that held, by object, and grasps tried on average: a record of ``mvitac.scores.interval``."""
     lifted, tried = decide(p[hands], threshold)
     thing, held = objects[hands[:, 0]], y[hands[np.arange(len(hands)), lifted]]
     num = int(objects.max()) + 1

@@ -1,7 +1,7 @@
 """A comparison as the paper's tables: Markdown, LaTeX, CSV and a figure, ours beside what was printed.
 
-Accuracies in percent, mean over seeds, 95 % interval over test groups and seeds (``probe.interval``), difference to the
-reference row with its two-sided p (``probe.paired_difference``; not corrected for the number of rows).
+Accuracies in percent, mean over seeds, 95 % interval over test groups and seeds (``scores.interval``), difference to the
+reference row with its two-sided p (``scores.paired_difference``; not corrected for the number of rows).
 """
 
 from __future__ import annotations
