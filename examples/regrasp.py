@@ -8,9 +8,10 @@ the first ('during': closed, not lifted), predicts success, lifts if that is lik
 the next; if none convinces, it goes back to the most promising. Its encoders are the run's, frozen; its head is a logistic
 regression on the grasps of the training objects. Scored on objects that neither has seen. "Best of all" closes on every
 candidate before it chooses. A choice by chance, an oracle, the mean imprint alone and encoders with random weights stand
-beside it; chance and oracle bound what any choice among these candidates can do.
+beside it; the oracle is the most that any choice among these candidates can do.
 
-Intervals resample test objects and seeds; they hold for this run's encoders, not for another pre-training.
+Intervals resample test objects and seeds (orders of the candidates); they hold for this run's encoders and this head, not
+for another pre-training.
 """
 
 from __future__ import annotations
