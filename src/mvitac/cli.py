@@ -68,9 +68,7 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    # OpenMP's threads spin while they wait for each other, unless told so before torch loads it. Beside any other busy
-    # program the one they wait for is not running, and a training step takes ten times as long (docs/speed.md).
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    _wait_briefly()
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP, end="")
@@ -107,6 +105,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"mvitac: error: {one_line(MemoryError())}", file=sys.stderr)
             return 2
         raise
+
+
+def _wait_briefly() -> None:
+    """Let OpenMP's threads spin for microseconds, not milliseconds, while they wait for each other.
+
+    Beside any other busy program the thread that is waited for may not be running: a step on two cores then took five
+    times as long (docs/speed.md). libgomp reads it when torch loads it; whoever sets OpenMP's own variables is obeyed.
+    """
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
+        os.environ["GOMP_SPINCOUNT"] = "10000"
 
 
 def _check_once(argv: Sequence[str]) -> None:
