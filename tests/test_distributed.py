@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-from test_step import assert_close, gradients, views
+from test_step import assert_close, gradients, small, views
 from test_step import build as build_from
 
 from mvitac.distributed import World
@@ -22,7 +22,7 @@ from mvitac.methods.base import Method
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.pack import Pack
 from mvitac.recipes import recipe
-from mvitac.run import Optim
+from mvitac.run import Optim, Run
 from mvitac.step import Step
 
 RUN = replace(
@@ -32,8 +32,12 @@ HERE = Path(__file__).parent
 WORKER = str(HERE / "worker_distributed.py")
 
 
-def build() -> Method:
-    return build_from(RUN)
+def run_of(method: str) -> Run:
+    return RUN if method == "mvitac" else replace(RUN, method=small(method))
+
+
+def build(method: str = "mvitac") -> Method:
+    return build_from(run_of(method))
 
 
 def together(command: list[str], num: int = 2, fails: bool = False) -> None:
@@ -56,12 +60,14 @@ def together(command: list[str], num: int = 2, fails: bool = False) -> None:
         assert (process.returncode != 0) == fails, errors
 
 
-def test_two_processes_equal_one_on_the_joint_batch(tmp_path: Path) -> None:
-    """Synchronised BatchNorm in trunks and heads, gathered negatives, summed gradients: one process's to rounding."""
-    together([WORKER, "step", str(tmp_path)])
+@pytest.mark.parametrize("method", ["mvitac", "cmc"])
+def test_two_processes_equal_one_on_the_joint_batch(tmp_path: Path, method: str) -> None:
+    """Synchronised BatchNorm in trunks and heads, gathered negatives, summed gradients: one process's to rounding. So are
+    CMC's banks, which every process holds whole and moves alike."""
+    together([WORKER, "step", str(tmp_path), method])
     first, second = (torch.load(tmp_path / f"rank{r}.pt", weights_only=True) for r in (0, 1))
-    alone = build()
-    step = Step(RUN, alone, torch.device("cpu"))
+    alone = build(method)
+    step = Step(run_of(method), alone, torch.device("cpu"))
     losses = step([views], lr=1e-3, seed=0, progress=0.5)
     assert_close(losses, first["losses"], 1e-5)
     assert_close(gradients(alone), first["gradients"], 1e-3)

@@ -6,6 +6,7 @@ import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import safetensors.torch
@@ -14,11 +15,12 @@ from torch import Tensor, nn
 from toy import Toy
 
 from mvitac.batch import Views
-from mvitac.methods.base import Method
+from mvitac.methods.base import Method, MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.pack import Pack
 from mvitac.recipes import recipe
+from mvitac.registry import default
 from mvitac.run import Optim, Run
 from mvitac.step import Step
 from mvitac.train import train
@@ -30,12 +32,20 @@ CPU = torch.device("cpu")
 def build(run: Run = RUN, norm: bool = True) -> Method:
     torch.manual_seed(0)
     method = run.method.build(Toy().spec(), run.encoder)
+    method.prepare(torch.arange(12))
     for layer in method.modules():
         if isinstance(layer, nn.BatchNorm2d):
             nn.init.ones_(layer.weight)  # timm starts each block's last BatchNorm at zero, which would hide the block
-            if not norm:
-                layer.eval()
+        if isinstance(layer, (nn.BatchNorm1d, nn.BatchNorm2d)) and not norm:
+            layer.eval()
     return method
+
+
+def small(name: str, **changes: Any) -> MethodConfig:
+    """A method's own settings but for its widths, and fewer keys to remember than the 12 rows of ``views``."""
+    config = default(MethodConfig, name)
+    widths = {"hidden": 24, "out": 12, "num_negatives": 8, "queue": 5}
+    return replace(config, **{k: v for k, v in widths.items() if hasattr(config, k)}, **changes)
 
 
 def views(num: int = 12) -> Views:
@@ -47,7 +57,8 @@ def views(num: int = 12) -> Views:
 def split(batch: Views, size: int) -> list[partial[Views]]:
     pieces = {m: [v.split(size) for v in vs] for m, vs in batch.images.items()}
     parts = [{m: [v[i] for v in vs] for m, vs in pieces.items()} for i in range(len(batch.rows) // size)]
-    return [partial(Views, images=images, labels={}, rows=torch.arange(size)) for images in parts]
+    rows = batch.rows.split(size)
+    return [partial(Views, images=images, labels={}, rows=own) for images, own in zip(parts, rows, strict=True)]
 
 
 def gradients(method: Method) -> dict[str, Tensor]:
@@ -98,15 +109,28 @@ def test_bf16_keeps_the_direction_of_the_gradient() -> None:
         assert float(b[name]) == pytest.approx(float(a[name]), rel=0.03)
 
 
-@pytest.mark.parametrize("size", [2, 4, 6])
-def test_gradient_caching_is_exact_without_batchnorm_statistics(size: int) -> None:
-    """With BatchNorm in eval mode no pair sees another: cached in any chunks = direct, losses and gradients."""
-    run = replace(RUN, method=MViTacConfig(hidden=24, out=12))
+CHUNKED = [
+    *[(small("mvitac"), size) for size in (2, 4, 6)],
+    (small("mvitac", losses=("vv", "vt")), 4),
+    *[(small(name), 4) for name in ("cmc", "ssvtp", "simclr", "moco", "mct", "byol", "vicreg")],
+]
+
+
+@pytest.mark.parametrize(("config", "size"), CHUNKED, ids=lambda value: getattr(value, "name", value))
+def test_gradient_caching_is_exact_without_batchnorm_statistics(config: MethodConfig, size: int) -> None:
+    """With BatchNorm in eval mode no pair sees another: cached in any chunks = direct, losses, gradients and memory."""
+    run = replace(RUN, method=config)
     direct, cached = build(run, norm=False), build(run, norm=False)
     a = take(run, direct, [lambda: views()])
     b = take(run, cached, split(views(), size))
     assert_close(a, b, 1e-5)
     assert_close(gradients(direct), gradients(cached), 1e-4)
+    remembered = [
+        {k: v for k, v in m.state_dict().items() if k.startswith(("banks", "queues"))} for m in (direct, cached)
+    ]
+    assert (config.name in ("cmc", "moco", "mct")) == bool(remembered[0])
+    for name, value in remembered[0].items():
+        torch.testing.assert_close(value, remembered[1][name], rtol=1e-4, atol=1e-5)
 
 
 def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -> None:

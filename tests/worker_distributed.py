@@ -1,4 +1,4 @@
-"""One process of tests/test_distributed.py, under torchrun's variables: ``step FOLDER`` or ``train PACK OUT DIE_AFTER``."""
+"""One process of tests/test_distributed.py, under torchrun's variables: ``step DIR METHOD`` or ``train PACK OUT DIE_AFTER``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from test_distributed import RUN, build, gradients, views
+from test_distributed import build, gradients, run_of, views
 from test_step import split
 
 from mvitac import batches
@@ -19,11 +19,11 @@ from mvitac.step import Step
 from mvitac.train import train as pretrain
 
 
-def step(folder: Path) -> None:
+def step(folder: Path, name: str) -> None:
     """Two steps on this process's part of the joint batch."""
-    world, method = join(), build()
+    world, method = join(), build(name)
     synchronise_norms(method, world)
-    take = Step(RUN, method, torch.device("cpu"), world)
+    take = Step(run_of(name), method, torch.device("cpu"), world)
     part = split(views(), len(views().rows) // world.size)[world.rank]
     losses = take([part], lr=1e-3, seed=0, progress=0.5)
     result = {"gradients": gradients(method), "losses": losses}
@@ -50,5 +50,5 @@ def train(pack: Path, out: Path, die_after: int) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     kind, *given = sys.argv[1:]
-    step(Path(given[0])) if kind == "step" else train(Path(given[0]), Path(given[1]), int(given[2]))
+    step(Path(given[0]), given[1]) if kind == "step" else train(Path(given[0]), Path(given[1]), int(given[2]))
     dist.destroy_process_group()

@@ -71,7 +71,8 @@ class Step:
             with self._autocast():
                 return method.queries(views)
 
-        statistics = [buffer.clone() for buffer in method.buffers()]
+        running = [] if alone else _running_statistics(method)
+        before = [buffer.clone() for buffer in running]
         graphs, keys = [], []
         for i, part in enumerate(parts):
             views = part()
@@ -82,31 +83,30 @@ class Step:
         own = {name: torch.cat([z[name].detach() for z in graphs]) for name in graphs[0]}
         everyones = {name: world.gather(z).requires_grad_() for name, z in own.items()}
         fixed = {name: world.gather(torch.cat([z[name] for z in keys])) for name in keys[0]}
+        torch.manual_seed(seed)  # what the losses draw (CMC's negatives) is the same on every process
         with self._autocast():
             losses = method.contrast(everyones | fixed)
         # Every process takes the whole loss, so the gradient of its own embeddings is complete without communication.
-        names = list(own)
-        gradients = dict(zip(names, torch.autograd.grad(losses["loss"], [everyones[n] for n in names]), strict=True))
+        sources = [everyones[name] for name in own]
+        found = torch.autograd.grad(losses["loss"], sources, allow_unused=True)  # a loss may be left out of the sum
+        gradients = {name: gradient for name, gradient in zip(own, found, strict=True) if gradient is not None}
         mine = {
             name: world.own(gradient, len(own[name])).split([len(z[name]) for z in graphs])
             for name, gradient in gradients.items()
         }
-        if not alone:
-            self._rewind(statistics)
+        for buffer, old in zip(running, before, strict=True):
+            buffer.copy_(old)  # the second pass will move them again
         for i, part in enumerate(parts):
             z = graphs[i] if alone else queries(i, part())
-            torch.autograd.backward([z[name] for name in names], [mine[name][i] for name in names])
+            torch.autograd.backward([z[name] for name in mine], [chunks[i] for chunks in mine.values()])
         world.sum_gradients(self.method)
         return losses
 
-    def _rewind(self, statistics: list[Tensor]) -> None:
-        """Undo what the first pass did to the running statistics of modules that the second passes again."""
-        layers = (m for m in self.method.modules() if any(p.requires_grad for p in m.parameters(recurse=False)))
-        trained = {id(buffer) for layer in layers for buffer in layer.buffers(recurse=False)}
-        with torch.no_grad():
-            for buffer, old in zip(self.method.buffers(), statistics, strict=True):
-                if id(buffer) in trained:
-                    buffer.copy_(old)
+
+def _running_statistics(method: Method) -> list[Tensor]:
+    """Buffers of the modules that are trained: BatchNorm's running statistics, but not those of momentum towers."""
+    layers = (m for m in method.modules() if any(p.requires_grad for p in m.parameters(recurse=False)))
+    return [buffer for layer in layers for buffer in layer.buffers(recurse=False)]
 
 
 def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:

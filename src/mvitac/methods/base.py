@@ -51,7 +51,8 @@ class Method(nn.Module, ABC):
 
 
 class Contrastive(Method):
-    """A method whose losses need nothing of a batch but its embeddings, each [B, E], row i being pair i.
+    """A method whose losses need nothing of a batch but what is computed from each pair apart: tensors [B, ...], row i of
+    pair i, such as embeddings.
 
     Saying so in three parts lets the loop embed a batch in chunks (gradient caching) or on many processes (all-gathered
     negatives) and contrast all of it at once (``step.py``).
@@ -62,12 +63,12 @@ class Contrastive(Method):
         """Embeddings that gradients flow into."""
 
     def keys(self, batch: Views) -> dict[str, Tensor]:
-        """Embeddings that none flows into, such as those of momentum towers."""
+        """What none flows into, such as embeddings of momentum towers, or the pairs' row numbers."""
         return {}
 
     @abstractmethod
     def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The losses of ``forward`` from all ``queries`` and ``keys``, by name."""
+        """The losses of ``forward`` from all ``queries`` and ``keys``, by name; may leave ``pending``."""
 
     def forward(self, batch: Views) -> dict[str, Tensor]:
         return self.contrast(self.queries(batch) | self.keys(batch))

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Head, Projected, build_trunk, num_features
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
 
@@ -48,7 +48,7 @@ def regression(prediction: Float[Tensor, "B D"], target: Float[Tensor, "B D"]) -
     return (2 - 2 * F.cosine_similarity(prediction.float(), target.float(), dim=1)).mean()
 
 
-class BYOL(Method):
+class BYOL(Contrastive):
     """An online tower with a predictor and a momentum tower per modality."""
 
     views = 2
@@ -63,14 +63,20 @@ class BYOL(Method):
             self.predictor[modality] = Head(config.out, config.hidden, config.out, norm=True)
         self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.online.items()})
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
-        losses: dict[str, Tensor] = {}
-        for modality, online in self.online.items():
-            predict, target = self.predictor[modality], self.target[modality]
-            first, second = batch.images[modality]
-            there = regression(predict(online(first)), target(second))
-            back = regression(predict(online(second)), target(first))
-            losses[modality] = there + back
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return {
+            f"{m}_q{i}": self.predictor[m](online(batch.images[m][i]))
+            for m, online in self.online.items()
+            for i in (0, 1)
+        }
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        return {f"{m}_k{i}": target(batch.images[m][i]) for m, target in self.target.items() for i in (0, 1)}
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+        losses = {
+            m: regression(z[f"{m}_q0"], z[f"{m}_k1"]) + regression(z[f"{m}_q1"], z[f"{m}_k0"]) for m in self.online
+        }
         return {"loss": torch.stack(list(losses.values())).sum(), **losses}
 
     def encoders(self) -> dict[str, nn.Module]:

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, build_towers
 from mvitac.memory import Bank
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.spec import DataSpec
 
 EPS = 1e-7
@@ -70,7 +70,7 @@ def nce(scores: Float[Tensor, "B K+1"], num_rows: int) -> Float[Tensor, ""]:
     return -(told + rejected).mean()
 
 
-class CMC(Method):
+class CMC(Contrastive):
     """Two towers, two banks."""
 
     rows: Tensor
@@ -89,16 +89,21 @@ class CMC(Method):
         self.rows = rows
         self.banks = nn.ModuleDict({m: Bank(len(rows), self.config.out) for m in self.towers})
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return {m: F.normalize(tower(batch.images[m][0]).float(), dim=1) for m, tower in self.towers.items()}
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        return {"rows": batch.rows}
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         assert len(self.rows), "prepare(rows) comes first"
-        at = torch.searchsorted(self.rows, batch.rows)
+        at = torch.searchsorted(self.rows, z["rows"])
         drawn = torch.randint(len(self.rows), (len(at), self.config.num_negatives + 1), device=at.device)
         drawn[:, 0] = at
-        z = {m: F.normalize(tower(batch.images[m][0]).float(), dim=1) for m, tower in self.towers.items()}
         with torch.autocast(at.device.type, enabled=False):
             vt, z_vision = self._contrast(z["vision"], "touch", drawn, self.z_norm[0])
             tv, z_touch = self._contrast(z["touch"], "vision", drawn, self.z_norm[1])
-        self.pending = (at, {m: value.detach() for m, value in z.items()}, torch.stack([z_vision, z_touch]))
+        self.pending = (at, {m: z[m].detach() for m in self.towers}, torch.stack([z_vision, z_touch]))
         return {"loss": vt + tv, "vt": vt, "tv": tv}
 
     def _contrast(self, query: Tensor, bank: str, drawn: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:

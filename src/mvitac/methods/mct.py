@@ -23,12 +23,13 @@ from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig
 from mvitac.losses import queue_nce
 from mvitac.memory import Queue
-from mvitac.methods.base import Method
+from mvitac.methods.base import Contrastive
 from mvitac.methods.mvitac import MViTac, MViTacConfig
 from mvitac.methods.queued import QueueConfig
 from mvitac.spec import DataSpec
 
-SIDES = ("intra", "inter")
+QUEUES = {"vision_intra": "vv_k", "vision_inter": "tv_k", "touch_intra": "tt_k", "touch_inter": "vt_k"}
+"""Queue -> the keys of ``MViTac.keys`` that it remembers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +63,7 @@ def hinge(
         return F.relu(margin - (query * key).sum(1, keepdim=True) + query @ queue.T).mean()
 
 
-class MCT(Method):
+class MCT(Contrastive):
     """MViTac's query and key towers, a queue for each head of each modality."""
 
     views = 2
@@ -73,25 +74,28 @@ class MCT(Method):
         same = ("temperature", "lambda_inter", "momentum", "momentum_end", "out", "hidden", "head_norm")
         self.towers = MViTac(MViTacConfig(**{name: getattr(config, name) for name in same}), spec, encoder)
         self.queues = nn.ModuleDict()
-        self.pending: dict[str, tuple[Tensor, Tensor]] = {}
+        self.pending: dict[str, Tensor] = {}
 
     def prepare(self, rows: Tensor) -> None:
         size = self.config.queue_size(len(rows))
-        names = [f"{m}_{side}" for m in self.towers.query for side in SIDES]
-        self.queues = nn.ModuleDict({name: Queue(size, self.config.out) for name in names})
+        self.queues = nn.ModuleDict({name: Queue(size, self.config.out) for name in QUEUES})
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return self.towers.queries(batch)
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        return self.towers.keys(batch)
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         assert self.queues, "prepare(rows) comes first"
         config = self.config
-        query = {m: self.towers.query[m](views[0]) for m, views in batch.images.items()}
-        key = {m: self.towers.key[m](views[1]) for m, views in batch.images.items()}
-        self.pending = key
+        self.pending = {name: z[keys] for name, keys in QUEUES.items()}
         queue: dict[str, Tensor] = {name: q.keys for name, q in self.queues.items()}  # type: ignore[misc]
         losses = {
-            "vv": queue_nce(query["vision"][0], key["vision"][0], queue["vision_intra"], config.temperature),
-            "tt": queue_nce(query["touch"][0], key["touch"][0], queue["touch_intra"], config.temperature),
-            "vt": hinge(query["vision"][1], key["touch"][1], queue["touch_inter"], config.margin),
-            "tv": hinge(query["touch"][1], key["vision"][1], queue["vision_inter"], config.margin),
+            "vv": queue_nce(z["vv_q"], z["vv_k"], queue["vision_intra"], config.temperature),
+            "tt": queue_nce(z["tt_q"], z["tt_k"], queue["touch_intra"], config.temperature),
+            "vt": hinge(z["vt_q"], z["vt_k"], queue["touch_inter"], config.margin),
+            "tv": hinge(z["tv_q"], z["tv_k"], queue["vision_inter"], config.margin),
         }
         loss = losses["vv"] + losses["tt"] + config.lambda_inter * (losses["vt"] + losses["tv"])
         return {"loss": loss, **losses}
@@ -103,7 +107,6 @@ class MCT(Method):
         return self.towers.projectors()
 
     def after_step(self, progress: float) -> None:
-        for modality, keys in self.pending.items():
-            for side, embedding in zip(SIDES, keys, strict=True):
-                self.queues[f"{modality}_{side}"].push(embedding)  # type: ignore[operator]
+        for name, keys in self.pending.items():
+            self.queues[name].push(keys)  # type: ignore[operator]
         self.towers.after_step(progress)

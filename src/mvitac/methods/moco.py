@@ -16,7 +16,7 @@ from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Head, build_towers
 from mvitac.losses import queue_nce
 from mvitac.memory import Queue
-from mvitac.methods.base import Method
+from mvitac.methods.base import Contrastive
 from mvitac.methods.queued import QueueConfig
 from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
@@ -39,7 +39,7 @@ class MoCoConfig(QueueConfig):
         return MoCo(self, spec, encoder)
 
 
-class MoCo(Method):
+class MoCo(Contrastive):
     """A query tower, its momentum copy and a queue per modality."""
 
     views = 2
@@ -58,16 +58,17 @@ class MoCo(Method):
         size = self.config.queue_size(len(rows))
         self.queues = nn.ModuleDict({m: Queue(size, self.config.out) for m in self.query})
 
-    def forward(self, batch: Views) -> dict[str, Tensor]:
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return {f"{m}_q": tower(batch.images[m][0]) for m, tower in self.query.items()}
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        return {f"{m}_k": tower(batch.images[m][1]) for m, tower in self.key.items()}
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         assert self.queues, "prepare(rows) comes first"
-        losses: dict[str, Tensor] = {}
-        pending: dict[str, Tensor] = {}
-        for modality, tower in self.query.items():
-            first, second = batch.images[modality]
-            pending[modality] = self.key[modality](second)
-            queue: Tensor = self.queues[modality].keys  # type: ignore[assignment]
-            losses[modality] = queue_nce(tower(first), pending[modality], queue, self.config.temperature)
-        self.pending = pending
+        self.pending = {m: z[f"{m}_k"] for m in self.query}
+        queue: dict[str, Tensor] = {m: queue.keys for m, queue in self.queues.items()}  # type: ignore[misc]
+        losses = {m: queue_nce(z[f"{m}_q"], z[f"{m}_k"], queue[m], self.config.temperature) for m in self.query}
         return {"loss": torch.stack(list(losses.values())).sum(), **losses}
 
     def encoders(self) -> dict[str, nn.Module]:
