@@ -1,4 +1,4 @@
-"""One process of tests/test_distributed.py, under torchrun's variables: ``step DIR METHOD`` or ``train PACK OUT DIE_AFTER``."""
+"""One process of tests/test_distributed.py under torchrun's variables: ``step DIR METHOD``, ``train PACK OUT DIE_AFTER``."""
 
 from __future__ import annotations
 
