@@ -21,6 +21,7 @@ from mvitac.memory import Bank, Queue
 from mvitac.methods.byol import BYOLConfig, regression
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.cmc import CMC, CMCConfig, nce
+from mvitac.methods.dino import DINO, DINOConfig
 from mvitac.methods.mct import MCTConfig, hinge
 from mvitac.methods.moco import MoCo, MoCoConfig
 from mvitac.methods.mvitac import MViTacConfig
@@ -214,7 +215,7 @@ def test_mct_crosses_modalities_through_the_inter_heads() -> None:
     )
 
 
-# -- BYOL, VICReg -----------------------------------------------------------------------------------------------------
+# -- BYOL, DINO, VICReg -----------------------------------------------------------------------------------------------------
 
 
 def test_regression_is_the_distance_of_unit_vectors() -> None:
@@ -234,13 +235,42 @@ def test_byol_both_ways_round() -> None:
     assert float(found["touch"].detach()) == pytest.approx(float(expected), rel=1e-4)
 
 
-def test_byol_does_not_collapse(pack: Pack, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["byol", "dino"])
+def test_without_negatives_nothing_collapses(pack: Pack, tmp_path: Path, method: str) -> None:
     """60 steps of the tiny trunk: unseen touches stay apart (a collapsed trunk has spread 0)."""
-    run = with_method(smoke(pack, steps=60, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=2e-3)), "byol")
+    run = with_method(smoke(pack, steps=60, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=2e-3)), method)
     run = replace(run, method=replace(run.method, momentum=0.95, hidden=64))
     model = load(train(run, tmp_path / "r", quiet=True))
     z = pack_features(model, pack, "touch", pack.rows("test", "val"))
     assert spread(z - z.mean(0)) > 0.3
+
+
+def test_dino_equals_a_direct_transcription() -> None:
+    """Two steps: cross-entropy of centred, sharpened teacher scores of the other view; the centre follows their mean."""
+    method = build("dino", config=replace(small("dino"), centre_momentum=0.75))
+    assert isinstance(method, DINO)
+    centre = [[0.0] * 12 for _ in range(2)]
+    for seed in (5, 6):
+        batch = views(method, seed=seed)
+        found = outcome(method, batch)
+        for place, modality in enumerate(("vision", "touch")):
+            with torch.no_grad():
+                s, t = (
+                    [tower[modality](view).tolist() for view in batch.images[modality]]
+                    for tower in (method.student, method.teacher)
+                )
+            total = 0.0
+            for mine, other in ((0, 1), (1, 0)):
+                for a, b in zip(s[mine], t[other], strict=True):
+                    p = [math.exp((x - c) / 0.04) for x, c in zip(b, centre[place], strict=True)]
+                    q = [math.exp(x / 0.1) for x in a]
+                    total -= sum(x / sum(p) * math.log(y / sum(q)) for x, y in zip(p, q, strict=True)) / 16
+            assert float(found[modality].detach()) == pytest.approx(total, rel=1e-3)
+            mean = [sum(column) / 16 for column in zip(*t[0], *t[1], strict=True)]
+            centre[place] = [0.75 * c + 0.25 * m for c, m in zip(centre[place], mean, strict=True)]
+        method.after_step(0.5)
+        torch.testing.assert_close(method.centre, torch.tensor(centre), rtol=1e-4, atol=1e-6)
+    assert all(float(row.norm()) > 0 for row in method.centre)
 
 
 def test_vicreg_terms_are_their_definitions() -> None:
@@ -357,6 +387,7 @@ def test_momentum_zero_copies_the_queries() -> None:
         (SimCLRConfig, {"temperature": 0.0}),
         (MoCoConfig, {"queue": 0}),
         (BYOLConfig, {"momentum": -0.1}),
+        (DINOConfig, {"teacher_temperature": 0.0}),
         (VICRegConfig, {"variance": -1.0}),
         (MCTConfig, {"margin": float("nan")}),
         (MViTacConfig, {"losses": ()}),

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-from test_step import assert_close, gradients, small, views
+from test_methods import small
+from test_step import assert_close, gradients, views
 from test_step import build as build_from
 
 from mvitac.distributed import World

@@ -1,6 +1,6 @@
 """Pre-training methods, one file each; importing this package registers them."""
 
-from mvitac.methods import byol, calandra, cmc, mct, moco, mvitac, simclr, ssvtp, supervised, vicreg
+from mvitac.methods import byol, calandra, cmc, dino, mct, moco, mvitac, simclr, ssvtp, supervised, vicreg
 from mvitac.methods.base import Method, MethodConfig
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "byol",
     "calandra",
     "cmc",
+    "dino",
     "mct",
     "moco",
     "mvitac",

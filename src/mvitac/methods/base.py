@@ -106,7 +106,7 @@ class MethodConfig(Registered, ABC):
             have = ", ".join(spec.modalities)
             raise ValueError(
                 f"method {self.name!r} learns from pairs, dataset {spec.name!r} has {have} only:"
-                " choose --method mvitac or a method per modality (simclr, moco, byol, vicreg)"
+                " choose --method mvitac or a method per modality (simclr, moco, byol, dino, vicreg)"
             )
 
     def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:

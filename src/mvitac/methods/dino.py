@@ -1,0 +1,124 @@
+"""DINO (Caron et al., ICCV 2021, arXiv:2104.14294) for each modality by itself: no negatives, K made-up classes.
+
+A head turns features into scores of K prototypes. The student's distribution over them for one view must match the momentum
+(teacher) tower's for the other view, both ways round:
+
+    L = -sum_k P_t(k) log P_s(k),    P_s = softmax(s / tau_s),    P_t = softmax((t - c) / tau_t)
+
+The centre c, a moving mean of the teacher's scores, keeps one prototype from taking all; the sharp tau_t keeps the answer
+from being even. Sources: the paper (eq. 1-4, appendix C); https://github.com/facebookresearch/dino (main_dino.py).
+Left out: small local crops (every method here sees two views), tau_t's warm-up, the last layer's first frozen epoch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvitac.batch import Views
+from mvitac.encoders import EncoderConfig, build_towers
+from mvitac.methods.base import Contrastive, MethodConfig
+from mvitac.momentum import Momentum, rising
+from mvitac.spec import DataSpec
+
+BOTTLENECK = 256
+
+
+@dataclass(frozen=True, kw_only=True)
+class DINOConfig(MethodConfig):
+    """Match the momentum tower's centred, sharpened prototype scores of another view, per modality."""
+
+    name: ClassVar[str] = "dino"
+
+    student_temperature: float = 0.1
+    """tau_s (DINO: .1)."""
+    teacher_temperature: float = 0.04
+    """tau_t (DINO: .04, in long runs rising to .07)."""
+    centre_momentum: float = 0.9
+    """Share of its old value that the centre keeps at a step (DINO: .9)."""
+    momentum: float = 0.996
+    """m of the teacher at the start (DINO: .996)."""
+    momentum_end: float | None = 1.0
+    """m rises to this along a half cosine (DINO: 1)."""
+    out: int = 4096
+    """K, prototypes; DINO's 65,536 are 5 % of ImageNet, 4,096 are 5 % of Touch and Go."""
+    hidden: int = 2048
+    """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
+
+    def __post_init__(self) -> None:
+        self.check_fields(
+            positive=("student_temperature", "teacher_temperature"),
+            share=("centre_momentum", "momentum", "momentum_end"),
+            width=("out", "hidden"),
+        )
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> DINO:
+        return DINO(self, spec, encoder)
+
+
+class Prototypes(nn.Module):
+    """Features [B, D] to cosines [B, K] with K directions, through an MLP with a bottleneck."""
+
+    def __init__(self, features: int, hidden: int, num: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(
+            nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, BOTTLENECK)
+        )
+        self.directions = nn.Parameter(torch.randn(num, BOTTLENECK))
+
+    def forward(self, features: Float[Tensor, "B D"]) -> Float[Tensor, "B K"]:
+        return F.linear(F.normalize(self.mlp(features), dim=1), F.normalize(self.directions, dim=1))
+
+
+def agreement(student: Float[Tensor, "B K"], teacher: Float[Tensor, "B K"]) -> Float[Tensor, ""]:
+    """Cross-entropy of the student's scores with the teacher's distribution, both divided by their temperatures; mean."""
+    return -(teacher.softmax(dim=1) * student.log_softmax(dim=1)).sum(1).mean()
+
+
+class DINO(Contrastive):
+    """A student tower, its momentum copy (the teacher) and a centre per modality."""
+
+    views = 2
+    centre: Tensor
+    """[modalities, K], in the order of ``student``."""
+
+    def __init__(self, config: DINOConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.student = build_towers(encoder, spec, lambda width: Prototypes(width, config.hidden, config.out))
+        self.teacher = nn.ModuleDict({m: Momentum(tower) for m, tower in self.student.items()})
+        self.register_buffer("centre", torch.zeros(len(self.student), config.out))
+        self.pending: Tensor | None = None
+
+    def queries(self, batch: Views) -> dict[str, Tensor]:
+        return {f"{m}_s{i}": tower(batch.images[m][i]) for m, tower in self.student.items() for i in (0, 1)}
+
+    def keys(self, batch: Views) -> dict[str, Tensor]:
+        return {f"{m}_t{i}": tower(batch.images[m][i]) for m, tower in self.teacher.items() for i in (0, 1)}
+
+    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+        config, losses, means = self.config, {}, []
+        with torch.autocast(self.centre.device.type, enabled=False):
+            for m, centre in zip(self.student, self.centre, strict=True):
+                s = [z[f"{m}_s{i}"].float() / config.student_temperature for i in (0, 1)]
+                raw = [z[f"{m}_t{i}"].float() for i in (0, 1)]
+                t = [(scores - centre) / config.teacher_temperature for scores in raw]
+                losses[m] = (agreement(s[0], t[1]) + agreement(s[1], t[0])) / 2
+                means.append(torch.cat(raw).mean(0))
+        self.pending = torch.stack(means)
+        return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return {m: tower.trunk for m, tower in self.student.items()}  # type: ignore[misc]
+
+    def after_step(self, progress: float) -> None:
+        assert self.pending is not None, "forward comes first"
+        self.centre.lerp_(self.pending, 1 - self.config.centre_momentum)
+        m = rising(self.config.momentum, self.config.momentum_end, progress)
+        for modality, tower in self.student.items():
+            self.teacher[modality].follow(tower, m)  # type: ignore[operator]
