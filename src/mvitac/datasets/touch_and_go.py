@@ -12,18 +12,13 @@ task's lists do not name has label -1 there.
 
 from __future__ import annotations
 
-import os
-import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
-
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.images import decode
 from mvitac.datasets.touch_and_go_lists import (
     CLASSES,
     LIST_FILES,
@@ -38,17 +33,21 @@ from mvitac.datasets.touch_and_go_lists import (
     read_list,
     read_lists,
 )
-from mvitac.pack import fit
+from mvitac.datasets.touch_and_go_recordings import (
+    HOMEPAGE,
+    Recording,
+    find_recordings,
+    missing_report,
+    on_disk,
+    read_frames,
+)
 from mvitac.record import digest, digest_file
 from mvitac.registry import to_json
 from mvitac.source import Count, Lost, Sample, Source
 from mvitac.spec import MODALITIES, DataSpec, Task
-from mvitac.video import frames, num_frames
 
 VERSION = 1
 """Raised when the same tree would give another pack."""
-HOMEPAGE = "https://touch-and-go.github.io"
-STEMS = {"vision": "video", "touch": "gelsight"}
 CHUNK = 256
 """Frames of one recording that a packing process holds at a time (100 MB of pairs at 256 px)."""
 
@@ -111,81 +110,6 @@ class TouchAndGoConfig(DatasetConfig):
         return TouchAndGo(self)
 
 
-# -- the recordings ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Where a recording's images are: for each modality an mp4 file or a folder of JPEGs."""
-
-    name: str
-    places: dict[str, Path]
-
-    def num_frames(self) -> int:
-        """Frames that all modalities have."""
-        return min(num_frames(p) if p.suffix else 1 + max(map(_number, os.listdir(p))) for p in self.places.values())
-
-    def state(self) -> list[Any]:
-        """What tells a changed download from an unchanged one without reading it."""
-        return [self.name, *([p.name, p.stat().st_size if p.suffix else 0] for p in self.places.values())]
-
-
-def _number(name: str) -> int:
-    return int(name[:10]) if re.fullmatch(r"\d{10}\.jpg", name) else -1
-
-
-def _base(root: Path) -> Path:
-    base = root / "dataset" if (root / "dataset").is_dir() else root
-    if not base.is_dir():
-        raise ValueError(
-            f"{base} is no folder: give the download (with dataset/ in it) as root; get it from {HOMEPAGE}"
-        )
-    return base
-
-
-def _on_disk(root: Path) -> dict[str, str]:
-    """Recording -> its folder; some mirrors append the material, as in 20220319_002026_rock."""
-    names = sorted(entry.name for entry in os.scandir(_base(root)) if entry.is_dir())
-    return {name[:15]: name for name in names if re.fullmatch(r"\d{8}_\d{6}(_.*)?", name)}
-
-
-def find_recordings(
-    root: Path, names: Iterable[str], config: TouchAndGoConfig
-) -> tuple[list[Recording], dict[str, str]]:
-    """The whole recordings among ``names``, and why each of the others cannot be used."""
-    base, folders = _base(root), _on_disk(root)
-    wanted = MODALITIES if config.modalities == "both" else (config.modalities,)
-    found, missing = [], {}
-    for name in names:
-        folder = base / folders.get(name, name)
-        places, lacking = {}, []
-        for modality in wanted:
-            movie, images = folder / f"{STEMS[modality]}.mp4", folder / f"{STEMS[modality]}_frame"
-            if config.frames != "jpeg" and movie.is_file() and movie.stat().st_size:
-                places[modality] = movie
-            elif config.frames != "video" and images.is_dir():
-                places[modality] = images
-            else:
-                lacking.append({"auto": movie, "video": movie, "jpeg": images}[config.frames].name)
-        if lacking:
-            missing[name] = f"no {' and '.join(lacking)}" if folder.is_dir() else "no folder"
-        else:
-            found.append(Recording(name, places))
-    return found, missing
-
-
-def missing_report(missing: dict[str, str], num: int) -> str:
-    """'3 of 126 listed recordings cannot be packed: no folder (2): a, b; no video.mp4 (1): c'."""
-    by_reason: dict[str, list[str]] = defaultdict(list)
-    for name, why in missing.items():
-        by_reason[why].append(name)
-    parts = [
-        f"{why} ({len(names)}): {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}"
-        for why, names in sorted(by_reason.items())
-    ]
-    return f"{len(missing)} of {num} listed recordings cannot be packed: {'; '.join(parts)}"
-
-
 class TouchAndGo(Source):
     """One item is up to ``CHUNK`` wanted frames of one recording, in ascending order: one forward pass of each video."""
 
@@ -196,9 +120,11 @@ class TouchAndGo(Source):
             raise ValueError(f"{folder} has no train.txt and test.txt, which the official split is: see {LISTS_AT}")
         self._lists, self._num_listed = folder, len(listed)
         names = sorted({frame.recording for frame in listed})
-        recordings, missing = find_recordings(config.root, names, config)
+        wanted = MODALITIES if config.modalities == "both" else (config.modalities,)
+        recordings, missing = find_recordings(config.root, names, wanted, config.frames)
         if config.unlabelled:
-            recordings += find_recordings(config.root, sorted(_on_disk(config.root).keys() - set(names)), config)[0]
+            others = sorted(on_disk(config.root).keys() - set(names))
+            recordings += find_recordings(config.root, others, wanted, config.frames)[0]
         if not recordings or (missing and not config.partial):
             hint = "" if config.modalities != "both" else "; modalities=touch needs only gelsight"
             advice = f"fetch them from {HOMEPAGE}, or let partial pack what is there{hint}"
@@ -274,7 +200,7 @@ class TouchAndGo(Source):
         chunk, lost = self._chunks[item], {}
         recording = self._recordings[chunk[0].recording]
         images = {
-            modality: _read(place, [frame.number for frame in chunk], self._config.size, lost)
+            modality: read_frames(place, [frame.number for frame in chunk], self._config.size, lost)
             for modality, place in recording.places.items()
         }
         samples: list[Sample | Lost] = []
@@ -312,22 +238,6 @@ def _unlabelled(listed: Sequence[Frame], recordings: Sequence[Recording], config
             elif number % config.unlabelled == 0:
                 extra.append(Frame(recording.name, number, touch=start))
     return extra
-
-
-def _read(place: Path, numbers: list[int], size: int, lost: dict[int, str]) -> dict[int, np.ndarray]:
-    """Images of one modality by frame number; what cannot be had goes to ``lost``."""
-    if place.suffix:
-        why: dict[int, str] = {}
-        found = dict(frames(place, numbers, size, lost=why))
-        lost.update({number: f"{place.name}: frame {reason}" for number, reason in why.items()})
-        return found
-    found = {}
-    for number in numbers:
-        try:
-            found[number] = fit(decode(place / f"{number:010d}.jpg"), size)
-        except (ValueError, OSError) as error:
-            lost[number] = str(error)
-    return found
 
 
 def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
