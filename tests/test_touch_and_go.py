@@ -27,6 +27,7 @@ from mvitac.datasets.touch_and_go_lists import (
     read_list,
     read_lists,
 )
+from mvitac.datasets.touch_and_go_recordings import Recording
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.probe import parts
@@ -341,6 +342,14 @@ def test_the_doctor_is_told_what_the_lists_name_and_the_download_lacks(tree: Pat
     assert inside.found == 239 - own[NAMES[1]] - own[NAMES[3]] - 10
     assert f"{NAMES[2]} has 135 frames, listed up to 144" in inside.detail
     assert f"{NAMES[3]} has 0 frames" in inside.detail and "video.mp4" in inside.detail
+
+
+def test_a_folder_of_jpegs_has_the_frames_up_to_its_last(tmp_path: Path) -> None:
+    recording = Recording("r", {"touch": tmp_path})
+    assert recording.num_frames() == 0
+    for name in ("0000000006.jpg", "0000000002.jpg", "thumbs.db"):
+        (tmp_path / name).touch()
+    assert recording.num_frames() == 7
 
 
 def _listed(root: Path) -> set[str]:

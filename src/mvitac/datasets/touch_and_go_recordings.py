@@ -33,18 +33,16 @@ class Recording:
 
     def num_frames(self) -> int:
         """Frames that all modalities have."""
-        return min(
-            num_frames(p) if p.suffix else 1 + max(map(_number, os.listdir(p)), default=-1)
-            for p in self.places.values()
-        )
+        return min(num_frames(p) if p.suffix else _num_jpegs(p) for p in self.places.values())
 
     def state(self) -> list[Any]:
         """What tells a changed download from an unchanged one without reading it."""
         return [self.name, *([p.name, p.stat().st_size if p.suffix else 0] for p in self.places.values())]
 
 
-def _number(name: str) -> int:
-    return int(name[:10]) if re.fullmatch(r"\d{10}\.jpg", name) else -1
+def _num_jpegs(folder: Path) -> int:
+    numbers = (int(name[:10]) for name in os.listdir(folder) if re.fullmatch(r"\d{10}\.jpg", name))
+    return 1 + max(numbers, default=-1)
 
 
 def _base(root: Path) -> Path:
