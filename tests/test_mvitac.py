@@ -159,3 +159,41 @@ def test_heads_are_as_printed() -> None:
     assert (tower.intra[0].in_features, tower.inter[-1].out_features) == (512, 128)
     z = tower(torch.randn(2, 3, 32, 32))[0]
     assert F.normalize(z, dim=1).shape == (2, 128)
+
+
+def swapped(batch: Views) -> Views:
+    return replace(batch, images={m: both[::-1] for m, both in batch.images.items()})
+
+
+def test_symmetric_is_the_mean_of_both_ways() -> None:
+    """Each view is query and key in turn: the mean of the loss and of the loss with the views swapped."""
+    one_way, both_ways = build(), build(replace(CONFIG, symmetric=True))
+    for method in (one_way, both_ways):
+        torch.manual_seed(3)
+        with torch.no_grad():
+            for p in method.key.parameters():
+                p.add_(0.05 * torch.randn_like(p))
+    batch = views()
+    there, back = one_way(batch), one_way(swapped(batch))
+    assert not torch.isclose(there["loss"], back["loss"], rtol=1e-3)
+    for name, value in both_ways(batch).items():
+        torch.testing.assert_close(value, (there[name] + back[name]) / 2)
+
+
+def test_end_to_end_keys_are_the_queries_and_learn() -> None:
+    """Without momentum towers: the loss of momentum 0 in both ways, and a gradient that flows through the keys as well."""
+    learned, copied = build(replace(CONFIG, keys="end-to-end")), build(replace(CONFIG, symmetric=True))
+    assert not list(learned.key.parameters())
+    batch = views()
+    mine, theirs = learned(batch), copied(batch)
+    torch.testing.assert_close(mine, theirs)
+    mine["loss"].backward()
+    theirs["loss"].backward()
+    found = [(a.grad, b.grad) for a, b in zip(learned.query.parameters(), copied.query.parameters(), strict=True)]
+    assert not all(torch.allclose(a, b, rtol=0.05) for a, b in found if a is not None and b is not None)
+    learned.after_step(0.5)  # has nothing to move
+
+
+def test_end_to_end_on_touch_alone() -> None:
+    method = build(replace(CONFIG, keys="end-to-end"), replace(Toy().spec(), vision_channels=0))
+    assert set(method(views(vision=0))) == {"loss", "tt"}

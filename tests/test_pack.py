@@ -11,6 +11,7 @@ import pytest
 from toy import Toy, toy_pack
 
 from mvitac import packing
+from mvitac.datasets.packed import PackConfig
 from mvitac.pack import Pack
 from mvitac.packing import build
 
@@ -155,3 +156,15 @@ def test_full_disk_leaves_no_half_part(tmp_path: Path, monkeypatch: pytest.Monke
             toy_pack(tmp_path / "p")
     assert [p.name for p in (tmp_path / "p.partial").iterdir()] == ["request.json"]
     toy_pack(tmp_path / "p")
+
+
+def test_scoring_on_val_hides_test(pack: Pack) -> None:
+    whole = PackConfig(path=pack.path).open()
+    choosing = PackConfig(path=pack.path, score_on="val").open()
+    assert len(whole.rows("val")) and len(whole.rows("test"))
+    np.testing.assert_array_equal(choosing.rows("test"), whole.rows("val"))
+    np.testing.assert_array_equal(choosing.rows("train", "unlabelled"), whole.rows("train", "unlabelled"))
+    assert not len(choosing.rows("val"))
+    task = whole.spec.tasks[0].name
+    unseen = whole.rows("test")
+    assert (choosing.labels(task, "train", "val", "test")[unseen] == -1).all()

@@ -14,6 +14,7 @@ from timm.models.resnet import BasicBlock, ResNet
 from torch import Tensor, nn
 
 from mvitac.record import brief
+from mvitac.small_maps import use_products
 from mvitac.spec import DataSpec
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
@@ -54,6 +55,10 @@ def build_trunk(config: EncoderConfig, channels: int) -> nn.Module:
     More than three input channels keep the pretrained stem: timm repeats and rescales its filters. Never falls back to
     random weights in silence: ValueError if the asked-for weights cannot be had.
     """
+    return use_products(_from_timm(config, channels))
+
+
+def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
     arguments: dict[str, Any] = {"num_classes": 0, "in_chans": channels}
     if config.weights == SCRATCH:
         try:

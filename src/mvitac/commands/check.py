@@ -50,7 +50,7 @@ def check(argv: list[str]) -> int:
 
     @dataclass(frozen=True, kw_only=True)
     class OfSource(Shared):
-        data: Annotated[type(config), tyro.conf.arg(name="")] = config  # type: ignore[valid-type]
+        data: Annotated[type(config), tyro.conf.arg(name="", help=config.__doc__)] = config  # type: ignore[valid-type]
         num: int = 0
         """Items to read, evenly spread over the source; 0 = all."""
         thumbnail: int = 64

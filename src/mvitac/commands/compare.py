@@ -33,7 +33,7 @@ def compare(argv: list[str]) -> None:
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
-        data: Annotated[type(chosen), tyro.conf.arg(name="data")] = chosen  # type: ignore[valid-type]
+        data: Annotated[type(chosen), tyro.conf.arg(name="data", help=chosen.__doc__)] = chosen  # type: ignore[valid-type]
         out: Path = Path("runs") / f"compare-{plan.name}-{chosen.name}"
         """Folder of the comparison: runs, controls, tables. The same command goes on where it stopped."""
         seeds: int = plan.seeds

@@ -48,7 +48,7 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
     class Options:
         out: Path
         """Folder of the new pack."""
-        data: Annotated[type(config), tyro.conf.arg(name="")] = config  # type: ignore[valid-type]
+        data: Annotated[type(config), tyro.conf.arg(name="", help=config.__doc__)] = config  # type: ignore[valid-type]
         max_damaged: float = 0.0
         """Share of the items that may be unreadable before packing stops; they are listed in pack.json."""
         quiet: bool = False

@@ -24,12 +24,12 @@ from mvitac.encoders import EncoderConfig
 from mvitac.losses import queue_nce
 from mvitac.memory import Queue
 from mvitac.methods.base import Contrastive
-from mvitac.methods.mvitac import MViTac, MViTacConfig
+from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
 from mvitac.methods.queued import QueueConfig
 from mvitac.spec import DataSpec
 
-QUEUES = {"vision_intra": "vv_k", "vision_inter": "tv_k", "touch_intra": "tt_k", "touch_inter": "vt_k"}
-"""Queue -> the keys of ``MViTac.keys`` that it remembers."""
+QUEUES = [f"{modality}_{head}" for modality in ("vision", "touch") for head in ("intra", "inter")]
+"""One for the keys of each head of each modality, named as ``MViTac.keys`` names them but for the view."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,14 +89,18 @@ class MCT(Contrastive):
     def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         assert self.queues, "prepare(rows) comes first"
         config = self.config
-        self.pending = {name: z[keys] for name, keys in QUEUES.items()}
+        key = {name: z[f"k1_{name}"] for name in QUEUES}
+        query = {name: z[f"q0_{name}"] for name in QUEUES}
+        self.pending = key
         queue: dict[str, Tensor] = {name: q.keys for name, q in self.queues.items()}  # type: ignore[misc]
-        losses = {
-            "vv": queue_nce(z["vv_q"], z["vv_k"], queue["vision_intra"], config.temperature),
-            "tt": queue_nce(z["tt_q"], z["tt_k"], queue["touch_intra"], config.temperature),
-            "vt": hinge(z["vt_q"], z["vt_k"], queue["touch_inter"], config.margin),
-            "tv": hinge(z["tv_q"], z["tv_k"], queue["vision_inter"], config.margin),
-        }
+        losses = {}
+        for part, (mine, other) in PARTS.items():
+            if mine == other:
+                name = f"{mine}_intra"
+                losses[part] = queue_nce(query[name], key[name], queue[name], config.temperature)
+            else:
+                name = f"{other}_inter"
+                losses[part] = hinge(query[f"{mine}_inter"], key[name], queue[name], config.margin)
         loss = losses["vv"] + losses["tt"] + config.lambda_inter * (losses["vt"] + losses["tv"])
         return {"loss": loss, **losses}
 

@@ -22,6 +22,9 @@ from mvitac.methods.base import Contrastive, MethodConfig
 from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
 
+PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
+"""loss -> modality of its queries, of its keys."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MViTacConfig(MethodConfig):
@@ -37,6 +40,11 @@ class MViTacConfig(MethodConfig):
     """m of eq. 1-3; not given in the paper, .99 in the authors' code."""
     momentum_end: float | None = None
     """If given, m rises to this along a half cosine (as in BYOL and MoCo v3); the paper has no schedule."""
+    keys: Literal["momentum", "end-to-end"] = "momentum"
+    """Where keys come from: a momentum tower (the paper), or the query tower itself, learning from them too (SimCLR; named
+    as in MoCo, figure 2). The latter is symmetric as it is, and takes no momentum."""
+    symmetric: bool = False
+    """Each view is query and key in turn, the loss the mean of both ways (BYOL, MoCo v3); the paper has one way."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
     """Which of the four losses of eq. 14 to minimise; the paper minimises all."""
     shared_heads: bool = False
@@ -100,6 +108,16 @@ class Tower(nn.Module):
         return self.intra(features), self.inter(features)
 
 
+def _embed(towers: nn.ModuleDict, batch: Views, name: str, views: list[int]) -> dict[str, Tensor]:
+    """Embeddings of ``views`` of each modality by both heads, named e.g. q0_vision_intra."""
+    z = {}
+    for modality, tower in towers.items():
+        for view in views:
+            intra, inter = tower(batch.images[modality][view])
+            z |= {f"{name}{view}_{modality}_intra": intra, f"{name}{view}_{modality}_inter": inter}
+    return z
+
+
 class MViTac(Contrastive):
     """Query towers, their momentum copies, four losses."""
 
@@ -110,32 +128,36 @@ class MViTac(Contrastive):
         self.config = config
         # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
         self.query = nn.ModuleDict({m: Tower(config, encoder, spec.channels(m)) for m in spec.modalities})
-        self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in self.query.items()})
+        momentum = self.query if config.keys == "momentum" else {}
+        self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in momentum.items()})
+
+    @property
+    def directions(self) -> tuple[tuple[int, int], ...]:
+        """(view of the query, view of the key) of every term of a loss."""
+        both = self.config.symmetric or self.config.keys == "end-to-end"
+        return ((0, 1), (1, 0)) if both else ((0, 1),)
 
     def queries(self, batch: Views) -> dict[str, Tensor]:
-        z: dict[str, Tensor] = {}
-        if "vision" in batch.images:
-            z["vv_q"], z["vt_q"] = self.query["vision"](batch.images["vision"][0])  # eq. 4, 9
-        if "touch" in batch.images:
-            z["tt_q"], z["tv_q"] = self.query["touch"](batch.images["touch"][0])  # eq. 6, 12
-        return z
+        return _embed(self.query, batch, "q", [q for q, _ in self.directions])  # eq. 4, 6, 9, 12
 
     def keys(self, batch: Views) -> dict[str, Tensor]:
-        z: dict[str, Tensor] = {}
-        if "vision" in batch.images:
-            z["vv_k"], z["tv_k"] = self.key["vision"](batch.images["vision"][1])  # eq. 5, 13
-        if "touch" in batch.images:
-            z["tt_k"], z["vt_k"] = self.key["touch"](batch.images["touch"][1])  # eq. 7, 10
-        return z
+        return _embed(self.key, batch, "k", [k for _, k in self.directions])  # eq. 5, 7, 10, 13
 
     def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
-        parts = [part for part in ("vv", "tt", "vt", "tv") if f"{part}_q" in z and f"{part}_k" in z]
-        losses = {
-            part: info_nce(z[f"{part}_q"], z[f"{part}_k"], self.config.temperature) for part in parts
-        }  # eq. 8, 11
+        tower = "q" if self.config.keys == "end-to-end" else "k"
+        losses = {}
+        for part, (mine, other) in PARTS.items():
+            if mine not in self.query or other not in self.query:
+                continue
+            head = "intra" if mine == other else "inter"
+            ways = [
+                info_nce(z[f"q{query}_{mine}_{head}"], z[f"{tower}{key}_{other}_{head}"], self.config.temperature)
+                for query, key in self.directions
+            ]
+            losses[part] = torch.stack(ways).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         # A loss that is left out of the sum is still told, as a witness of what the others do to it.
-        weighted = [weight.get(part, 1.0) * losses[part] for part in parts if part in self.config.losses]
+        weighted = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
         return {"loss": torch.stack(weighted).sum(), **losses}  # eq. 14, or what is left of it with one modality
 
     def encoders(self) -> dict[str, nn.Module]:
@@ -146,5 +168,5 @@ class MViTac(Contrastive):
 
     def after_step(self, progress: float) -> None:
         m = rising(self.config.momentum, self.config.momentum_end, progress)
-        for modality, tower in self.query.items():
-            self.key[modality].follow(tower, m)  # type: ignore[operator]  # eq. 1-3
+        for modality, key in self.key.items():
+            key.follow(self.query[modality], m)  # type: ignore[operator]  # eq. 1-3
