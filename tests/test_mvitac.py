@@ -197,3 +197,12 @@ def test_end_to_end_keys_are_the_queries_and_learn() -> None:
 def test_end_to_end_on_touch_alone() -> None:
     method = build(replace(CONFIG, keys="end-to-end"), replace(Toy().spec(), vision_channels=0))
     assert set(method(views(vision=0))) == {"loss", "tt"}
+
+
+def test_running_norm_makes_a_key_independent_of_its_batch() -> None:
+    batch = views()
+    first = replace(batch, images={m: [v[:3] for v in both] for m, both in batch.images.items()})
+    for kind in ("batch", "running"):
+        method = build(replace(CONFIG, key_norm=kind)).train()
+        whole, part = (method.keys(b)["k1_touch_intra"][:3] for b in (batch, first))
+        assert torch.allclose(whole, part, atol=1e-5) == (kind == "running")

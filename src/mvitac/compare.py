@@ -11,12 +11,9 @@ A run whose loss stops being a number is a result too: it is kept as failed.json
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import statistics
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +34,7 @@ from mvitac.run import Run
 from mvitac.session import Session, chosen, probe_runs
 from mvitac.stress import stress
 from mvitac.train import Diverged, train
+from mvitac.workers import my_device, side_by_side
 
 
 @dataclass(frozen=True)
@@ -136,39 +134,17 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
             line = do(job, work.pack)
             say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.label}, seed {job.run.seed}: {line}")
         return
-    context = multiprocessing.get_context("spawn")
-    devices = context.Queue()
-    for i in range(num_jobs):
-        gpus = torch.cuda.device_count()
-        devices.put(f"cuda:{i % gpus}" if gpus > 1 else "auto")
-    threads = max(1, (os.cpu_count() or 1) // num_jobs)
-    with ProcessPoolExecutor(num_jobs, context, initializer=_start, initargs=(devices, threads)) as pool:
+    gpus = torch.cuda.device_count()
+    with side_by_side(num_jobs, [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()) as pool:
         futures = {pool.submit(_do_here, job): job for job in todo}
         for done in as_completed(futures):
             job = futures[done]
             say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.label}, seed {job.run.seed}: {done.result()}")
 
 
-_device = "auto"
-
-
-def _start(devices: Any, threads: int) -> None:
-    """Begin a worker: one device for its life, and no life after its parent's, which might be started again."""
-    global _device
-    _device = devices.get()
-    torch.set_num_threads(threads)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
 def _do_here(job: Job) -> str:
-    return do(replace(job, run=replace(job.run, device=_device)) if _device != "auto" else job)
+    device = my_device()
+    return do(job if device == "auto" else replace(job, run=replace(job.run, device=device)))
 
 
 def submit(work: Work, options: str) -> str:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import os
 import time
+from collections.abc import Sequence
+from concurrent.futures import FIRST_EXCEPTION, wait
 from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from mvitac.device import pick_device
 from mvitac.record import write_json
 from mvitac.report import write_report
 from mvitac.run import Run
 from mvitac.session import Session, probe_runs
 from mvitac.tables import print_retrieval, print_summary
-from mvitac.train import train
+from mvitac.train import Interrupted, train
+from mvitac.workers import side_by_side
 
 
 def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
@@ -30,11 +37,18 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
         f"1/4 simulating {run.data.name}: {getattr(run.data, 'num', '')} pairs, once; later runs find them in the cache"
     )
     pack = run.data.open()
-    paths = []
-    for seed in range(num_seeds):
-        say(f"2/4 pre-training seed {seed} (of {num_seeds}): {run.num_steps(len(pack.rows('train')))} steps")
-        seeded = replace(run, seed=run.seed + seed)
-        paths.append(train(seeded, out / f"seed{seeded.seed}", resume=True, pack=pack))
+    runs = [(replace(run, seed=run.seed + i), out / f"seed{run.seed + i}") for i in range(num_seeds)]
+    steps = run.num_steps(len(pack.rows("train")))
+    unfinished = [(seeded, path) for seeded, path in runs if not (path / "model.safetensors").exists()]
+    if len(unfinished) > 1 and pick_device(run.device).type == "cpu" and (os.cpu_count() or 1) > 1:
+        # Several runs of few threads get more out of the cores than one run of many (docs/speed.md).
+        say(f"2/4 pre-training {len(unfinished)} seeds side by side: {steps} steps each")
+        train_together(unfinished, steps, console)
+    for seeded, path in runs:  # what is finished is only held against what is asked for
+        if not (path / "model.safetensors").exists():
+            say(f"2/4 pre-training seed {seeded.seed} (of {num_seeds}): {steps} steps")
+        train(seeded, path, resume=True, pack=pack)
+    paths = [path for _, path in runs]
     say("3/4 probing the frozen features, beside controls")
     result = probe_runs(paths, Session(), pack)
     write_json(out / "probe.json", result)
@@ -46,3 +60,36 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     say(f"figures: {out / 'summary.json'}\nreport: {page}    (open it in a browser)")
     say(f"took {(time.perf_counter() - start) / 60:.1f} minutes")
     return page
+
+
+def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Console) -> None:
+    """Pre-train ``runs`` at the same time, each in a process of its own, with a line of progress for each.
+
+    Interrupted after Ctrl-C, when every run has saved its checkpoint; the first run's error if one fails.
+    """
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.fields[text]}"), console=console) as progress:
+        bars = {path: progress.add_task(f"seed {run.seed}", total=num_steps, text="") for run, path in runs}
+        with side_by_side(len(runs)) as pool:
+            waiting = {pool.submit(train, run, path, resume=True, quiet=True) for run, path in runs}
+            try:
+                while waiting:
+                    done, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
+                    for path, bar in bars.items():
+                        step, text = _last_line(path / "log.jsonl")
+                        finished = (path / "model.safetensors").exists()
+                        progress.update(bar, completed=num_steps if finished else step, text=text)
+                    for future in done:
+                        future.result()
+            except KeyboardInterrupt:  # the terminal sent it to the runs as well, which stop after their step
+                raise Interrupted("stopped; the same command goes on from here") from None
+
+
+def _last_line(log: Path) -> tuple[int, str]:
+    """The step that a run's log has come to, and what it says of it."""
+    try:
+        entries = [json.loads(line) for line in log.read_text().splitlines()[-2:]]
+    except (OSError, ValueError):  # not there yet, or a line being written
+        return 0, ""
+    told = [entry for entry in entries if "loss" in entry]
+    return (told[-1]["step"], f"loss {told[-1]['loss']:.2f}  {told[-1]['pairs_per_s']:.0f}/s") if told else (0, "")

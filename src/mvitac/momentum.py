@@ -18,9 +18,15 @@ def rising(m: float, end: float | None, progress: float) -> float:
 class Momentum(nn.Module):
     """A frozen copy of ``query`` that follows it: theta_k <- m theta_k + (1 - m) theta."""
 
-    def __init__(self, query: nn.Module) -> None:
+    def __init__(self, query: nn.Module, *, running_norm: bool = False) -> None:
+        """``running_norm``: its BatchNorm uses the statistics that follow the query's, never those of its own batch, so
+        that a key tells nothing of its neighbours (EMAN, Cai et al., CVPR 2021)."""
         super().__init__()
         self.module = copy.deepcopy(query).requires_grad_(False)
+        self.running_norm = running_norm
+
+    def train(self, mode: bool = True) -> Momentum:
+        return super().train(mode and not self.running_norm)
 
     @torch.no_grad()
     def forward(self, *inputs: Any) -> Any:

@@ -240,6 +240,9 @@ ABLATION = Plan(
             Row(label=f"momentum {m}", set={"method.momentum": m, "method.momentum_end": None})
             for m in (0.0, 0.5, 0.9, 0.99, 0.999)
         ),
+        Row(label="no momentum tower, keys learn", set={"method.keys": "end-to-end"}),
+        Row(label="symmetric", set={"method.symmetric": True}),
+        Row(label="keys by running BatchNorm statistics", set={"method.key_norm": "running"}),
         Row(label="shared heads", set={"method.shared_heads": True}),
         Row(label="heads without BatchNorm", set={"method.head_norm": False}),
         Row(label="heads with BatchNorm", set={"method.head_norm": True}),

@@ -43,6 +43,9 @@ class MViTacConfig(MethodConfig):
     keys: Literal["momentum", "end-to-end"] = "momentum"
     """Where keys come from: a momentum tower (the paper), or the query tower itself, learning from them too (SimCLR; named
     as in MoCo, figure 2). The latter is symmetric as it is, and takes no momentum."""
+    key_norm: Literal["batch", "running"] = "batch"
+    """Statistics of BatchNorm in momentum towers: of their own batch (the authors' code), or those that follow the query
+    tower's (EMAN, arXiv:2101.08482)."""
     symmetric: bool = False
     """Each view is query and key in turn, the loss the mean of both ways (BYOL, MoCo v3); the paper has one way."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
@@ -129,7 +132,8 @@ class MViTac(Contrastive):
         # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
         self.query = nn.ModuleDict({m: Tower(config, encoder, spec.channels(m)) for m in spec.modalities})
         momentum = self.query if config.keys == "momentum" else {}
-        self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in momentum.items()})
+        running = config.key_norm == "running"
+        self.key = nn.ModuleDict({m: Momentum(tower, running_norm=running) for m, tower in momentum.items()})
 
     @property
     def directions(self) -> tuple[tuple[int, int], ...]:
