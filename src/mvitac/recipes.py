@@ -45,11 +45,13 @@ def authors(data: DatasetConfig) -> Run:
 
 
 def modern(data: DatasetConfig) -> Run:
-    """What current practice does, each change with its reason; not yet measured one by one.
+    """What current practice does, each change with its reason (docs/results/ has the rows that were measured).
 
+    - keys end-to-end, negatives of both views: gradients through both views instead of a momentum tower, as in SimCLR. At
+      equal steps and images the change that helps most, for half as much time again per step (docs/results/recipes.md).
     - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away.
     - BatchNorm in the heads (SimCLR v2, MoCo v3): keeps the embeddings from collapsing early at small batches.
-    - momentum .99 rising to 1 (BYOL, MoCo v3): the keys settle as the queries do; .99 suits long runs.
+    - momentum .99 rising to 1 (BYOL, MoCo v3) for the methods that have one: the keys settle as the queries do.
     - one-per-touch batches: consecutive frames of one touch are near-duplicates, and as negatives they teach nonsense.
     - same-touch positives: two views of one image share lamp, background and sensor, which solves L_vv and L_tt without
       looking at the material (docs/simulator.md has the figures); another row of the touch shares only the thing. Not for
@@ -60,7 +62,7 @@ def modern(data: DatasetConfig) -> Run:
     return replace(
         base,
         recipe="modern",
-        method=MViTacConfig(head_norm=True, momentum_end=1.0),
+        method=MViTacConfig(head_norm=True, keys="end-to-end", negatives="both views", momentum_end=1.0),
         optim=Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=1e-4, schedule="cosine", warmup=0.05),
         sampler="one-per-touch",
         positives="same-image" if phased else "same-touch",
@@ -74,7 +76,7 @@ def demo(data: DatasetConfig) -> Run:
     - ResNet-10 (timm's resnet10t) at 48 px, for more steps in the same minutes; its score against ResNet-18 is not measured.
     - batch 64 for twice the steps of batch 128, and temperature .2 (docs/simulator.md has the scores of each).
     - whole images are probed at 72 px, the scale at which crops of them were learned.
-    - momentum .9 throughout: keys at .99 rising to 1 remember more steps than the run has.
+    - momentum .9 for the methods that have one: keys at .99 rising to 1 remember more steps than the run has.
     - crops of 40 % and more, no grayscale, lr 2e-3: easier views for few steps.
     """
     base = modern(data)
@@ -82,7 +84,7 @@ def demo(data: DatasetConfig) -> Run:
     return replace(
         base,
         recipe="demo",
-        method=MViTacConfig(head_norm=True, momentum=0.9, temperature=0.2),
+        method=replace(base.method, momentum=0.9, momentum_end=None, temperature=0.2),  # type: ignore[call-arg]
         optim=replace(base.optim, lr=2e-3),
         encoder=EncoderConfig(trunk="resnet10t", weights=SCRATCH),
         augment=Augment(size=48, whole=72, vision=views, touch=views),
