@@ -14,7 +14,6 @@ from toy import Toy
 from mvitac.batch import Views
 from mvitac.encoders import SCRATCH, EncoderConfig
 from mvitac.methods.mvitac import MViTac, MViTacConfig
-from mvitac.methods.simclr import nt_xent
 from mvitac.run import Optim
 from mvitac.spec import DataSpec
 from mvitac.step import build_optimiser
@@ -207,16 +206,3 @@ def test_running_norm_makes_a_key_independent_of_its_batch() -> None:
         method = build(replace(CONFIG, key_norm=kind)).train()
         whole, part = (method.keys(b)["k1_touch_intra"][:3] for b in (batch, first))
         assert torch.allclose(whole, part, atol=1e-5) == (kind == "running")
-
-
-def test_negatives_of_both_views_are_nt_xent() -> None:
-    """Within a modality, end-to-end: SimCLR's loss over all 2B views."""
-    method = build(replace(CONFIG, keys="end-to-end", negatives="both views", temperature=0.3))
-    batch = views()
-    z = method.queries(batch)
-    losses = method(batch)
-    for part, modality in (("vv", "vision"), ("tt", "touch")):
-        expected = nt_xent(z[f"q0_{modality}_intra"], z[f"q1_{modality}_intra"], 0.3)
-        torch.testing.assert_close(losses[part], expected)
-    with pytest.raises(ValueError, match="symmetric"):
-        replace(CONFIG, negatives="both views")

@@ -8,23 +8,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def info_nce(
-    query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], temperature: float, more: Float[Tensor, "B D"] | None = None
-) -> Float[Tensor, ""]:
+def info_nce(query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], temperature: float) -> Float[Tensor, ""]:
     """InfoNCE with in-batch negatives, mean over the queries (paper eq. 8 and 11).
 
     L = -log( exp(q.k+ / tau) / sum_i exp(q.k_i / tau) ), the sum running over all B keys of the batch, the positive
-    included. ``more``: further negatives, all rows but a query's own (with both views of SimCLR, eq. 1: NT-Xent). All
-    inputs are L2-normalised here, and everything is computed in fp32 whatever the autocast: at tau = .07 the logits
-    span +-14, where bf16 keeps only two digits.
+    included. Both inputs are L2-normalised here, and everything is computed in fp32 whatever the autocast: at
+    tau = .07 the logits span +-14, where bf16 keeps only two digits.
     """
     with torch.autocast(query.device.type, enabled=False):
         query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)
         logits = query @ key.T / temperature
-        if more is not None:
-            others = query @ F.normalize(more.float(), dim=1).T / temperature
-            own = torch.eye(len(query), dtype=torch.bool, device=query.device)
-            logits = torch.cat([logits, others.masked_fill(own, float("-inf"))], dim=1)
         return F.cross_entropy(logits, torch.arange(len(query), device=query.device))
 
 

@@ -47,7 +47,7 @@ def authors(data: DatasetConfig) -> Run:
 def modern(data: DatasetConfig) -> Run:
     """What current practice does, each change with its reason (docs/results/ has the rows that were measured).
 
-    - keys end-to-end, negatives of both views: gradients through both views instead of a momentum tower, as in SimCLR. At
+    - keys end-to-end: gradients through both views instead of a momentum tower, as in SimCLR. At
       equal steps and images the change that helps most, for half as much time again per step (docs/results/recipes.md).
     - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away.
     - BatchNorm in the heads (SimCLR v2, MoCo v3): keeps the embeddings from collapsing early at small batches.
@@ -62,7 +62,7 @@ def modern(data: DatasetConfig) -> Run:
     return replace(
         base,
         recipe="modern",
-        method=MViTacConfig(head_norm=True, keys="end-to-end", negatives="both views", momentum_end=1.0),
+        method=MViTacConfig(head_norm=True, keys="end-to-end", momentum_end=1.0),
         optim=Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=1e-4, schedule="cosine", warmup=0.05),
         sampler="one-per-touch",
         positives="same-image" if phased else "same-touch",

@@ -48,8 +48,6 @@ class MViTacConfig(MethodConfig):
     tower's (EMAN, arXiv:2101.08482)."""
     symmetric: bool = False
     """Each view is query and key in turn, the loss the mean of both ways (BYOL, MoCo v3); the paper has one way."""
-    negatives: Literal["view", "both views"] = "view"
-    """A query's negatives: the keys of one view (the paper), or of both (SimCLR), which takes a symmetric loss."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
     """Which of the four losses of eq. 14 to minimise; the paper minimises all."""
     shared_heads: bool = False
@@ -74,8 +72,6 @@ class MViTacConfig(MethodConfig):
         for name, width in (("out", self.out), ("hidden", self.hidden)):
             if not 1 <= width <= 65536:
                 raise ValueError(f"head width {name} {width}: give 1 to 65536")
-        if self.negatives == "both views" and not (self.symmetric or self.keys == "end-to-end"):
-            raise ValueError("negatives of both views need keys of both: add symmetric, or keys end-to-end")
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if not 0 <= self.dropout < 1:
@@ -158,12 +154,10 @@ class MViTac(Contrastive):
             if mine not in self.query or other not in self.query:
                 continue
             head = "intra" if mine == other else "inter"
-            ways = []
-            for query, key in self.directions:
-                # The other positive, or the query itself, is the row that ``info_nce`` leaves out of ``more``.
-                more = z[f"{tower}{query}_{other}_{head}"] if self.config.negatives == "both views" else None
-                positive = z[f"{tower}{key}_{other}_{head}"]
-                ways.append(info_nce(z[f"q{query}_{mine}_{head}"], positive, self.config.temperature, more))
+            ways = [
+                info_nce(z[f"q{query}_{mine}_{head}"], z[f"{tower}{key}_{other}_{head}"], self.config.temperature)
+                for query, key in self.directions
+            ]
             losses[part] = torch.stack(ways).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         # A loss that is left out of the sum is still told, as a witness of what the others do to it.
