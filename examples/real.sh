@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Everything behind docs/results/real.md: manifests, pre-training, probes, tables. CPU only.
 #   examples/real.sh ../shared/data runs/real 0 1 2          (data, output, seeds; stops and resumes at any point)
+#   SETS="vt60 physiclear" examples/real.sh ...              (only these sets: several calls may run side by side)
 set -euo pipefail
 data=$1 out=$2
 shift 2
@@ -9,11 +10,12 @@ here=$(dirname "$0")
 mvitac=(python -m mvitac)
 [ -d "$out/manifests" ] || python "$here/real_manifests.py" "$data" "$out/manifests"
 
-# pretrain NAME SPLIT SEED OPTIONS...: one run of the recipe demo, a finished one is left alone
+# pretrain NAME SPLIT SEED OPTIONS...: one run of the recipe demo in half its steps (the sets are small); a finished one
+# is left alone
 pretrain() {
   local name=$1 split=$2 seed=$3 run="$out/$1/$2-seed$3"
   shift 3
-  [ -f "$run/model.safetensors" ] || "${mvitac[@]}" pretrain --data folder --recipe demo "$@" --data.title "$name" \
+  [ -f "$run/model.safetensors" ] || "${mvitac[@]}" pretrain --data folder --recipe demo --steps 300 "$@" --data.title "$name" \
     --data.path "$out/manifests/$name.csv" --data.group object --data.split "$split" --data.size 72 \
     --eval-every 0 --seed "$seed" --quiet --resume --out "$run"
 }
@@ -28,6 +30,7 @@ probe() {
 # road NAME "SPLITS" OPTIONS...: all runs of a set, their probes, and one table
 road() {
   local name=$1 splits=$2 split seed
+  [[ " ${SETS:-$name} " == *" $name "* ]] || return 0
   shift 2
   for seed in "${seeds[@]}"; do
     for split in $splits; do pretrain "$name" "$split" "$seed" "$@"; done
