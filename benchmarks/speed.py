@@ -2,6 +2,7 @@
 
     python -m benchmarks.speed [--quick] [--device cpu|cuda] [--json FILE]     (make bench)
 
+Where lightly is installed, a step of its parts stands beside ours (``benchmarks/lightly_parts.py``).
 Sections: the step on resident random tensors; the input; both together, end to end; the probe; gradient caching.
 Every speed stands as a share of the bare networks (`benchmarks/floor.py`, same precision) and of the machine's measured
 arithmetic.
@@ -30,6 +31,7 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks import lightly_parts
 from benchmarks.floor import Floor, clock, peak
 from benchmarks.typical import TypicalStep, typical_batches, write_jpegs
 from mvitac.allocator import keep_freed_memory
@@ -137,6 +139,9 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
         "floor bf16": lambda: floors["bf16"](small),
         "ours bf16": ours("bf16"),
     }
+    if lightly_parts.INSTALLED:
+        moco = lightly_parts.LightlyStep(scale.trunk, device)
+        variants["lightly's parts, fp32"] = lambda: moco((images[0], images[2]), (images[1], images[3]))
     if scale.compile:
         variants["ours bf16 compiled"] = ours("bf16", compile=True)
     seconds = interleave(variants, scale.rounds, device)
