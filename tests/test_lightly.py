@@ -1,4 +1,4 @@
-"""Our losses beside lightly's, where it is installed (`pip install --no-deps lightly lightly-utils`); nothing else needs it."""
+"""Our losses beside lightly's, where it is installed (`pip install --no-deps lightly lightly-utils`)."""
 
 from __future__ import annotations
 
