@@ -213,7 +213,7 @@ def test_a_recording_is_read_in_bounded_pieces(tree: Path, tmp_path: Path) -> No
     (tmp_path / "dataset").symlink_to(tree / "dataset")
     (tmp_path / "label.txt").write_text("\n".join(f"{n}/{i:010d}.jpg,{i % 3}" for n in NAMES[:2] for i in range(160)))
     source = TouchAndGoConfig(root=tmp_path, size=32).source()
-    assert source.num_samples() == 320 and len(source.items()) == 2
+    assert sum(source.samples_per_item()) == 320 and len(source.items()) == 2
     assert all(sample.touch.nbytes == 32 * 32 * 3 for sample in source.read(0))  # type: ignore[union-attr]
     assert CHUNK * 2 * 256 * 256 * 3 < 128e6
 

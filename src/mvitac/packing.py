@@ -1,7 +1,8 @@
 """Making a pack: any source's items, resized, checked, and written so that no interruption costs more than a part of them.
 
-``build`` works item by item into ``<pack>.partial`` (killed at any instant, it resumes there and ends byte-identical)
-and renames the finished folder into place, so a folder with a pack.json is a whole pack. No torch here.
+``build`` works in ``<pack>.partial``, where every image is written once, at its final place, and a part's file vouches for
+its rows by their sums. Killed at any instant, it resumes there and ends byte-identical. The finished folder is renamed into
+place, so a folder with a pack.json is a whole pack. No torch here.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ import multiprocessing
 import os
 import shutil
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +29,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mvitac.allocator import keep_freed_memory
 from mvitac.pack import FORMAT, FORMAT_VERSION, SPLITS, Pack, check_table, fit
-from mvitac.record import brief, digest, naming, provenance, read_json, write_atomic, write_json
+from mvitac.record import brief, digest, digest_file, naming, provenance, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.source import Lost, Sample, Source
 from mvitac.spec import DataSpec
@@ -56,12 +59,14 @@ def build(
     check_request(size, workers, max_damaged)
     if out.exists():
         raise ValueError(f"{out} already exists: choose another --out, or delete it first")
-    spec, items = source.spec(), source.items()
-    if not items:
+    spec, items, counts = source.spec(), source.items(), source.samples_per_item()
+    num = sum(counts)
+    if not num:
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
     request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(spec)}
     partial = out.with_name(out.name + ".partial")
-    _check_disk(out, spec, source.num_samples(), size)
+    files = {m: _Rows(partial / "pack" / f"{m}.npy", num, (size, size, spec.channels(m))) for m in spec.modalities}
+    _check_disk(out, list(files.values()))
     if (partial / "request.json").exists():
         if read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})") != json.loads(
             json.dumps(request)
@@ -69,22 +74,105 @@ def build(
             raise ValueError(f"{partial} is an unfinished pack of something else: delete it or choose another --out")
     else:
         write_json(partial / "request.json", request)
+    for rows in files.values():
+        rows.create()
 
-    # A part is held in memory: few items where one gives many samples (a video).
-    step = max(1, NUM_PART_ITEMS * len(items) // max(len(items), source.num_samples()))
-    parts = [range(i, min(i + step, len(items))) for i in range(0, len(items), step)]
-    missing = [i for i in range(len(parts)) if not (partial / f"part-{i:06d}.npz").exists()]
+    step = max(1, NUM_PART_ITEMS * len(items) // max(len(items), num))  # few items where one gives many (a video)
+    firsts = [0, *accumulate(counts)]
+    parts = [
+        _Part(partial / f"part-{i:06d}.json", (start, min(start + step, len(items))), firsts[start])
+        for i, start in enumerate(range(0, len(items), step))
+    ]
+    # Parts come in order, so the digests are taken beside the other processes' work, of rows still in memory.
+    sums = {modality: hashlib.sha256(rows.header(num)) for modality, rows in files.items()}
+    images = {modality: rows.map() for modality, rows in files.items()}
     with _progress(quiet) as progress:
-        bar = progress.add_task(f"packing {spec.name}", total=len(items), completed=0)
-        progress.update(bar, completed=len(items) - sum(len(parts[i]) for i in missing))
-        jobs = [(source, spec, parts[i], size, partial / f"part-{i:06d}.npz") for i in missing]
-        for done in _run(jobs, workers):
-            progress.update(bar, advance=len(done))
-    pack = _finish(
-        partial, out, request, [partial / f"part-{i:06d}.npz" for i in range(len(parts))], items, max_damaged
-    )
+        bar = progress.add_task(f"packing {spec.name}", total=len(items))
+        for part, made in zip(parts, _run(_Work(source, spec, size, counts, files), parts, workers), strict=True):
+            for modality in files:
+                sums[modality].update(images[modality][part.first : part.first + made])
+            progress.update(bar, advance=part.items[1] - part.items[0])
+    digests = {rows.path.name: sums[modality].hexdigest() for modality, rows in files.items()}
+    pack = _finish(partial, out, request, files, parts, digests, items, max_damaged)
     shutil.rmtree(partial)
     return pack
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The image file of one modality, made at full length: whoever has a row writes it at its place."""
+
+    path: Path
+    num: int
+    shape: tuple[int, int, int]
+
+    def header(self, num: int) -> bytes:
+        """What stands before ``num`` rows; numpy leaves room in it, so that its length is the same for any number."""
+        buffer = io.BytesIO()
+        shape = (num, *self.shape)
+        np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
+        return buffer.getvalue()
+
+    def place(self, row: int) -> int:
+        """Byte of the file at which ``row`` begins."""
+        return len(self.header(self.num)) + row * int(np.prod(self.shape))
+
+    def create(self) -> None:
+        """Make the file, zeros that take no space; what an interrupted build wrote stays."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.touch()
+        with naming(self.path), self.path.open("r+b") as file:
+            file.write(self.header(self.num))
+            file.truncate(self.place(self.num))
+
+    def write(self, first: int, images: Iterable[np.ndarray]) -> None:
+        """Write rows ``first`` on. (Not through a map: on a full disk a store into a map kills the process.)"""
+        with naming(self.path), self.path.open("r+b") as file:
+            file.seek(self.place(first))
+            for image in images:
+                file.write(image.data)
+
+    def map(self) -> np.ndarray:
+        """All rows, to read, mapped."""
+        return np.load(self.path, mmap_mode="r", allow_pickle=False)
+
+    def close_holes(self, runs: Sequence[tuple[int, int]]) -> None:
+        """Move rows up so that the ``runs`` (first row, how many), in order, leave nothing between them or behind."""
+        images, to = self.map(), 0
+        for first, num in runs:
+            if first != to:
+                self.write(to, (image.copy() for image in images[first : first + num]))
+            to += num
+        with naming(self.path), self.path.open("r+b") as file:
+            file.write(self.header(to))
+            file.truncate(self.place(to))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Items ``items[0]`` up to ``items[1]``, whose rows begin at ``first``; done where its file says so and is right."""
+
+    path: Path
+    items: tuple[int, int]
+    first: int
+
+    def read(self) -> dict[str, Any]:
+        """columns, damaged, lost and crc (modality -> sum of each row); ValueError if it is not there or of other rows."""
+        known = read_json(self.path, "a part of an unfinished pack")
+        if known["items"] != [*self.items] or known["first"] != self.first:
+            raise ValueError(f"{self.path} is of other rows: delete it and run the same command again")
+        return known
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What every process that packs needs to know. It goes to each once: a source of 100,000 rows takes seconds to send."""
+
+    source: Source
+    spec: DataSpec
+    size: int
+    counts: Sequence[int]
+    files: dict[str, _Rows]
 
 
 def _progress(quiet: bool) -> Progress:
@@ -92,76 +180,85 @@ def _progress(quiet: bool) -> Progress:
     return Progress(*columns, disable=quiet)
 
 
-def _check_disk(out: Path, spec: DataSpec, num: int, size: int) -> None:
-    need = 2 * num * size * size * (spec.vision_channels + spec.touch_channels)  # the parts, then the joined arrays
+def _check_disk(out: Path, files: Sequence[_Rows]) -> None:
+    need = sum(rows.place(rows.num) for rows in files)
+    need -= sum(rows.path.stat().st_blocks * 512 for rows in files if rows.path.exists())  # an interrupted build's
     parent = next(p for p in [out.absolute().parent, *out.absolute().parents] if p.exists())
     free = shutil.disk_usage(parent).free
     if need > free:
         raise ValueError(f"packing needs about {need / 1e9:.1f} GB, {parent} has {free / 1e9:.1f} GB free")
 
 
-def _run(jobs: list[tuple[Source, DataSpec, range, int, Path]], workers: int) -> Iterator[range]:
+def _run(work: _Work, parts: Sequence[_Part], workers: int) -> Iterator[int]:
+    """How many rows each of ``parts`` has, in order, as they are done."""
     workers = workers or os.cpu_count() or 1
-    if workers == 1 or len(jobs) < 2:
+    if workers == 1 or len(parts) < 2:
         keep_freed_memory()
-        for job in jobs:
-            yield _write_part(job)
+        for part in parts:
+            yield _make_part(work, part)
         return
-    # spawn, because a forked child may inherit torch's locks; workers import no torch, so starting one is cheap. The
-    # source goes to each worker once, not with every part: one of 100,000 rows takes seconds to send.
+    # spawn, because a forked child may inherit torch's locks; workers import no torch, so starting one is cheap.
     context = multiprocessing.get_context("spawn")
-    source, spec = jobs[0][:2]
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(source, spec)) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(work,)) as pool:
         try:
-            yield from pool.map(_work, [job[2:] for job in jobs])
+            yield from pool.map(_make_part_here, parts)
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
 
 
-_work_on: tuple[Source, DataSpec]
+_work: _Work
 """What this worker process packs."""
 
 
-def _start_worker(source: Source, spec: DataSpec) -> None:
-    global _work_on
+def _start_worker(work: _Work) -> None:
+    global _work
     keep_freed_memory()
     os.environ["OMP_NUM_THREADS"] = "1"  # one worker, one core; also keeps sums in one order
-    _work_on = source, spec
+    _work = work
 
 
-def _work(job: tuple[range, int, Path]) -> range:
-    return _write_part((*_work_on, *job))
+def _make_part_here(part: _Part) -> int:
+    return _make_part(_work, part)
 
 
-def _write_part(job: tuple[Source, DataSpec, range, int, Path]) -> range:
-    source, spec, numbers, size, path = job
+def _make_part(work: _Work, part: _Part) -> int:
+    """Write ``part`` unless an interrupted build did, and did it well; returns how many rows it has."""
+    with contextlib.suppress(ValueError, KeyError, TypeError):  # not there, or damaged
+        known = part.read()
+        num = len(known["columns"])
+        found = {m: [zlib.crc32(i) for i in rows.map()[part.first : part.first + num]] for m, rows in work.files.items()}
+        if found == known["crc"]:  # else a machine lost power before all of it was on the disk
+            return num
+    return _write_part(work, part)
+
+
+def _write_part(work: _Work, part: _Part) -> int:
     columns: list[dict[str, Any]] = []
-    images: dict[str, list[np.ndarray]] = {m: [] for m in spec.modalities}
     damaged: list[list[Any]] = []
     lost: list[list[str]] = []
-    for number in numbers:
+    sums: dict[str, list[int]] = {m: [] for m in work.files}
+    for number in range(*part.items):
         try:
-            read = source.read(number)
+            read = work.source.read(number)
             samples = [one for one in read if isinstance(one, Sample)]
             lost += [[one.name, one.why] for one in read if isinstance(one, Lost)]
-            fitted = [{m: _check_image(s, m, spec, size) for m in spec.modalities} for s in samples]
+            images = {m: [_check_image(s, m, work.spec, work.size) for s in samples] for m in work.files}
             for sample in samples:
-                _check_columns(sample.columns, spec)
+                _check_columns(sample.columns, work.spec)
         except (ValueError, OSError) as error:
             damaged.append([number, str(error)])
             continue
+        if len(samples) > work.counts[number]:
+            raise ValueError(f"item {number} gives {len(samples)} samples, its source promised {work.counts[number]}")
+        for modality, rows in work.files.items():
+            rows.write(part.first + len(columns), images[modality])
+            sums[modality] += [zlib.crc32(image) for image in images[modality]]
         columns += [sample.columns for sample in samples]
-        for each in fitted:
-            for modality, image in each.items():
-                images[modality].append(image)
-    arrays = {
-        m: np.stack(images[m]) if images[m] else np.zeros((0, size, size, spec.channels(m)), np.uint8) for m in images
-    }
-    texts = {"columns": columns, "damaged": damaged, "lost": lost}
-    text = {name: np.array(json.dumps(value)) for name, value in texts.items()}
-    write_atomic(path, lambda file: np.savez(file, **arrays, **text))  # type: ignore[arg-type]
-    return numbers
+    known = {"items": part.items, "first": part.first, "columns": columns, "damaged": damaged, "lost": lost, "crc": sums}
+    # The rows are written before what vouches for them. Nothing waits for the disk: a resumed build checks the sums.
+    write_atomic(part.path, lambda file: file.write(json.dumps(known).encode()), sync=False)
+    return len(columns)
 
 
 def _check_image(sample: Sample, modality: str, spec: DataSpec, size: int) -> np.ndarray:
@@ -176,7 +273,7 @@ def _check_image(sample: Sample, modality: str, spec: DataSpec, size: int) -> np
         )
     if 0 in image.shape:
         raise ValueError(f"{modality} image is {image.shape}: it has no pixels")
-    return fit(image, size)
+    return np.ascontiguousarray(fit(image, size))
 
 
 def _check_columns(columns: dict[str, Any], spec: DataSpec) -> None:
@@ -195,22 +292,36 @@ def _check_columns(columns: dict[str, Any], spec: DataSpec) -> None:
 
 
 def _finish(
-    partial: Path, out: Path, request: dict[str, Any], paths: list[Path], items: Sequence[str], max_damaged: float
+    partial: Path,
+    out: Path,
+    request: dict[str, Any],
+    files: dict[str, _Rows],
+    parts: Sequence[_Part],
+    digests: dict[str, str],
+    items: Sequence[str],
+    max_damaged: float,
 ) -> Pack:
-    """Join the parts into ``<partial>/pack`` and rename it to ``out``."""
+    """Complete ``<partial>/pack`` and rename it to ``out``; ``digests`` are those of the image files as they are."""
     spec: DataSpec = from_json(DataSpec, json.loads(json.dumps(request["spec"])), "spec")
     columns: list[dict[str, Any]] = []
     damaged: list[list[Any]] = []
     lost: list[list[str]] = []
-    for path in paths:
-        columns += json.loads(str(_from_part(path, "columns")))
-        damaged += json.loads(str(_from_part(path, "damaged")))
-        lost += json.loads(str(_from_part(path, "lost")))
+    sums: dict[str, list[int]] = {m: [] for m in files}  # so that damage can be told by row
+    runs: list[tuple[int, int]] = []
+    for part in parts:
+        known = part.read()
+        runs.append((part.first, len(known["columns"])))
+        columns += known["columns"]
+        damaged += known["damaged"]
+        lost += known["lost"]
+        for modality in files:
+            sums[modality] += known["crc"][modality]
     named = [*([items[number], why] for number, why in damaged), *lost]
     if len(damaged) > max_damaged * len(items) or len(lost) > max_damaged * (len(columns) + len(lost)):
-        for path in paths:  # the damaged parts are read again next time, when they may have been repaired
-            if any(str(_from_part(path, name)) != "[]" for name in ("damaged", "lost")):
-                path.unlink()
+        for part in parts:  # the damaged parts are read again next time, when they may have been repaired
+            known = part.read()
+            if known["damaged"] or known["lost"]:
+                part.path.unlink()
         what = (
             f"{len(damaged)} of {len(items)} items" if damaged else f"{len(lost)} of {len(columns) + len(lost)} samples"
         )
@@ -220,24 +331,15 @@ def _finish(
         )
     if not columns:
         raise ValueError("every item is damaged: nothing to pack")
+    if any(len(columns) < rows.num for rows in files.values()):
+        # Killed here, the next build finds that the sums of what has moved are wrong, and reads that again.
+        for rows in files.values():
+            rows.close_holes(runs)
+        digests = {rows.path.name: digest_file(rows.path) for rows in files.values()}
     joined = partial / "pack"
-    shutil.rmtree(joined, ignore_errors=True)
-    joined.mkdir()
-    size = int(request["size"])
-    sums: dict[str, list[int]] = {m: [] for m in spec.modalities}  # so that damage can be told by row
-    digests: dict[str, str] = {}
-    for modality in spec.modalities:
-        shape = (len(columns), size, size, spec.channels(modality))
-        name = f"{modality}.npy"
-        # Written, not mapped: on a full disk a write is an error one can report, a store into a map kills the process.
-        with naming(joined / name), (joined / name).open("wb") as file:
-            written = _Hashing(file)
-            np.lib.format.write_array_header_1_0(written, {"descr": "|u1", "fortran_order": False, "shape": shape})
-            for path in paths:
-                images = np.ascontiguousarray(_from_part(path, modality))
-                written.write(images.data)
-                sums[modality] += [zlib.crc32(image) for image in images]
-        digests[name] = written.hash.hexdigest()
+    for path in joined.iterdir():  # of a build that was killed here
+        if path.name not in digests:
+            path.unlink()
     buffer = io.BytesIO()
     table = _table(columns)
     for modality in spec.modalities:
@@ -263,26 +365,6 @@ def _finish(
         out.parent.mkdir(parents=True)
     os.rename(joined, out)
     return Pack(out, verify=False)
-
-
-def _from_part(path: Path, name: str) -> np.ndarray:
-    """One array of a part, checked by its CRC."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as part:  # numpy leaks what it cannot read
-            return part[name]
-    except Exception as error:  # zipfile and numpy raise their own kinds for a damaged file
-        raise ValueError(f"{path} is damaged ({brief(error)}): delete it and run the same command again") from None
-
-
-class _Hashing:
-    """A file that takes the sha256 of what is written, so that it need not be read again."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self.hash = file, hashlib.sha256()
-
-    def write(self, data: Any) -> int:
-        self.hash.update(data)
-        return self._file.write(data)
 
 
 def _table(columns: list[dict[str, Any]]) -> pa.Table:

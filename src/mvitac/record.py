@@ -17,9 +17,10 @@ from typing import Any, BinaryIO
 LIBRARIES = ("mvitac", "torch", "torchvision", "timm", "numpy", "scikit-learn", "pyarrow", "mujoco-core")
 
 
-def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
+def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:
     """Let ``write`` fill a neighbouring file, then rename it over ``path``: a reader never sees half of it.
 
+    Without ``sync`` that holds against a killed process, not against lost power, and nothing waits for the disk.
     On any failure (a full disk, Ctrl-C) the half-written neighbour is removed and ``path`` keeps its old content.
     """
     made = [parent for parent in path.parents if not parent.exists()]
@@ -29,7 +30,8 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object]) -> None:
         with neighbour.open("wb") as file:
             write(file)
             file.flush()
-            os.fsync(file.fileno())
+            if sync:
+                os.fsync(file.fileno())
         os.replace(neighbour, path)
     except BaseException as error:
         with contextlib.suppress(OSError):

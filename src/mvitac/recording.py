@@ -125,8 +125,8 @@ class Recorded(Source):
     def items(self) -> Sequence[str]:
         return [path.name for path in self.files]
 
-    def num_samples(self) -> int:
-        return len(self.files) * SPOOL
+    def samples_per_item(self) -> list[int]:
+        return [SPOOL] * len(self.files)
 
     def fingerprint(self) -> dict[str, Any]:
         return {"recording": [digest_file(path) for path in self.files]}

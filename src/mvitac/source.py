@@ -65,9 +65,9 @@ class Source(ABC):
     def fingerprint(self) -> dict[str, Any]:
         """Whatever decides the content, JSON-ready: two sources with equal fingerprints give equal packs."""
 
-    def num_samples(self) -> int:
-        """How many samples to expect, for the disk estimate."""
-        return len(self.items())
+    def samples_per_item(self) -> Sequence[int]:
+        """How many samples each item gives if none is damaged or lost, which decides where their rows lie; never more."""
+        return [1] * len(self.items())
 
     def expected(self) -> list[Count]:
         """What a published list of the dataset says, beside what is there, for `mvitac data check`."""

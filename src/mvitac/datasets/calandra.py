@@ -172,8 +172,8 @@ class Calandra(Source):
             "options": {k: v for k, v in to_json(self.config).items() if k not in ("path", "workers", "size")},
         }
 
-    def num_samples(self) -> int:
-        return len(self._grasps) * len(self.config.phases)
+    def samples_per_item(self) -> list[int]:
+        return [len(self.config.phases)] * len(self._grasps)
 
     def read(self, item: int) -> list[Sample]:
         import h5py

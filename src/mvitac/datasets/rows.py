@@ -246,8 +246,8 @@ class Rows(Source):
         numbers = ([self._rows[i].number for i in item] for item in self._items)
         return [f"row {n[0]}" if len(n) == 1 else f"{len(n)} rows from row {n[0]}" for n in numbers]
 
-    def num_samples(self) -> int:
-        return len(self._rows)
+    def samples_per_item(self) -> list[int]:
+        return [len(item) for item in self._items]
 
     def fingerprint(self) -> dict[str, Any]:
         return {

@@ -149,8 +149,8 @@ class Grasps(Source):
     def fingerprint(self) -> dict[str, Any]:
         return self.config._fingerprint(grasps.VERSION)
 
-    def num_samples(self) -> int:
-        return 3 * self.config.num
+    def samples_per_item(self) -> list[int]:
+        return [3] * self.config.num
 
     def read(self, item: int) -> list[Sample]:
         obj, index = item % grasps.NUM_OBJECTS, item // grasps.NUM_OBJECTS

@@ -165,8 +165,8 @@ class TouchAndGo(Source):
     def items(self) -> list[str]:
         return [f"{c[0].recording} frames {c[0].number} to {c[-1].number}" for c in self._chunks]
 
-    def num_samples(self) -> int:
-        return sum(map(len, self._chunks))
+    def samples_per_item(self) -> list[int]:
+        return [len(chunk) for chunk in self._chunks]
 
     def fingerprint(self) -> dict[str, Any]:
         return self._fingerprint

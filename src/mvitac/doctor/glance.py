@@ -38,8 +38,9 @@ class Glance(Source):
     def fingerprint(self) -> dict[str, Any]:
         return {"glance": self._chosen, **self.source.fingerprint()}
 
-    def num_samples(self) -> int:
-        return -(-self.source.num_samples() * len(self._items) // max(1, len(self.source.items())))
+    def samples_per_item(self) -> list[int]:
+        counts = self.source.samples_per_item()
+        return [counts[number] for number in self._chosen]
 
     def expected(self) -> list[Count]:
         return self.source.expected()
