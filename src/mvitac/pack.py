@@ -241,5 +241,11 @@ def fit(image: np.ndarray, size: int) -> np.ndarray:
     pixels = np.ascontiguousarray(image).view("V3")
     sensors = [np.ascontiguousarray(pixels[:, :, i]).view(np.uint8) for i in range(pixels.shape[2])]
     shaped = [s.reshape(*image.shape[:2], 3) for s in sensors]
-    resized = [np.asarray(Image.fromarray(s).resize((size, size), Image.Resampling.BILINEAR)) for s in shaped]
-    return np.concatenate(resized, axis=2)
+    return np.concatenate([shrink(Image.fromarray(s), size) for s in shaped], axis=2)
+
+
+def shrink(image: Image.Image, size: int) -> np.ndarray:
+    """An RGB image as uint8 [size, size, 3], the pixels ``fit`` gives, without its array in full size."""
+    if image.size != (size, size):
+        image = image.resize((size, size), Image.Resampling.BILINEAR)
+    return np.asarray(image)

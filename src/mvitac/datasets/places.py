@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from PIL import Image
 
 from mvitac import video
 from mvitac.datasets.images import decode
@@ -34,8 +35,8 @@ class Place(ABC):
 
     @staticmethod
     @abstractmethod
-    def read(places: Sequence[Place]) -> Iterator[np.ndarray]:
-        """uint8 RGB [H, W, 3] of ``places``, ascending and all of one kind and ``together``; ValueError names the damage."""
+    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
+        """``places`` as RGB, ascending and all of one kind and ``together``; ValueError names the damage."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -46,7 +47,7 @@ class File(Place):
         return self.path
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[np.ndarray]:
+    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
         return (decode(place.path) for place in places)
 
 
@@ -63,9 +64,9 @@ class Frame(Place):
         return self.path
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[np.ndarray]:
+    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
         for _, image in video.frames(places[0].path, [place.index for place in places]):  # type: ignore[attr-defined]
-            yield image
+            yield Image.fromarray(image)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -79,7 +80,7 @@ class Stretch(Place):
         return f"{self.path} byte {self.offset}"
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[np.ndarray]:
+    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
         for place in places:
             with open(place.path, "rb") as file:
                 file.seek(place.offset)  # type: ignore[attr-defined]
@@ -101,7 +102,7 @@ class Cell(Place):
         return (self.path, self.group)
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[np.ndarray]:
+    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
         first: Cell = places[0]  # type: ignore[assignment]
         try:
             values = pq.ParquetFile(first.path).read_row_group(first.group, columns=[first.column]).column(0)
@@ -117,8 +118,8 @@ class Cell(Place):
             yield decode(io.BytesIO(value), str(place))
 
 
-def read_all(places: Sequence[Place]) -> Iterator[tuple[Place, np.ndarray]]:
-    """Every distinct one of ``places``, which lie together, with its image."""
+def read_all(places: Sequence[Place]) -> Iterator[tuple[Place, Image.Image]]:
+    """Every distinct one of ``places``, which lie together, with its image (RGB)."""
     distinct = sorted(set(places))  # type: ignore[type-var]
     if distinct:
         yield from zip(distinct, type(distinct[0]).read(distinct), strict=True)
@@ -129,7 +130,8 @@ def mean_image(places: tuple[Place, ...]) -> np.ndarray:
     """The mean of several images of one size, uint8 [H, W, 3]: what a sensor sees without contact."""
     total, num = None, 0
     for place in places:
-        for _, image in read_all([place]):
+        for _, read in read_all([place]):
+            image = np.asarray(read)
             if total is not None and image.shape != total.shape:
                 raise ValueError(f"{place} is {image.shape[1]} x {image.shape[0]}: backgrounds must be of one size")
             total = image.astype(np.float64) if total is None else total + image

@@ -20,7 +20,7 @@ from mvitac.datasets.manifest import Condition, Manifest
 from mvitac.datasets.named import check_files, check_present, image_columns, read_backgrounds
 from mvitac.datasets.places import Place, difference, mean_image, read_all
 from mvitac.datasets.splits import BY_GROUP, check_leak, check_sides, check_split_names, deal
-from mvitac.pack import fit
+from mvitac.pack import fit, shrink
 from mvitac.record import digest
 from mvitac.registry import to_json
 from mvitac.source import Sample, Source
@@ -279,7 +279,7 @@ class Rows(Source):
 
     def _look(self, places: Sequence[Place]) -> dict[Place, tuple[tuple[int, int], np.ndarray]]:
         """Place -> its size (height, width) and its image, already at the stored size: a whole video would not fit."""
-        return {place: (image.shape[:2], fit(image, self._size)) for place, image in read_all(places)}
+        return {place: (image.size[::-1], shrink(image, self._size)) for place, image in read_all(places)}
 
     def _minus(
         self, touch: tuple[tuple[int, int], np.ndarray], background: tuple[Place, ...], place: Place

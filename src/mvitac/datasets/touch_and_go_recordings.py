@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mvitac.datasets.images import decode
-from mvitac.pack import fit
+from mvitac.pack import shrink
 from mvitac.video import frames as video_frames
 from mvitac.video import num_frames
 
@@ -106,7 +106,7 @@ def read_frames(place: Path, numbers: list[int], size: int, lost: dict[int, str]
     found = {}
     for number in numbers:
         try:
-            found[number] = fit(decode(place / f"{number:010d}.jpg"), size)
+            found[number] = shrink(decode(place / f"{number:010d}.jpg"), size)
         except (ValueError, OSError) as error:
             lost[number] = str(error)
     return found
