@@ -467,7 +467,7 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     real = Path.open
 
     def opened(self: Path, mode: str = "r", *args: Any, **options: Any) -> Any:
-        if name in self.name and mode[0] == ("a" if name == "log.jsonl" else "w"):
+        if name in self.name and (mode[0] == ("a" if name == "log.jsonl" else "w") or "+" in mode):
             real(self, mode).close()
             return real(Path("/dev/full"), mode, *args, **options)
         return real(self, mode, *args, **options)
@@ -478,7 +478,7 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
 TRAIN_ONE = PRETRAIN + "--steps 1 --eval-every 0"
 FULL: list[tuple[str, str, str, tuple[str, ...]]] = [
     ("pack-request", "request.json", " ".join(SIMULATE) + " {out}", ()),
-    ("pack-part", "part-000000.npz", " ".join(SIMULATE) + " {out}", ("out.partial",)),
+    ("pack-part", "part-000000.json", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-images", "touch.npy", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-table", "samples.parquet", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-description", "pack.json", " ".join(SIMULATE) + " {out}", ("out.partial",)),
@@ -794,10 +794,15 @@ def test_bad_samples_make_no_pack(tmp_path: Path, change: Any, says: str) -> Non
     assert not (tmp_path / "p").exists()
 
 
-@pytest.mark.parametrize("name", ["request.json", "part-000001.npz"])
-@pytest.mark.parametrize("damage", ["empty", "truncated", "garbage", "folder"])
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        *(("request.json", damage) for damage in ("empty", "truncated", "garbage", "folder")),
+        ("part-000001.json", "folder"),
+    ],
+)
 def test_unfinished_pack_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str) -> None:
-    """A damaged leftover is named, and deleting it is enough to go on."""
+    """A damaged leftover is named (a part's file that is only damaged is made again: tests/test_pack.py)."""
     with monkeypatch.context() as patch:
         patch.setattr(packing, "_finish", trap("finish"))
         with pytest.raises(WorkBegan):

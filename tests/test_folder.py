@@ -22,7 +22,7 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.images import decode
 from mvitac.datasets.rows import Rows
 from mvitac.datasets.splits import deal
-from mvitac.pack import Pack
+from mvitac.pack import Pack, fit, shrink
 from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.record import cache_dir
@@ -229,7 +229,7 @@ def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
     Image.fromarray(values).save(tmp_path / "deep.png")
     Image.fromarray(values).save(tmp_path / "deep.tif")
     for name in ("deep.png", "deep.tif"):
-        image = decode(tmp_path / name)
+        image = np.asarray(decode(tmp_path / name))
         assert image.dtype == np.uint8
         assert image.shape == (16, 16, 3)
         assert (image[..., 0].ravel() == np.arange(256)).all()
@@ -240,16 +240,16 @@ def test_gray_palette_bilevel_and_alpha_become_rgb(tmp_path: Path) -> None:
     rgb = Image.fromarray(np.random.default_rng(0).integers(0, 4, (12, 10, 3), np.uint8) * 80)
     gray = rgb.convert("L")
     gray.save(tmp_path / "gray.png")
-    assert (decode(tmp_path / "gray.png") == np.asarray(gray)[..., None]).all()
+    assert (np.asarray(decode(tmp_path / "gray.png")) == np.asarray(gray)[..., None]).all()
     palette = rgb.quantize(256)
     palette.save(tmp_path / "palette.png")
-    assert (decode(tmp_path / "palette.png") == np.asarray(palette.convert("RGB"))).all()
+    assert decode(tmp_path / "palette.png") == palette.convert("RGB")
     gray.point(lambda v: 255 * (v > 99)).convert("1").save(tmp_path / "bits.png")
     assert set(np.unique(decode(tmp_path / "bits.png"))) == {0, 255}
     alpha = np.dstack([np.asarray(rgb), np.full((12, 10), 255, np.uint8)])
     alpha[0, :, 3] = 0
     Image.fromarray(alpha).save(tmp_path / "alpha.png")
-    seen = decode(tmp_path / "alpha.png")
+    seen = np.asarray(decode(tmp_path / "alpha.png"))
     assert (seen[0] == 0).all()
     assert (seen[1:] == np.asarray(rgb)[1:]).all()
 
@@ -261,10 +261,21 @@ def test_exif_rotation_is_applied(tmp_path: Path, mode: str) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera was turned: rotate by 90 degrees clockwise to see it upright
     upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "turned.png", exif=exif)
-    seen = decode(tmp_path / "turned.png")
+    seen = np.asarray(decode(tmp_path / "turned.png"))
     assert seen.shape == (20, 30, 3)
     assert (seen[:5] == 255).all()
     assert (seen[5:] == 0).all()
+
+
+def test_shrunk_without_its_array_it_has_the_same_pixels(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8)
+    for mode, name in [("RGB", "a.jpg"), ("RGB", "a.png"), ("L", "l.jpg"), ("CMYK", "c.jpg"), ("RGBA", "a.webp")]:
+        Image.fromarray(pixels).convert(mode).save(tmp_path / name)
+        array = np.asarray(decode(tmp_path / name))
+        for size in (16, 60, 75, 90, 128):
+            assert (shrink(decode(tmp_path / name), size) == fit(array, size)).all(), (name, size)
+    Image.fromarray(pixels[:, :60]).save(tmp_path / "square.png")
+    assert (shrink(decode(tmp_path / "square.png"), 60) == pixels[:, :60]).all()
 
 
 def damage_truncated(path: Path) -> None:

@@ -22,7 +22,7 @@ from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
 from mvitac.datasets.splits import folds
 from mvitac.datasets.videos import num_frames, spread
 from mvitac.datasets.vt60 import VT60Config
-from mvitac.pack import Pack, fit
+from mvitac.pack import Pack, shrink
 from mvitac.packing import build
 
 
@@ -362,7 +362,7 @@ def test_genuine_slip_grasp(tmp_path: Path) -> None:
         }
         assert sample.columns["width_mm"] == float(row["width_mm"])
         for modality in ("vision", "touch"):
-            assert (getattr(sample, modality) == fit(decode(REAL / "slip_grasp" / row[modality]), 32)).all()
+            assert (getattr(sample, modality) == shrink(decode(REAL / "slip_grasp" / row[modality]), 32)).all()
 
 
 def test_genuine_vt60(tmp_path: Path) -> None:
@@ -382,4 +382,4 @@ def test_genuine_vt60(tmp_path: Path) -> None:
     touches = [row for row in rows if row["modality"] == "touch" and row["object"] == sample.columns["object"]]
     row = touches[int(sample.columns["seq"])]
     assert [sample.columns[axis] for axis in "xyz"] == [row[axis] for axis in "xyz"]
-    assert (sample.touch == fit(decode(REAL / "vt60" / row["image"]), 32)).all()
+    assert (sample.touch == shrink(decode(REAL / "vt60" / row["image"]), 32)).all()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from mvitac import packing
 from mvitac.datasets.packed import PackConfig
 from mvitac.pack import Pack
 from mvitac.packing import build
+from mvitac.source import Lost, Sample, Source
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
@@ -42,36 +46,107 @@ def test_two_processes_give_the_bytes_of_one(pack: Pack, tmp_path: Path) -> None
     assert contents(tmp_path / "two") == contents(pack.path)
 
 
-@pytest.mark.parametrize("parts_before_the_kill", [0, 1, 3])
-def test_interrupted_build_resumes_to_the_same_bytes(
-    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parts_before_the_kill: int
-) -> None:
-    real, calls = packing._write_part, []
+@dataclass
+class Counting(Toy):
+    """The toy, which keeps what was read of it."""
 
-    def dying(job: object) -> range:
-        if len(calls) == parts_before_the_kill:
-            raise KeyboardInterrupt
-        calls.append(job)
-        return real(job)  # type: ignore[arg-type]
+    seen: list[int] = field(default_factory=list)
 
-    monkeypatch.setattr(packing, "_write_part", dying)
-    with pytest.raises(KeyboardInterrupt):
+    def read(self, item: int) -> list[Sample]:
+        self.seen.append(item)
+        return super().read(item)
+
+
+class Stop:
+    """Raises instead of the ``after``-th call of the method ``name`` of a pack's image files, which then does nothing."""
+
+    def __init__(self, name: str, after: int, error: BaseException) -> None:
+        self.name, self.after, self.error, self.real = name, after, error, getattr(packing._Rows, name)
+
+    def __enter__(self) -> None:
+        def stopping(*args: Any) -> Any:
+            self.after -= 1
+            if self.after < 0:
+                raise self.error
+            return self.real(*args)
+
+        setattr(packing._Rows, self.name, stopping)
+
+    def __exit__(self, *_: object) -> None:
+        setattr(packing._Rows, self.name, self.real)
+
+
+@pytest.mark.parametrize("writes_before_the_kill", [0, 1, 64, 100, 239])
+def test_interrupted_build_resumes_to_the_same_bytes(pack: Pack, tmp_path: Path, writes_before_the_kill: int) -> None:
+    with pytest.raises(KeyboardInterrupt), Stop("write", writes_before_the_kill, KeyboardInterrupt()):
         toy_pack(tmp_path / "p")
     assert not (tmp_path / "p").exists()
-    monkeypatch.setattr(packing, "_write_part", real)
-    toy_pack(tmp_path / "p")
+    source = Counting()
+    build(source, tmp_path / "p", size=32, quiet=True)
+    done = writes_before_the_kill // 64 * 32  # an item is two writes, a part 32 items
+    assert source.seen == list(range(done, 120)), "what was done is not read again"
     assert contents(tmp_path / "p") == contents(pack.path)
+    assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted([*FILES, "provenance.json"])
     assert not (tmp_path / "p.partial").exists()
 
 
-def test_unfinished_pack_of_something_else_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def die(job: object) -> range:
+def almost_finished(path: Path, source: Source) -> Path:
+    """What is left of packing ``source`` if the build is killed after the last part."""
+
+    def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch:
-        patch.setattr(packing, "_write_part", die)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(packing, "_finish", killed)
         with pytest.raises(KeyboardInterrupt):
-            toy_pack(tmp_path / "p")
+            build(source, path, size=32, quiet=True)
+    return path.with_name(path.name + ".partial")
+
+
+@pytest.mark.parametrize("lost", ["row", "end of the images", "part's file", "half of the part's file"])
+def test_what_lost_power_took_is_read_again(pack: Pack, tmp_path: Path, lost: str) -> None:
+    partial = almost_finished(tmp_path / "p", Toy())
+    images, part = partial / "pack" / "touch.npy", partial / "part-000001.json"
+    if lost == "row":
+        with images.open("r+b") as file:
+            file.seek(128 + 40 * 32 * 32 * 3)
+            file.write(bytes(32 * 32 * 3))
+    elif lost == "end of the images":
+        with images.open("r+b") as file:
+            file.truncate(128 + 40 * 32 * 32 * 3)
+    else:
+        part.write_bytes(part.read_bytes()[: 500 * (lost != "part's file")])
+    source = Counting()
+    build(source, tmp_path / "p", size=32, quiet=True)
+    assert source.seen == list(range(32, 120 if lost == "end of the images" else 64))
+    assert contents(tmp_path / "p") == contents(pack.path)
+
+
+@pytest.mark.parametrize("writes_before_the_kill", [0, 1, 2, 4])
+def test_killed_while_holes_are_closed(tmp_path: Path, writes_before_the_kill: int) -> None:
+    """Three of the four parts move up, first those of vision, then those of touch."""
+    source = Toy(damaged=(3, 40))
+    options: dict[str, Any] = {"size": 32, "max_damaged": 0.05, "quiet": True}
+    straight = build(source, tmp_path / "straight", **options)
+    almost_finished(tmp_path / "p", source)
+    with pytest.raises(KeyboardInterrupt), Stop("write", writes_before_the_kill, KeyboardInterrupt()):
+        build(source, tmp_path / "p", **options)
+    build(source, tmp_path / "p", **options)
+    assert contents(tmp_path / "p") == contents(straight.path)
+
+
+def test_leftovers_in_the_folder_do_not_get_into_the_pack(pack: Pack, tmp_path: Path) -> None:
+    """Those of a build that was killed at its very end, or of a version that kept images in its parts."""
+    partial = almost_finished(tmp_path / "p", Toy())
+    for name in ("pack/pack.json", "pack/.pack.json.1.tmp", "part-000001.npz", "part-000002.json", "pack/vision.npy"):
+        (partial / name).write_bytes(b"of old")
+    toy_pack(tmp_path / "p")
+    assert contents(tmp_path / "p") == contents(pack.path)
+    assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted([*FILES, "provenance.json"])
+
+
+def test_unfinished_pack_of_something_else_is_not_continued(tmp_path: Path) -> None:
+    almost_finished(tmp_path / "p", Toy())
     with pytest.raises(ValueError, match="unfinished pack of something else"):
         toy_pack(tmp_path / "p", num=60)
 
@@ -84,6 +159,47 @@ def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:
     assert lenient.num == 118
     assert [name for name, _ in lenient.meta["damaged"]] == ["item 3", "item 40"]
     assert "0003" not in lenient.column("id")
+    check_images(lenient, [item for item in range(120) if item not in (3, 40)])
+
+
+def check_images(pack: Pack, items: list[int]) -> None:
+    """Every row's images, against the toy's ``items``."""
+    samples = [Toy().read(item)[0] for item in items]
+    assert pack.column("id").tolist() == [sample.columns["id"] for sample in samples]
+    for modality in ("vision", "touch"):
+        file = io.BytesIO()
+        np.save(file, np.stack([getattr(s, modality) for s in samples]))
+        assert (pack.path / f"{modality}.npy").read_bytes() == file.getvalue(), modality
+    Pack(pack.path)  # the digests agree
+
+
+class Strings(Toy):
+    """The toy in items of seven samples, of which a few are lost; the last item has one less than it says."""
+
+    def items(self) -> list[str]:
+        return [f"string {i}" for i in range(6)]
+
+    def samples_per_item(self) -> list[int]:
+        return [7] * 6
+
+    def read(self, item: int) -> list[Sample | Lost]:  # type: ignore[override]
+        numbers = range(7 * item, 41 if item == 5 else 7 * item + 7)
+        lost = (0, 20, 21, 22, 33)
+        return [Lost(f"sample {i}", "torn") if i in lost else super(Strings, self).read(i)[0] for i in numbers]
+
+
+@pytest.mark.parametrize("part", [1, 2, 32])
+def test_lost_samples_leave_no_hole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
+    monkeypatch.setattr(packing, "NUM_PART_ITEMS", 7 * part)
+    found = build(Strings(), tmp_path / "p", size=32, max_damaged=0.2, quiet=True)
+    check_images(found, [i for i in range(41) if i not in (0, 20, 21, 22, 33)])
+    assert found.meta["damaged"] == [[f"sample {i}", "torn"] for i in (0, 20, 21, 22, 33)]
+
+
+def test_more_samples_than_promised_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Strings, "samples_per_item", lambda _: [5] * 6)
+    with pytest.raises(ValueError, match="item 0 gives 6 samples, its source promised 5"):
+        build(Strings(), tmp_path / "p", size=32, max_damaged=0.2, quiet=True)
 
 
 def test_repaired_items_are_read_on_the_next_try(pack: Pack, tmp_path: Path) -> None:
@@ -139,23 +255,29 @@ def test_never_overwrites(pack: Pack) -> None:
         toy_pack(pack.path)
 
 
+def free(monkeypatch: pytest.MonkeyPatch, num_bytes: int) -> None:
+    monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, num_bytes))  # type: ignore[attr-defined]
+
+
 def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))  # type: ignore[attr-defined]
+    """For one copy of the images, less what an interrupted build has written of it."""
+    need = 2 * (128 + 120 * 32 * 32 * 3)
+    free(monkeypatch, need - 1)
     with pytest.raises(ValueError, match="packing needs about"):
         toy_pack(tmp_path / "p")
     assert not list(tmp_path.iterdir())
-
-
-def test_full_disk_leaves_no_half_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(np, "savez", full)
-        with pytest.raises(OSError, match="No space"):
-            toy_pack(tmp_path / "p")
-    assert [p.name for p in (tmp_path / "p.partial").iterdir()] == ["request.json"]
+    free(monkeypatch, need)
+    almost_finished(tmp_path / "p", Toy())
+    free(monkeypatch, 1000)
     toy_pack(tmp_path / "p")
+
+
+def test_full_disk_leaves_no_half_part(pack: Pack, tmp_path: Path) -> None:
+    with Stop("write", 101, OSError(28, "No space left on device")), pytest.raises(OSError, match="No space"):
+        toy_pack(tmp_path / "p")
+    assert sorted(p.name for p in (tmp_path / "p.partial").iterdir()) == ["pack", "part-000000.json", "request.json"]
+    toy_pack(tmp_path / "p")
+    assert contents(tmp_path / "p") == contents(pack.path)
 
 
 def test_scoring_on_val_hides_test(pack: Pack) -> None:

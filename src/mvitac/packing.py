@@ -90,7 +90,7 @@ def build(
         bar = progress.add_task(f"packing {spec.name}", total=len(items))
         for part, made in zip(parts, _run(_Work(source, spec, size, counts, files), parts, workers), strict=True):
             for modality in files:
-                sums[modality].update(images[modality][part.first : part.first + made])
+                sums[modality].update(images[modality][part.first : part.first + made].data)
             progress.update(bar, advance=part.items[1] - part.items[0])
     digests = {rows.path.name: sums[modality].hexdigest() for modality, rows in files.items()}
     pack = _finish(partial, out, request, files, parts, digests, items, max_damaged)
@@ -227,7 +227,10 @@ def _make_part(work: _Work, part: _Part) -> int:
     with contextlib.suppress(ValueError, KeyError, TypeError):  # not there, or damaged
         known = part.read()
         num = len(known["columns"])
-        found = {m: [zlib.crc32(i) for i in rows.map()[part.first : part.first + num]] for m, rows in work.files.items()}
+        found = {
+            m: [zlib.crc32(row.data) for row in rows.map()[part.first : part.first + num]]
+            for m, rows in work.files.items()
+        }
         if found == known["crc"]:  # else a machine lost power before all of it was on the disk
             return num
     return _write_part(work, part)
@@ -253,9 +256,16 @@ def _write_part(work: _Work, part: _Part) -> int:
             raise ValueError(f"item {number} gives {len(samples)} samples, its source promised {work.counts[number]}")
         for modality, rows in work.files.items():
             rows.write(part.first + len(columns), images[modality])
-            sums[modality] += [zlib.crc32(image) for image in images[modality]]
+            sums[modality] += [zlib.crc32(image.data) for image in images[modality]]
         columns += [sample.columns for sample in samples]
-    known = {"items": part.items, "first": part.first, "columns": columns, "damaged": damaged, "lost": lost, "crc": sums}
+    known = {
+        "items": part.items,
+        "first": part.first,
+        "columns": columns,
+        "damaged": damaged,
+        "lost": lost,
+        "crc": sums,
+    }
     # The rows are written before what vouches for them. Nothing waits for the disk: a resumed build checks the sums.
     write_atomic(part.path, lambda file: file.write(json.dumps(known).encode()), sync=False)
     return len(columns)

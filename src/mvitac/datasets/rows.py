@@ -279,7 +279,7 @@ class Rows(Source):
 
     def _look(self, places: Sequence[Place]) -> dict[Place, tuple[tuple[int, int], np.ndarray]]:
         """Place -> its size (height, width) and its image, already at the stored size: a whole video would not fit."""
-        return {place: (image.size[::-1], shrink(image, self._size)) for place, image in read_all(places)}
+        return {place: ((image.height, image.width), shrink(image, self._size)) for place, image in read_all(places)}
 
     def _minus(
         self, touch: tuple[tuple[int, int], np.ndarray], background: tuple[Place, ...], place: Place
