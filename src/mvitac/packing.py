@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import io
 import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -115,7 +116,7 @@ class _Rows:
 
     def place(self, row: int) -> int:
         """Byte of the file at which ``row`` begins."""
-        return len(self.header(self.num)) + row * int(np.prod(self.shape))
+        return len(self.header(self.num)) + row * math.prod(self.shape)
 
     def create(self) -> None:
         """Make the file, zeros that take no space; what an interrupted build wrote stays."""
