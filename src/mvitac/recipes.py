@@ -47,8 +47,8 @@ def authors(data: DatasetConfig) -> Run:
 def modern(data: DatasetConfig) -> Run:
     """What current practice does, each change with its reason (docs/results/ has the rows that were measured).
 
-    - keys end-to-end: gradients through both views instead of a momentum tower, as in SimCLR. At
-      equal steps and images the change that helps most; at equal time, as a step takes half as much again, it is about level (docs/results/recipes.md).
+    - keys end-to-end: gradients through both views instead of a momentum tower, as in SimCLR. At equal steps and images
+      the change that helps most; a step takes half as much again, at equal time it is about level (docs/results/recipes.md).
     - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away.
     - BatchNorm in the heads (SimCLR v2, MoCo v3): keeps the embeddings from collapsing early at small batches.
     - momentum .99 rising to 1 (BYOL, MoCo v3) for the methods that have one: the keys settle as the queries do.
@@ -92,7 +92,7 @@ def demo(data: DatasetConfig) -> Run:
         augment=Augment(size=48, whole=72, vision=views, touch=views),
         batch_size=64,
         steps=900,
-        eval_every=200,
+        eval_every=300,
     )
 
 
