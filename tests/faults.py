@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import tracemalloc
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,8 +95,14 @@ class World:
             self.live.tick()
 
 
-def faulty(engine: Engine, minutes: int) -> tuple[World, list[tuple[str, str]], list[int]]:
-    """Run ``minutes`` with one fault in each; returns the world, the (fault, stream) made, and memory at each minute."""
+def resident() -> int:
+    """Bytes of this process in memory (Linux)."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def faulty(engine: Engine, minutes: int) -> tuple[World, list[tuple[str, str]], list[tuple[int, int]]]:
+    """Run ``minutes`` with one fault in each; returns the world, the (fault, stream) made, and at each minute the bytes
+    that Python has allocated since the first and those of the whole process."""
     world = World(engine)
     world.run(9)
     made, memory = [], []
@@ -114,7 +122,7 @@ def faulty(engine: Engine, minutes: int) -> tuple[World, list[tuple[str, str]], 
             assert not others, (minute, fault, stream, others)
             made.append((fault, stream))
             del world.heard[:]
-            memory.append(tracemalloc.get_traced_memory()[0])
+            memory.append((tracemalloc.get_traced_memory()[0], resident()))
     finally:
         tracemalloc.stop()
     return world, made, memory

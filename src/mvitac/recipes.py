@@ -45,7 +45,7 @@ def authors(data: DatasetConfig) -> Run:
 
 
 def modern(data: DatasetConfig) -> Run:
-    """What current practice does, each change with its reason (docs/results/ has the rows that were measured).
+    """What current practice does, each change with its reason; only the first was measured by itself.
 
     - keys end-to-end: gradients through both views instead of a momentum tower, as in SimCLR. At equal steps and images
       the change that helps most; a step takes half as much again, at equal time it is about level (docs/results/recipes.md).
