@@ -15,7 +15,7 @@ from torch import Tensor
 from mvitac.augment import random_view
 from mvitac.batch import Views
 from mvitac.distributed import World
-from mvitac.feed import Feed, ahead
+from mvitac.feed import Feed, ahead, prefetch
 from mvitac.pack import Pack
 from mvitac.run import Run
 from mvitac.step import Part
@@ -93,8 +93,9 @@ def feed_parts(
 
     numbers = range(per_process * world.rank, per_process * (world.rank + 1))
     steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
-    if device.type == "cuda" and per_process == 1:
-        for made in ahead((part(step, batch, numbers[0]) for step, batch in steps), device):
+    if per_process == 1 and (device.type == "cuda" or pack.store == "jpeg"):
+        views = (part(step, batch, numbers[0]) for step, batch in steps)
+        for made in ahead(views, device) if device.type == "cuda" else prefetch(views):
             yield [partial(_same, made)]
         return
     for step, batch in steps:

@@ -1,4 +1,4 @@
-"""Where a step's pixels come from: the pack's memory map, or wholly resident on the GPU as uint8; and a thread ahead of it.
+"""Where a step's pixels come from: the pack, mapped or decoded, or wholly resident on the GPU as uint8; and a thread ahead.
 
 Shapes: images uint8 [N, H, W, C] in the pack, [B, C, H, W] (channels-last) as they leave.
 """
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mvitac.batch import Views
-from mvitac.pack import Pack
+from mvitac.pack import Images, Pack
 
 T = TypeVar("T")
 SHARE = 0.4
@@ -23,7 +23,8 @@ SHARE = 0.4
 
 
 class Feed:
-    """The images of ``pack`` for ``device``; on a GPU they are resident if they fit, else copied through pinned memory."""
+    """The images of ``pack`` for ``device``; on a GPU they are resident if they fit (JPEGs: decoded), else copied through
+    pinned memory."""
 
     def __init__(self, pack: Pack, device: torch.device) -> None:
         self.pack, self.device, self.resident = pack, device, {}
@@ -32,9 +33,9 @@ class Feed:
             if size < SHARE * torch.cuda.mem_get_info(device)[0]:
                 self.resident = {m: self._upload(pack.images[m]) for m in pack.spec.modalities}
 
-    def _upload(self, images: np.ndarray) -> Tensor:
+    def _upload(self, images: Images) -> Tensor:
         whole = torch.empty(images.shape, dtype=torch.uint8, device=self.device)
-        for start in range(0, len(images), 4096):  # the memory map is read once, in order, in pieces
+        for start in range(0, len(images), 4096):  # the file is read once, in order, in pieces
             piece = np.ascontiguousarray(images[start : start + 4096])
             whole[start : start + 4096] = torch.from_numpy(piece)
         return whole

@@ -6,6 +6,7 @@
            vision.npy        uint8 [N, size, size, 3]      absent where the dataset has no camera
            touch.npy         uint8 [N, size, size, 3 or 6]
 
+A pack that stores JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``jpegs.py``), and bytes_<modality> in its table.
 Here it is opened and checked; ``packing.py`` makes one. No torch here.
 """
 
@@ -16,25 +17,31 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
+from mvitac.jpegs import Jpegs
 from mvitac.record import brief, digest, digest_file, read_json
 from mvitac.registry import from_json, unknown
 from mvitac.spec import DataSpec
 
 FORMAT = "mvitac-pack"
-FORMAT_VERSION = 1
+FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}
+"""By how the images are stored."""
+SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}
 SPLITS = ("train", "val", "test", "unlabelled")
 """Pre-training sees train and unlabelled; val chooses (kNN while training, a probe's regularisation); test only scores."""
 
+Store = Literal["raw", "jpeg"]
+Images = np.ndarray | Jpegs
+
 
 class Pack:
-    """An opened pack: ``table`` (pyarrow), ``images[modality]`` (memory-mapped uint8 [N, S, S, C]), ``spec``."""
+    """An opened pack: ``table`` (pyarrow), ``spec``, and ``images[modality]``: uint8 [N, S, S, C], memory-mapped or decoded on access."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
         """Open and check ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""
@@ -44,10 +51,9 @@ class Pack:
         meta = read_json(self.path / "pack.json", "a pack's description")
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             raise ValueError(f"{self.path / 'pack.json'} does not describe a pack: choose a folder `mvitac data` wrote")
-        if meta.get("format_version") != FORMAT_VERSION:
-            raise ValueError(
-                f"{self.path} has pack format {meta.get('format_version')}, this version reads {FORMAT_VERSION}: re-pack it"
-            )
+        if (version := meta.get("format_version")) not in FORMAT_VERSIONS.values():
+            known = " and ".join(map(str, FORMAT_VERSIONS.values()))
+            raise ValueError(f"{self.path} has pack format {version}, this version reads {known}: re-pack it")
         rest = {key: value for key, value in meta.items() if key != "digest"}
         if meta.get("digest", given := digest(rest)) != given:
             raise ValueError(
@@ -56,21 +62,17 @@ class Pack:
         try:
             self.spec: DataSpec = from_json(DataSpec, meta.get("spec"), "spec")
             self.num, self.size = (int(from_json(int, meta.get(name), name)) for name in ("num", "size"))
+            self.store: Store = from_json(Store, meta.get("store", "raw"), "store")
+            if FORMAT_VERSIONS[self.store] != version:
+                raise ValueError(f"store: {self.store} is not of format {version}")
             self.digests: dict[str, str] = from_json(dict[str, str], meta.get("digests"), "digests")
-            if sorted(self.digests) != sorted(
-                names := ("samples.parquet", *(f"{m}.npy" for m in self.spec.modalities))
-            ):
+            files = {f"{m}{SUFFIXES[self.store]}": m for m in self.spec.modalities}
+            if sorted(self.digests) != sorted(names := ("samples.parquet", *files)):
                 raise ValueError(f"digests: expected those of {', '.join(names)}")
         except ValueError as error:
             raise ValueError(f"{self.path / 'pack.json'} is damaged ({error}): re-pack it") from None
         self.meta: dict[str, Any] = meta
-        self.images: dict[str, np.ndarray] = {m: self._map(m) for m in self.spec.modalities}
-        for name, expected in self.digests.items():
-            if (verify or name == "samples.parquet") and digest_file(self._file(name)) != expected:
-                where = "" if name == "samples.parquet" else self._damaged_rows(name.removesuffix(".npy"))
-                raise ValueError(
-                    f"{self.path / name} does not match its digest{where}: the pack is damaged, make it again"
-                )
+        self._check_digest("samples.parquet")
         try:
             self.table: pa.Table = pq.read_table(self._file("samples.parquet"))
         except Exception as error:  # arrow raises several kinds for a damaged file
@@ -85,6 +87,10 @@ class Pack:
             check_table(self.table, self.spec)
         except ValueError as error:
             raise ValueError(f"{self.path / 'samples.parquet'}: {error} (make the pack again)") from None
+        reader = {"raw": self._map, "jpeg": self._jpegs}[self.store]
+        self.images: dict[str, Images] = {m: reader(m, self._file(name)) for name, m in files.items()}
+        for name, modality in files.items() if verify else ():
+            self._check_digest(name, modality)
 
     @property
     def digest(self) -> str:
@@ -148,17 +154,23 @@ class Pack:
         """Ascending row numbers of touch group number ``touch_group``."""
         return self._rows_by_touch_group[touch_group]
 
+    def _check_digest(self, name: str, modality: str = "") -> None:
+        if digest_file(self._file(name)) != self.digests[name]:
+            where = self._damaged_rows(modality) if modality else ""
+            raise ValueError(f"{self.path / name} does not match its digest{where}: the pack is damaged, make it again")
+
     def _damaged_rows(self, modality: str) -> str:
         """Which rows of a damaged image file do not match their own sums, for the error; "" if that cannot be said."""
-        file = self._file("samples.parquet")
-        if digest_file(file) != self.digests["samples.parquet"] or f"crc_{modality}" not in pq.read_schema(file).names:
+        if f"crc_{modality}" not in self.table.column_names:
             return ""
-        table = pq.read_table(file, columns=["id", f"crc_{modality}"])
-        sums = table.column(f"crc_{modality}").to_pylist()
-        rows = [i for i, image in enumerate(self.images[modality]) if zlib.crc32(image) != sums[i]]
+        sums, images = self.table.column(f"crc_{modality}").to_pylist(), self.images[modality]
+        stored = map(images.jpeg, range(self.num)) if isinstance(images, Jpegs) else images
+        rows = [i for i, one in enumerate(stored) if zlib.crc32(one) != sums[i]]
         if not rows:
             return " in its header"
-        return f" in {len(rows)} of {self.num} rows, first row {rows[0]} (id {table.column('id')[rows[0]].as_py()!r})"
+        return (
+            f" in {len(rows)} of {self.num} rows, first row {rows[0]} (id {self.table.column('id')[rows[0]].as_py()!r})"
+        )
 
     def _file(self, name: str) -> Path:
         path = self.path / name
@@ -166,9 +178,22 @@ class Pack:
             raise ValueError(f"{path} is missing: the pack is damaged, make it again")
         return path
 
-    def _map(self, modality: str) -> np.ndarray:
-        path = self._file(f"{modality}.npy")
-        expected = (self.num, self.size, self.size, self.spec.channels(modality))
+    def _shape(self, modality: str) -> tuple[int, int, int, int]:
+        return self.num, self.size, self.size, self.spec.channels(modality)
+
+    def _jpegs(self, modality: str, path: Path) -> Jpegs:
+        name = f"bytes_{modality}"
+        if name not in self.table.column_names or not pa.types.is_uint32((column := self.table.column(name)).type):
+            raise ValueError(f"{self.path / 'samples.parquet'} has no column {name} of uint32: make the pack again")
+        if column.null_count:
+            raise ValueError(f"{self.path / 'samples.parquet'}: column {name} has empty rows: make the pack again")
+        try:
+            return Jpegs(path, self._shape(modality), self.column(name))
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{brief(error)}: the pack is damaged, make it again") from None
+
+    def _map(self, modality: str, path: Path) -> np.ndarray:
+        expected = self._shape(modality)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about headers that only damage can produce

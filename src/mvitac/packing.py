@@ -1,8 +1,9 @@
 """Making a pack: any source's items, resized, checked, and written so that no interruption costs more than a part of them.
 
 ``build`` works in ``<pack>.partial``, where every image is written once, at its final place, and a part's file vouches for
-its rows by their sums. Killed at any instant, it resumes there and ends byte-identical. The finished folder is renamed into
-place, so a folder with a pack.json is a whole pack. No torch here.
+its rows by their sums. (JPEGs, whose place depends on the length of all before them, are written in files of the parts,
+which are joined in order.) Killed at any instant, it resumes there and ends byte-identical. The finished folder is renamed
+into place, so a folder with a pack.json is a whole pack. No torch here.
 """
 
 from __future__ import annotations
@@ -29,16 +30,24 @@ import pyarrow.parquet as pq
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mvitac.allocator import keep_freed_memory
-from mvitac.pack import FORMAT, FORMAT_VERSION, SPLITS, Pack, check_table, fit
+from mvitac.jpegs import QUALITY, encode
+from mvitac.pack import FORMAT, FORMAT_VERSIONS, SPLITS, SUFFIXES, Pack, Store, check_table, fit
 from mvitac.record import brief, digest, digest_file, naming, provenance, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.source import Lost, Sample, Source
 from mvitac.spec import DataSpec
 
 NUM_PART_ITEMS = 32
+LIKELY_RATIO = 4
+"""Bytes of an image's pixels over those of its JPEG, rather too low than too high."""
 
 
-def check_request(size: int, workers: int, max_damaged: float = 0.0) -> None:
+Buffer = bytes | memoryview
+
+
+def check_request(
+    size: int, workers: int, max_damaged: float = 0.0, *, store: str = "raw", quality: int = QUALITY
+) -> None:
     """Refuse impossible packing options before any work."""
     if not 8 <= size <= 1024:
         raise ValueError(f"size {size} is not possible: give the stored side in pixels, 8 to 1024")
@@ -46,27 +55,47 @@ def check_request(size: int, workers: int, max_damaged: float = 0.0) -> None:
         raise ValueError(f"workers {workers} is not possible: give 1 to 1024 processes, or 0 for one per core")
     if not 0 <= max_damaged <= 1:
         raise ValueError(f"max_damaged {max_damaged} is not possible: give a fraction of the items, 0 to 1")
+    if store not in SUFFIXES:
+        raise unknown("store", str(store), SUFFIXES)
+    if not 1 <= quality <= 100:
+        raise ValueError(f"quality {quality} is not possible: give JPEG's 1 to 100")
+
+
+def stored_as(store: Store, quality: int) -> dict[str, Any]:
+    """What tells a pack of JPEGs from others of the same source and size; nothing of a raw one, as ever."""
+    return {} if store == "raw" else {"store": store, "quality": quality}
 
 
 def build(
-    source: Source, out: str | Path, *, size: int, workers: int = 1, max_damaged: float = 0.0, quiet: bool = False
+    source: Source,
+    out: str | Path,
+    *,
+    size: int,
+    workers: int = 1,
+    max_damaged: float = 0.0,
+    quiet: bool = False,
+    store: Store = "raw",
+    quality: int = QUALITY,
 ) -> Pack:
-    """Read ``source`` into a new pack at ``out``, images stored [size, size].
+    """Read ``source`` into a new pack at ``out``, images stored [size, size]: raw, or as JPEG of ``quality``.
 
     An interrupted build continues from ``<out>.partial``. Damaged items are listed in pack.json under "damaged" if they
     are at most the fraction ``max_damaged`` of all, otherwise ValueError names the first.
     """
     out = Path(out)
-    check_request(size, workers, max_damaged)
+    check_request(size, workers, max_damaged, store=store, quality=quality)
     if out.exists():
         raise ValueError(f"{out} already exists: choose another --out, or delete it first")
     spec, items, counts = source.spec(), source.items(), source.samples_per_item()
     num = sum(counts)
     if not num:
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
-    request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(spec)}
+    request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(spec), **stored_as(store, quality)}
     partial = out.with_name(out.name + ".partial")
-    files = {m: _Rows(partial / "pack" / f"{m}.npy", num, (size, size, spec.channels(m))) for m in spec.modalities}
+    files: dict[str, _Rows | _Jpegs] = {}
+    for modality in spec.modalities:
+        path, shape = partial / "pack" / f"{modality}{SUFFIXES[store]}", (size, size, spec.channels(modality))
+        files[modality] = _Rows(path, num, shape) if store == "raw" else _Jpegs(path, num, shape, quality)
     _check_disk(out, list(files.values()))
     if (partial / "request.json").exists():
         if read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})") != json.loads(
@@ -86,12 +115,11 @@ def build(
     ]
     # Parts come in order, so the digests are taken beside the other processes' work, of rows still in memory.
     sums = {modality: hashlib.sha256(rows.header(num)) for modality, rows in files.items()}
-    images = {modality: rows.map() for modality, rows in files.items()}
     with _progress(quiet) as progress:
         bar = progress.add_task(f"packing {spec.name}", total=len(items))
         for part, made in zip(parts, _run(_Work(source, spec, size, counts, files), parts, workers), strict=True):
-            for modality in files:
-                sums[modality].update(images[modality][part.first : part.first + made].data)
+            for modality, rows in files.items():
+                sums[modality].update(rows.join(part, made))
             progress.update(bar, advance=part.items[1] - part.items[0])
     digests = {rows.path.name: sums[modality].hexdigest() for modality, rows in files.items()}
     pack = _finish(partial, out, request, files, parts, digests, items, max_damaged)
@@ -118,6 +146,10 @@ class _Rows:
         """Byte of the file at which ``row`` begins."""
         return len(self.header(self.num)) + row * math.prod(self.shape)
 
+    def need(self) -> int:
+        """Bytes of disk that are yet to be taken."""
+        return self.place(self.num) - (self.path.stat().st_blocks * 512 if self.path.exists() else 0)
+
     def create(self) -> None:
         """Make the file, zeros that take no space; what an interrupted build wrote stays."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -126,27 +158,102 @@ class _Rows:
             file.write(self.header(self.num))
             file.truncate(self.place(self.num))
 
-    def write(self, first: int, images: Iterable[np.ndarray]) -> None:
+    def stored(self, image: np.ndarray) -> Buffer:
+        """``image`` as it is written."""
+        return image.data
+
+    def put(self, part: _Part, start: int, rows: Iterable[Buffer]) -> None:
+        """Write rows ``start`` on of ``part``."""
+        self.write(part.first + start, rows)
+
+    def write(self, first: int, rows: Iterable[Buffer]) -> None:
         """Write rows ``first`` on. (Not through a map: on a full disk a store into a map kills the process.)"""
         with naming(self.path), self.path.open("r+b") as file:
             file.seek(self.place(first))
-            for image in images:
-                file.write(image.data)
+            for row in rows:
+                file.write(row)
 
     def map(self) -> np.ndarray:
         """All rows, to read, mapped."""
         return np.load(self.path, mmap_mode="r", allow_pickle=False)
+
+    def found(self, part: _Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
+        """The ``num`` rows of ``part`` as they are on the disk; ``lengths`` are for JPEGs only."""
+        return (image.data for image in self.map()[part.first : part.first + num])
+
+    def join(self, part: _Part, num: int) -> Buffer:
+        """The bytes of the ``num`` rows of ``part``, which are in place."""
+        return self.map()[part.first : part.first + num].data
 
     def close_holes(self, runs: Sequence[tuple[int, int]]) -> None:
         """Move rows up so that the ``runs`` (first row, how many), in order, leave nothing between them or behind."""
         images, to = self.map(), 0
         for first, num in runs:
             if first != to:
-                self.write(to, (image.copy() for image in images[first : first + num]))
+                self.write(to, (image.copy().data for image in images[first : first + num]))
             to += num
         with naming(self.path), self.path.open("r+b") as file:
             file.write(self.header(to))
             file.truncate(self.place(to))
+
+
+@dataclass(frozen=True)
+class _Jpegs:
+    """The image file of one modality where JPEG is stored: each part's rows in a file of its own, then joined in order.
+
+    So an image is on the disk twice until the pack is finished, and whatever interrupts the joining, it begins anew.
+    """
+
+    path: Path
+    num: int
+    shape: tuple[int, int, int]
+    quality: int
+
+    def header(self, num: int) -> bytes:
+        """Nothing stands before the rows."""
+        return b""
+
+    def need(self) -> int:
+        """About how many bytes of disk are yet to be taken, by experience with pictures at quality 95."""
+        parts = self.path.parent.parent.glob(f"part-*.{self.path.name}")
+        taken = sum(path.stat().st_size for path in parts) + (self.path.stat().st_size if self.path.exists() else 0)
+        return max(0, 2 * self.num * math.prod(self.shape) // LIKELY_RATIO - taken)
+
+    def create(self) -> None:
+        """Make the file anew, empty: joining begins."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.write_bytes(b"")
+
+    def stored(self, image: np.ndarray) -> Buffer:
+        """``image`` as it is written."""
+        return encode(image, self.quality)
+
+    def part_file(self, part: _Part) -> Path:
+        """Where the rows of ``part`` wait to be joined."""
+        return part.path.with_suffix(f".{self.path.name}")
+
+    def put(self, part: _Part, start: int, rows: Iterable[Buffer]) -> None:
+        """Write rows ``start`` on of ``part``; rows must come in order."""
+        path = self.part_file(part)
+        with naming(path), path.open("ab" if start else "wb") as file:
+            for row in rows:
+                file.write(row)
+
+    def found(self, part: _Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
+        """The ``num`` rows of ``part``, of ``lengths`` bytes each, as they are on the disk."""
+        if num:
+            with self.part_file(part).open("rb") as file:
+                yield from map(file.read, lengths)
+
+    def join(self, part: _Part, num: int) -> Buffer:
+        """Append the rows of ``part`` to those of the parts before it, and give their bytes."""
+        jpegs = self.part_file(part).read_bytes() if num else b""
+        with naming(self.path), self.path.open("ab") as file:
+            file.write(jpegs)
+        return jpegs
+
+    def close_holes(self, runs: Sequence[tuple[int, int]]) -> None:
+        """There are none."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +265,8 @@ class _Part:
     first: int
 
     def read(self) -> dict[str, Any]:
-        """columns, damaged, lost and crc (modality -> sum of each row); ValueError if it is not there or of other rows."""
+        """columns, damaged, lost, crc and bytes (modality -> sum and, of JPEGs, length of each row); ValueError if it is
+        not there or of other rows."""
         known = read_json(self.path, "a part of an unfinished pack")
         if known["items"] != [*self.items] or known["first"] != self.first:
             raise ValueError(f"{self.path} is of other rows: delete it and run the same command again")
@@ -173,7 +281,7 @@ class _Work:
     spec: DataSpec
     size: int
     counts: Sequence[int]
-    files: dict[str, _Rows]
+    files: dict[str, _Rows | _Jpegs]
 
 
 def _progress(quiet: bool) -> Progress:
@@ -181,9 +289,8 @@ def _progress(quiet: bool) -> Progress:
     return Progress(*columns, disable=quiet)
 
 
-def _check_disk(out: Path, files: Sequence[_Rows]) -> None:
-    need = sum(rows.place(rows.num) for rows in files)
-    need -= sum(rows.path.stat().st_blocks * 512 for rows in files if rows.path.exists())  # an interrupted build's
+def _check_disk(out: Path, files: Sequence[_Rows | _Jpegs]) -> None:
+    need = sum(rows.need() for rows in files)  # less what an interrupted build has taken
     parent = next(p for p in [out.absolute().parent, *out.absolute().parents] if p.exists())
     free = shutil.disk_usage(parent).free
     if need > free:
@@ -225,11 +332,11 @@ def _make_part_here(part: _Part) -> int:
 
 def _make_part(work: _Work, part: _Part) -> int:
     """Write ``part`` unless an interrupted build did, and did it well; returns how many rows it has."""
-    with contextlib.suppress(ValueError, KeyError, TypeError):  # not there, or damaged
+    with contextlib.suppress(ValueError, KeyError, TypeError, FileNotFoundError):  # not there, or damaged
         known = part.read()
         num = len(known["columns"])
         found = {
-            m: [zlib.crc32(row.data) for row in rows.map()[part.first : part.first + num]]
+            m: [zlib.crc32(row) for row in rows.found(part, num, known.get("bytes", {}).get(m, []))]
             for m, rows in work.files.items()
         }
         if found == known["crc"]:  # else a machine lost power before all of it was on the disk
@@ -242,6 +349,7 @@ def _write_part(work: _Work, part: _Part) -> int:
     damaged: list[list[Any]] = []
     lost: list[list[str]] = []
     sums: dict[str, list[int]] = {m: [] for m in work.files}
+    lengths: dict[str, list[int]] = {m: [] for m, rows in work.files.items() if isinstance(rows, _Jpegs)}
     for number in range(*part.items):
         try:
             read = work.source.read(number)
@@ -256,8 +364,11 @@ def _write_part(work: _Work, part: _Part) -> int:
         if len(samples) > work.counts[number]:
             raise ValueError(f"item {number} gives {len(samples)} samples, its source promised {work.counts[number]}")
         for modality, rows in work.files.items():
-            rows.write(part.first + len(columns), images[modality])
-            sums[modality] += [zlib.crc32(image.data) for image in images[modality]]
+            stored = [rows.stored(image) for image in images[modality]]
+            rows.put(part, len(columns), stored)
+            sums[modality] += [zlib.crc32(row) for row in stored]
+            if modality in lengths:
+                lengths[modality] += [len(row) for row in stored]
         columns += [sample.columns for sample in samples]
     known = {
         "items": part.items,
@@ -266,6 +377,7 @@ def _write_part(work: _Work, part: _Part) -> int:
         "damaged": damaged,
         "lost": lost,
         "crc": sums,
+        **({"bytes": lengths} if lengths else {}),
     }
     # The rows are written before what vouches for them. Nothing waits for the disk: a resumed build checks the sums.
     write_atomic(part.path, lambda file: file.write(json.dumps(known).encode()), sync=False)
@@ -306,7 +418,7 @@ def _finish(
     partial: Path,
     out: Path,
     request: dict[str, Any],
-    files: dict[str, _Rows],
+    files: dict[str, _Rows | _Jpegs],
     parts: Sequence[_Part],
     digests: dict[str, str],
     items: Sequence[str],
@@ -318,6 +430,7 @@ def _finish(
     damaged: list[list[Any]] = []
     lost: list[list[str]] = []
     sums: dict[str, list[int]] = {m: [] for m in files}  # so that damage can be told by row
+    lengths: dict[str, list[int]] = {m: [] for m, rows in files.items() if isinstance(rows, _Jpegs)}
     runs: list[tuple[int, int]] = []
     for part in parts:
         known = part.read()
@@ -327,6 +440,8 @@ def _finish(
         lost += known["lost"]
         for modality in files:
             sums[modality] += known["crc"][modality]
+        for modality in lengths:
+            lengths[modality] += known["bytes"][modality]
     named = [*([items[number], why] for number, why in damaged), *lost]
     if len(damaged) > max_damaged * len(items) or len(lost) > max_damaged * (len(columns) + len(lost)):
         for part in parts:  # the damaged parts are read again next time, when they may have been repaired
@@ -353,17 +468,17 @@ def _finish(
             path.unlink()
     buffer = io.BytesIO()
     table = _table(columns)
-    for modality in spec.modalities:
-        name = f"crc_{modality}"
-        table = table.drop_columns(name) if name in table.column_names else table  # a manifest made of another pack
-        table = table.append_column(name, pa.array(sums[modality], pa.uint32()))
+    for kind, numbers in (("crc", sums), ("bytes", lengths)):
+        for name, column in ((f"{kind}_{modality}", numbers[modality]) for modality in numbers):
+            table = table.drop_columns(name) if name in table.column_names else table  # a manifest made of another pack
+            table = table.append_column(name, pa.array(column, pa.uint32()))
     check_table(table, spec)
     pq.write_table(table, buffer)
     write_atomic(joined / "samples.parquet", lambda file: file.write(buffer.getvalue()))
     digests = {"samples.parquet": hashlib.sha256(buffer.getvalue()).hexdigest(), **digests}
     meta = {
         "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format_version": FORMAT_VERSIONS[request.get("store", "raw")],
         "num": len(columns),
         "digests": digests,
         "damaged": named,

@@ -168,7 +168,9 @@ class Run:
         value = to_json(self)
         for name in ("device", "log_every", "eval_every", "checkpoint_every"):
             del value[name]
-        del value["data"]["workers"]
+        # A raw pack's run has the digest it had before there were others.
+        for name in ("workers", *(("store", "quality") if self.data.store == "raw" else ())):
+            del value["data"][name]
         return digest(value)
 
     @classmethod

@@ -63,6 +63,8 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
         options.out,
         size=options.data.size,
         workers=options.data.workers,
+        store=options.data.store,
+        quality=options.data.quality,
         max_damaged=options.max_damaged,
         quiet=options.quiet,
     )
@@ -122,7 +124,9 @@ def info(argv: list[str]) -> None:
         """Folder of the pack."""
 
     pack = Pack(parse(Options, argv, "data info").pack)
-    table = Table(title=f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px", title_justify="left")
+    stored = "" if pack.store == "raw" else f", JPEG of quality {pack.meta['quality']}"
+    title = f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px{stored}"
+    table = Table(title=title, title_justify="left")
     for column in ("split", "rows", f"{pack.spec.group_by}s", *(f"{t.name}: majority" for t in pack.spec.tasks)):
         table.add_column(column)
     for split in SPLITS:

@@ -5,11 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from mvitac.pack import Pack
-from mvitac.packing import build, check_request
+from mvitac.jpegs import QUALITY
+from mvitac.pack import Pack, Store
+from mvitac.packing import build, check_request, stored_as
 from mvitac.record import cache_dir, check_place, digest
 from mvitac.registry import Registered
 from mvitac.source import Source
+
+KEEPING = ("size", "workers", "store", "quality")
+"""Options of every dataset that say how its images are kept, not which they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,9 +24,13 @@ class DatasetConfig(Registered, ABC):
     """Side in pixels at which images are stored; crops are cut from it (paper: 256)."""
     workers: int = 0
     """Processes that read or simulate while packing; 0 = one per core."""
+    store: Store = "raw"
+    """Images as raw pixels, read at the speed of memory, or as jpeg, a fraction of the disk, decoded in every step."""
+    quality: int = QUALITY
+    """Of JPEG, 1 to 100."""
 
     def __post_init__(self) -> None:
-        check_request(self.size, self.workers)
+        check_request(self.size, self.workers, store=self.store, quality=self.quality)
 
     @abstractmethod
     def source(self) -> Source:
@@ -31,7 +39,8 @@ class DatasetConfig(Registered, ABC):
     def open(self, *, quiet: bool = False) -> Pack:
         """The pack of this dataset, made in the cache (see ``record.cache_dir``) the first time."""
         source = self.source()
-        key = digest({"fingerprint": source.fingerprint(), "size": self.size})[:16]
+        kept = stored_as(self.store, self.quality)
+        key = digest({"fingerprint": source.fingerprint(), "size": self.size, **kept})[:16]
         path = cache_dir() / "packs" / f"{self.name}-{key}"
         if path.exists():
             return Pack(path)
@@ -39,4 +48,6 @@ class DatasetConfig(Registered, ABC):
             check_place(path)
         except ValueError as error:
             raise ValueError(f"the cache of packs: {error} with MVITAC_CACHE") from None
-        return build(source, path, size=self.size, workers=self.workers, quiet=quiet)
+        return build(
+            source, path, size=self.size, workers=self.workers, quiet=quiet, store=self.store, quality=self.quality
+        )

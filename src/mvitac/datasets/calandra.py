@@ -27,7 +27,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.calandra_objects import (
     AUTHORS_TEST,
     AUTHORS_TRAIN,
@@ -169,7 +169,7 @@ class Calandra(Source):
             "reader": f"calandra {VERSION}",
             "files": {file.name: file.stat().st_size for file in self._files},
             "grasps": digest(known),
-            "options": {k: v for k, v in to_json(self.config).items() if k not in ("path", "workers", "size")},
+            "options": {k: v for k, v in to_json(self.config).items() if k not in ("path", *KEEPING)},
         }
 
     def samples_per_item(self) -> list[int]:

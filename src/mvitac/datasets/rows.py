@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.columns import filled, read_controls, read_ids, read_task
 from mvitac.datasets.manifest import Condition, Manifest
 from mvitac.datasets.named import check_files, check_present, image_columns, read_backgrounds
@@ -151,7 +151,7 @@ class Rows(Source):
         self._size = config.size
         self._name = config.name
         self._manifest_digest = manifest.digest
-        self._options = {k: v for k, v in to_json(config).items() if k not in ("path", "workers", "size")}
+        self._options = {k: v for k, v in to_json(config).items() if k not in ("path", *KEEPING)}
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
 
         vision, touch = image_columns(manifest, config.vision, config.touch)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.sim import grasps, materials
 from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec, Task
@@ -39,7 +39,7 @@ class SimulatedConfig(DatasetConfig):
             raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
 
     def _fingerprint(self, version: int) -> dict[str, Any]:
-        own = {key: value for key, value in asdict(self).items() if key != "workers"}
+        own = {key: value for key, value in asdict(self).items() if key == "size" or key not in KEEPING}
         return {"simulator": self.name, "version": version, **own}
 
 

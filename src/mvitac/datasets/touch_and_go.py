@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.touch_and_go_lists import (
     CLASSES,
     LIST_FILES,
@@ -154,7 +154,7 @@ class TouchAndGo(Source):
         self._fingerprint = {
             "reader": f"touch-and-go {VERSION}",
             "lists": {file.name: digest_file(file) for file in sorted(folder.glob("*.txt")) if file.name in LIST_FILES},
-            "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", "workers", "size")},
+            "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
             "recordings": digest([recording.state() for recording in recordings]),
             "missing": dict(sorted(missing.items())),
         }

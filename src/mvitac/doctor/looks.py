@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvitac.pack import Pack
+from mvitac.pack import Images, Pack
 
 SIDE, FINE = 16, 32
 CONSTANT = 1.0
@@ -62,7 +62,7 @@ def look_at(pack: Pack) -> dict[str, Looks]:
     return found
 
 
-def _look(name: str, modality: str, images: np.ndarray, channels: slice, has: np.ndarray) -> Looks:
+def _look(name: str, modality: str, images: Images, channels: slice, has: np.ndarray) -> Looks:
     num, size = images.shape[:2]
     side = min(SIDE, size)
     fine_side, every = min(FINE, size), max(1, size // 64)  # some 64 x 64 pixels are plenty for a standard deviation
