@@ -123,8 +123,10 @@ def make_views(
     images: dict[str, list[Tensor]] = {}
     for modality in pack.spec.modalities:
         config, images[modality] = getattr(run.augment, modality), []
+        own = feed(modality, rows)
         for source in sources:
-            view = random_view(feed(modality, source), config, run.augment.size, generator, dtype)
+            seen = own if source is rows else feed(modality, source)
+            view = random_view(seen, config, run.augment.size, generator, dtype)
             images[modality].append(view)
     labels = {t.name: torch.from_numpy(pack.labels(t.name, "train")[rows]).to(device) for t in pack.spec.tasks}
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))

@@ -37,7 +37,8 @@ def encode(image: np.ndarray, quality: int) -> bytes:
 
 
 def decode(jpeg: bytes, shape: tuple[int, int, int]) -> np.ndarray:
-    """uint8 ``shape`` [S, S, C]; ValueError or OSError if ``jpeg`` is damaged or of another shape."""
+    """uint8 ``shape`` [S, S, C]; ValueError or OSError if ``jpeg`` is cut short or of another shape. (Damage within gives
+    other pixels, as libjpeg has it: what a pack holds is known by its sums.)"""
     if not jpeg:
         return np.zeros(shape, np.uint8)
     size, _, channels = shape

@@ -41,7 +41,8 @@ Images = np.ndarray | Jpegs
 
 
 class Pack:
-    """An opened pack: ``table`` (pyarrow), ``spec``, and ``images[modality]``: uint8 [N, S, S, C], memory-mapped or decoded on access."""
+    """An opened pack: ``table`` (pyarrow), ``images[modality]`` (uint8 [N, S, S, C], memory-mapped or decoded as they are
+    indexed), ``spec``."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
         """Open and check ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""
