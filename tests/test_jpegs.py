@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,21 +13,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import safetensors.torch
 import torch
 from PIL import Image, JpegImagePlugin
+from test_bad_inputs import described, seal
+from test_train import assert_equal_weights, power_cut, smoke
 from toy import Toy
 
 from mvitac import batches, jpegs, packing, retrieval
 from mvitac.cli import main
-from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.jpegs import Jpegs, decode, encode
 from mvitac.model import pack_features
 from mvitac.pack import Pack
 from mvitac.packing import build
-from mvitac.recipes import recipe
-from mvitac.record import digest, digest_file
 from mvitac.run import Run
 from mvitac.session import Session, probe_runs
 from mvitac.source import Lost, Sample, Source
@@ -283,14 +280,6 @@ def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFi
 # -- damage -----------------------------------------------------------------------------------------------------------
 
 
-def seal(path: Path, **changes: Any) -> None:
-    """Make pack.json promise what the files hold now, so that the checks behind the digests are reached."""
-    meta = {**json.loads((path / "pack.json").read_text()), **changes}
-    meta["digests"] = {name: digest_file(path / name) for name in meta["digests"]}
-    meta.pop("digest")
-    (path / "pack.json").write_text(json.dumps({**meta, "digest": digest(meta)}))
-
-
 def lengths(change: Callable[[np.ndarray], pa.Array | None]) -> Callable[[Path], None]:
     """Column bytes_touch otherwise, or away; consistently sealed."""
 
@@ -332,8 +321,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
     "no-offsets": (lengths(lambda _: None), r"samples\.parquet has no column bytes_touch"),
     "text": (lengths(lambda v: pa.array([str(x) for x in v])), r"samples\.parquet has no column bytes_touch of uint32"),
     "holes": (lengths(lambda v: pa.array([None, *v[1:].tolist()], pa.uint32())), "column bytes_touch has empty rows"),
-    "called-raw": (lambda path: seal(path, store="raw"), r"pack\.json is damaged \(store: raw is not of format 2"),
-    "called-png": (lambda path: seal(path, store="png"), r"pack\.json is damaged .*png"),
+    "called-raw": (described("store", value="raw"), r"pack\.json is damaged \(store: raw is not of format 2"),
+    "called-png": (described("store", value="png"), r"pack\.json is damaged .*png"),
 }
 
 
@@ -388,7 +377,7 @@ def decoded(small: Pack, tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 
 def run_on(pack: Pack, **changes: Any) -> Run:
-    return replace(recipe("smoke", PackConfig(path=pack.path)), steps=4, eval_every=4, **changes)
+    return smoke(pack, **{"steps": 4, "eval_every": 4, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -396,44 +385,24 @@ def trained(small: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(run_on(small), tmp_path_factory.mktemp("trained") / "run", quiet=True)
 
 
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return safetensors.torch.load_file(path / "model.safetensors")
-
-
-def equal(a: Path, b: Path) -> bool:
-    first, second = weights(a), weights(b)
-    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
-
-
 def test_trains_as_on_the_same_pixels_raw(trained: Path, small: Pack, decoded: Pack, tmp_path: Path) -> None:
-    assert equal(trained, train(run_on(decoded), tmp_path / "raw", quiet=True))
-    assert equal(trained, train(run_on(small), tmp_path / "again", quiet=True))
+    assert_equal_weights(trained, train(run_on(decoded), tmp_path / "raw", quiet=True))
+    assert_equal_weights(trained, train(run_on(small), tmp_path / "again", quiet=True))
 
 
 def test_trains_in_chunks_with_partners_too(small: Pack, decoded: Pack, tmp_path: Path) -> None:
-    changes = {"positives": "same-touch", "chunk": 8, "eval_every": 0}
-    made = [
-        train(replace(run_on(pack), steps=1, **changes), tmp_path / name, quiet=True)  # type: ignore[arg-type]
-        for name, pack in (("jpeg", small), ("raw", decoded))
-    ]
-    assert equal(*made)
+    changes: dict[str, Any] = {"positives": "same-touch", "chunk": 8, "steps": 1, "eval_every": 0}
+    packs = {"jpeg": small, "raw": decoded}
+    made = [train(run_on(pack, **changes), tmp_path / name, quiet=True) for name, pack in packs.items()]
+    assert_equal_weights(*made)
 
 
-def test_resumed_equals_straight(trained: Path, small: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    left, real = iter(range(2)), batches.make_views
-
-    def dying(*args: Any) -> Any:
-        if next(left, None) is None:
-            raise RuntimeError("power cut")
-        return real(*args)
-
+def test_resumed_equals_straight(trained: Path, small: Pack, tmp_path: Path) -> None:
     run = run_on(small, checkpoint_every=1)
-    monkeypatch.setattr(batches, "make_views", dying)
-    with pytest.raises(RuntimeError, match="power cut"):
+    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
         train(run, tmp_path / "r", quiet=True)
-    monkeypatch.setattr(batches, "make_views", real)
     train(run, tmp_path / "r", resume=True, quiet=True)
-    assert equal(trained, tmp_path / "r")
+    assert_equal_weights(trained, tmp_path / "r")
 
 
 def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -109,7 +109,7 @@ class Jpegs:
 
 def _num_threads() -> int:
     allowed = os.environ.get("OMP_NUM_THREADS", "")
-    return min(int(allowed) if allowed.isdecimal() and int(allowed) else 8, len(os.sched_getaffinity(0)))
+    return min(int(allowed) if allowed.isdecimal() and int(allowed) else 8, os.cpu_count() or 1)
 
 
 @functools.cache
