@@ -26,6 +26,9 @@ from mvitac.jpegs import Jpegs, decode, encode
 from mvitac.model import pack_features
 from mvitac.pack import Pack
 from mvitac.packing import build
+from mvitac.recipes import recipe
+from mvitac.record import digest
+from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.session import Session, probe_runs
 from mvitac.source import Lost, Sample, Source
@@ -163,6 +166,13 @@ def test_a_pack_of_black_images(tmp_path: Path) -> None:
     assert not found.images["touch"][:].any() and found.images["touch"][3:5].shape == (2, 32, 32, 3)
 
 
+KEPT: dict[str, dict[str, Any]] = {
+    "raw": {"store": "raw", "quality": 50},
+    "jpeg": {"store": "jpeg"},
+    "rough": {"store": "jpeg", "quality": 50},
+}
+
+
 # -- packing ----------------------------------------------------------------------------------------------------------
 
 
@@ -241,7 +251,7 @@ def test_an_unfinished_pack_stored_otherwise_is_not_continued(tmp_path: Path) ->
 
 def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     raw = 2 * 120 * 32 * 32 * 3
-    free = [raw // 2 - 1]  # two copies of a quarter
+    free = [2 * raw // 3 - 1]  # two copies of a third
     monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, free[0]))  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="packing needs about"):
         jpeg_pack(tmp_path / "p")
@@ -275,6 +285,21 @@ def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFi
     kept = [replace(config, **changes).open(quiet=True) for changes in ({}, {"store": "raw"}, {"quality": 81})]  # type: ignore[arg-type]
     assert kept[0].digest == Pack(tmp_path / "p").digest and len({pack.path for pack in kept}) == 3
     assert isinstance(kept[0].images["touch"], Jpegs) and isinstance(kept[1].images["touch"], np.ndarray)
+
+
+def test_a_raw_run_is_the_run_it_was() -> None:
+    """Checkpoints and caches of before hold its digest; and its record says nothing of how images are stored."""
+    config = MaterialsConfig(num=20, size=16)
+    run = recipe("smoke", config)
+    kept = {name: replace(run, data=replace(config, **changes)).digest() for name, changes in KEPT.items()}  # type: ignore[arg-type]
+    assert kept["raw"] == run.digest() and len(set(kept.values())) == 3
+    record = to_json(run)
+    for name in ("workers", "store", "quality"):
+        del record["data"][name]
+    assert Run.load(record) == run
+    for name in ("device", "log_every", "eval_every", "checkpoint_every"):
+        del record[name]
+    assert digest(record) == run.digest()
 
 
 # -- damage -----------------------------------------------------------------------------------------------------------
@@ -345,7 +370,7 @@ def test_a_row_that_cannot_be_decoded_is_named(small: Pack, tmp_path: Path, kind
     if kind == "garbage":
         new = bytes(range(256)) * 10
     else:
-        shape = (40, 40, 3) if kind == "other size" else (32, 32)
+        shape = (16, 64, 3) if kind == "other size" else (32, 32)  # as many pixels
         Image.fromarray(np.full(shape, 9, np.uint8)).save(tmp_path / "x.jpg", quality=20)
         new = (tmp_path / "x.jpg").read_bytes()
     data[row] = new[: len(one)] + bytes(max(0, len(one) - len(new)))
