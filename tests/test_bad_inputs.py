@@ -480,6 +480,7 @@ FULL: list[tuple[str, str, str, tuple[str, ...]]] = [
     ("pack-request", "request.json", " ".join(SIMULATE) + " {out}", ()),
     ("pack-part", "part-000000.json", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-images", "touch.npy", " ".join(SIMULATE) + " {out}", ("out.partial",)),
+    ("pack-jpegs", "touch.jpegs", " ".join(SIMULATE) + " {out} --store jpeg", ("out.partial",)),
     ("pack-table", "samples.parquet", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-description", "pack.json", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-provenance", "provenance.json", " ".join(SIMULATE) + " {out}", ("out.partial",)),

@@ -82,7 +82,7 @@ class Pack:
             ) from None
         if self.table.num_rows != self.num:
             raise ValueError(
-                f"{self.path}: {self.table.num_rows} table rows for {self.num} images: make the pack again"
+                f"{self.path / 'samples.parquet'} has {self.table.num_rows} rows, pack.json promises {self.num}: re-pack it"
             )
         try:
             check_table(self.table, self.spec)

@@ -27,7 +27,7 @@ class DatasetConfig(Registered, ABC):
     store: Store = "raw"
     """Images as raw pixels, read at the speed of memory, or as jpeg, a fraction of the disk, decoded in every step."""
     quality: int = QUALITY
-    """Of JPEG, 1 to 100."""
+    """Of JPEG, 1 to 100; at 95 a pixel is off by 1 or 2 of 255 levels. Colours stay in full resolution (4:4:4)."""
 
     def __post_init__(self) -> None:
         check_request(self.size, self.workers, store=self.store, quality=self.quality)
