@@ -48,7 +48,8 @@ def modern(data: DatasetConfig) -> Run:
     """What current practice does, each change with its reason; only the first was measured by itself.
 
     - keys end-to-end: gradients through both views instead of a momentum tower, as in SimCLR. At equal steps and images
-      the change that helps most; a step takes half as much again, at equal time it is about level (docs/results/recipes.md).
+      ahead of every other self-supervised method on category, at equal time by 3 points of the paper's way, for steps
+      that take half as much again (docs/results/materials.md).
     - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away.
     - BatchNorm in the heads (SimCLR v2, MoCo v3): keeps the embeddings from collapsing early at small batches.
     - momentum .99 rising to 1 (BYOL, MoCo v3) for the methods that have one: the keys settle as the queries do.
@@ -73,8 +74,7 @@ def modern(data: DatasetConfig) -> Run:
 def demo(data: DatasetConfig) -> Run:
     """`modern` in minutes on a laptop's CPU: ResNet-10 from scratch at 48 px, 900 steps of 64 pairs.
 
-    - the paper's momentum keys: at equal time they are level with end-to-end ones, whose steps take 1.5 times as long
-      (docs/results/materials.md), and the demo is a matter of minutes.
+    - the paper's momentum keys: it is there to show the paper's method.
     - ResNet-10 (timm's resnet10t) at 48 px, for more steps in the same minutes; its score against ResNet-18 is not measured.
     - batch 64 for twice the steps of batch 128, and temperature .2 (docs/simulator.md has the scores of each).
     - whole images are probed at 72 px, the scale at which crops of them were learned.
