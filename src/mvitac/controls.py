@@ -20,6 +20,7 @@ from mvitac.pack import Pack
 from mvitac.probe import cross_modal, parts, probe_all, probe_features, probe_model, score_rows
 from mvitac.run import Run
 from mvitac.spec import Task
+from mvitac.workers import in_threads
 
 
 def thumbnails(pack: Pack, modality: str, rows: np.ndarray, side: int = 8) -> np.ndarray:
@@ -78,10 +79,16 @@ def controls_of(
 
     # The trunk before training, once for each seed and architecture among the runs; then the trunk they started from.
     starts = {(run.seed, run.encoder.trunk, run.augment.seen): run for run in runs}
-    for run in starts.values():
-        untrained = fresh(replace(run, encoder=replace(run.encoder, weights=SCRATCH)), pack.spec, pack.size)
-        add("untrained", run.seed, probe_model(untrained, pack, tasks, modalities, probes))
-        retrieval += [{"source": "untrained", "seed": run.seed, **r} for r in cross_modal(untrained, pack)]
+    untrained = [  # weights are drawn here, one model after another: threads share torch's generator
+        fresh(replace(run, encoder=replace(run.encoder, weights=SCRATCH)), pack.spec, pack.size)
+        for run in starts.values()
+    ]
+    scored = in_threads(
+        lambda model: (probe_model(model, pack, tasks, modalities, probes), cross_modal(model, pack)), untrained
+    )
+    for run, (found, ranked) in zip(starts.values(), scored, strict=True):
+        add("untrained", run.seed, found)
+        retrieval += [{"source": "untrained", "seed": run.seed, **r} for r in ranked]
     for name in start_weights(runs, imagenet):
         start = fresh(replace(runs[0], encoder=replace(runs[0].encoder, weights=name)), pack.spec, pack.size)
         add("imagenet", None, probe_model(start, pack, tasks, modalities, probes))

@@ -19,6 +19,7 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
+from mvitac.allocator import keep_freed_memory
 from mvitac.augment import plain_view
 from mvitac.encoders import SCRATCH
 from mvitac.methods.base import Method
@@ -215,6 +216,8 @@ def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
 def pack_features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, precision: str = "fp32") -> Tensor:
     """Features [len(rows), D] of pack rows, in chunks, on the model's device; returned on the CPU."""
     device = next(model.parameters()).device
+    if device.type == "cpu":
+        keep_freed_memory()  # else every activation is mapped anew: twice the time and more on a virtual machine
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)

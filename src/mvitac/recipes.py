@@ -92,7 +92,7 @@ def demo(data: DatasetConfig) -> Run:
         augment=Augment(size=48, whole=72, vision=views, touch=views),
         batch_size=64,
         steps=900,
-        eval_every=300,
+        eval_every=450,
     )
 
 

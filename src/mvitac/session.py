@@ -9,13 +9,14 @@ from typing import Any, Literal
 
 from mvitac.controls import controls_of, start_weights
 from mvitac.encoders import build_trunk
-from mvitac.model import load
+from mvitac.model import Model, load
 from mvitac.pack import Pack
 from mvitac.probe import PROBES, Probe, cross_modal, parts, probe_model
 from mvitac.record import check_place, write_json
 from mvitac.registry import unknown
 from mvitac.scores import summarise
 from mvitac.spec import Task
+from mvitac.workers import in_threads
 
 END_TO_END = ", end to end"
 """Added to a source's name where its own classifiers are scored, which it trained along with its encoders."""
@@ -82,8 +83,9 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
             build_trunk(replace(models[0].run.encoder, weights=weights), 3)
     records: list[dict[str, Any]] = []
     retrieval: list[dict[str, Any]] = []
-    for path, model in zip(paths, models, strict=True):
-        several = len({m.run.recipe for m in models}) > 1
+    several = len({m.run.recipe for m in models}) > 1
+
+    def one(path: Path, model: Model) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         source = f"{model.run.method.name} ({model.run.recipe})" if several else model.run.method.name
         own = {"source": source, "seed": model.run.seed, "run": str(path)}
         mine = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
@@ -93,6 +95,9 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         write_json(
             path / "probe.json", {"data": pack.spec.name, "pack": pack.digest, "records": mine, "retrieval": found}
         )
+        return mine, found
+
+    for mine, found in in_threads(lambda pair: one(*pair), list(zip(paths, models, strict=True))):
         records += mine
         retrieval += found
     if session.controls:
