@@ -134,7 +134,7 @@ def demo(argv: list[str]) -> None:
 
         out: Path = Path("runs/demo")
         """Folder of the demo: one run per seed, summary.json, report."""
-        seeds: int = 3
+        seeds: int = 2
         """How many times to pre-train, each from its own seed."""
         run: Annotated[Run, tyro.conf.arg(name="")] = recipe("demo")
 
