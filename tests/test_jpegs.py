@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import torch
 from PIL import Image, JpegImagePlugin
 from test_bad_inputs import described, seal
 from test_train import assert_equal_weights, power_cut, smoke
-from toy import Toy
+from toy import Counting, Toy
 
 from mvitac import batches, jpegs, packing, retrieval
 from mvitac.cli import main
@@ -35,17 +35,6 @@ from mvitac.source import Lost, Sample, Source
 from mvitac.train import train
 
 FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
-
-
-@dataclass
-class Counting(Toy):
-    """The toy, which keeps what was read of it."""
-
-    seen: list[int] = field(default_factory=list)
-
-    def read(self, item: int) -> list[Sample]:
-        self.seen.append(item)
-        return super().read(item)
 
 
 def jpeg_pack(path: Path, source: Source | None = None, **options: Any) -> Pack:

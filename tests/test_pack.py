@@ -5,13 +5,12 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from toy import Toy, toy_pack
+from toy import Counting, Toy, toy_pack
 
 from mvitac import packing
 from mvitac.datasets.packed import PackConfig
@@ -44,17 +43,6 @@ def test_splits_share_no_group(pack: Pack) -> None:
 def test_two_processes_give_the_bytes_of_one(pack: Pack, tmp_path: Path) -> None:
     build(Toy(), tmp_path / "two", size=32, workers=2, quiet=True)
     assert contents(tmp_path / "two") == contents(pack.path)
-
-
-@dataclass
-class Counting(Toy):
-    """The toy, which keeps what was read of it."""
-
-    seen: list[int] = field(default_factory=list)
-
-    def read(self, item: int) -> list[Sample]:
-        self.seen.append(item)
-        return super().read(item)
 
 
 class Stop:

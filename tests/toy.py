@@ -77,5 +77,16 @@ class Toy(Source):
         return [Sample(vision=image(self.vision_channels), touch=image(self.touch_channels), columns=columns)]
 
 
+@dataclass
+class Counting(Toy):
+    """The toy, which keeps what was read of it."""
+
+    seen: list[int] = field(default_factory=list)
+
+    def read(self, item: int) -> list[Sample]:
+        self.seen.append(item)
+        return super().read(item)
+
+
 def toy_pack(path: Path, size: int = 32, **kwargs: Any) -> Pack:
     return build(Toy(**kwargs), path, size=size, quiet=True)
