@@ -33,6 +33,7 @@ from mvitac.run import Run
 from mvitac.session import Session, probe_runs
 from mvitac.source import Lost, Sample, Source
 from mvitac.train import train
+from mvitac.unfinished import JpegFile
 
 FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
 
@@ -191,7 +192,7 @@ def test_interrupted_build_resumes_to_the_same_bytes(
     small: Pack, tmp_path: Path, name: str, calls: int, done: int
 ) -> None:
     """An item is two puts, a part 32 items and two joins."""
-    kill(tmp_path / "p", packing._Jpegs, name, calls)
+    kill(tmp_path / "p", JpegFile, name, calls)
     assert not (tmp_path / "p").exists()
     source = Counting()
     jpeg_pack(tmp_path / "p", source)
@@ -232,7 +233,7 @@ def test_lost_samples_and_damaged_items_leave_no_hole(small: Pack, tmp_path: Pat
 
 
 def test_an_unfinished_pack_stored_otherwise_is_not_continued(tmp_path: Path) -> None:
-    kill(tmp_path / "p", packing._Jpegs, "put", 3)
+    kill(tmp_path / "p", JpegFile, "put", 3)
     for options in ({"store": "jpeg", "quality": 94}, {"store": "raw"}):
         with pytest.raises(ValueError, match="unfinished pack of something else"):
             build(Toy(), tmp_path / "p", size=32, quiet=True, **options)  # type: ignore[arg-type]
@@ -246,7 +247,7 @@ def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         jpeg_pack(tmp_path / "p")
     assert not list(tmp_path.iterdir())
     free[0] += 1
-    kill(tmp_path / "p", packing._Jpegs, "join", 6)
+    kill(tmp_path / "p", JpegFile, "join", 6)
     free[0] = 1000  # what is there already is not asked for again
     jpeg_pack(tmp_path / "p")
 

@@ -17,6 +17,7 @@ from mvitac.datasets.packed import PackConfig
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.source import Lost, Sample, Source
+from mvitac.unfinished import RowFile
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 
@@ -49,7 +50,7 @@ class Stop:
     """Raises instead of the ``after``-th call of the method ``name`` of a pack's image files, which then does nothing."""
 
     def __init__(self, name: str, after: int, error: BaseException) -> None:
-        self.name, self.after, self.error, self.real = name, after, error, getattr(packing._Rows, name)
+        self.name, self.after, self.error, self.real = name, after, error, getattr(RowFile, name)
 
     def __enter__(self) -> None:
         def stopping(*args: Any) -> Any:
@@ -58,10 +59,10 @@ class Stop:
                 raise self.error
             return self.real(*args)
 
-        setattr(packing._Rows, self.name, stopping)
+        setattr(RowFile, self.name, stopping)
 
     def __exit__(self, *_: object) -> None:
-        setattr(packing._Rows, self.name, self.real)
+        setattr(RowFile, self.name, self.real)
 
 
 @pytest.mark.parametrize("writes_before_the_kill", [0, 1, 64, 100, 239])

@@ -1,9 +1,7 @@
 """Making a pack: any source's items, resized, checked, and written so that no interruption costs more than a part of them.
 
-``build`` works in ``<pack>.partial``, where every image is written once, at its final place, and a part's file vouches for
-its rows by their sums. (JPEGs, whose place depends on the length of all before them, are written in files of the parts,
-which are joined in order.) Killed at any instant, it resumes there and ends byte-identical. The finished folder is renamed
-into place, so a folder with a pack.json is a whole pack. No torch here.
+``build`` works in ``<pack>.partial`` (``unfinished.py`` has its files). Killed at any instant, it resumes there and ends
+byte-identical. The finished folder is renamed into place, so a folder with a pack.json is a whole pack. No torch here.
 """
 
 from __future__ import annotations
@@ -12,12 +10,11 @@ import contextlib
 import hashlib
 import io
 import json
-import math
 import multiprocessing
 import os
 import shutil
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import accumulate
@@ -30,19 +27,15 @@ import pyarrow.parquet as pq
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mvitac.allocator import keep_freed_memory
-from mvitac.jpegs import QUALITY, encode
+from mvitac.jpegs import QUALITY
 from mvitac.pack import FORMAT, FORMAT_VERSIONS, SPLITS, SUFFIXES, Pack, Store, check_table, fit
-from mvitac.record import brief, digest, digest_file, naming, provenance, read_json, write_atomic, write_json
+from mvitac.record import brief, digest, digest_file, provenance, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.source import Lost, Sample, Source
 from mvitac.spec import DataSpec
+from mvitac.unfinished import JpegFile, Part, RowFile
 
 NUM_PART_ITEMS = 32
-LIKELY_RATIO = 3
-"""Bytes of an image's pixels over those of its JPEG: rather low, real frames have 4 at 64 px and 6 to 10 at 256."""
-
-
-Buffer = bytes | memoryview
 
 
 def check_request(
@@ -92,10 +85,10 @@ def build(
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
     request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(spec), **stored_as(store, quality)}
     partial = out.with_name(out.name + ".partial")
-    files: dict[str, _Rows | _Jpegs] = {}
+    files: dict[str, RowFile | JpegFile] = {}
     for modality in spec.modalities:
         path, shape = partial / "pack" / f"{modality}{SUFFIXES[store]}", (size, size, spec.channels(modality))
-        files[modality] = _Rows(path, num, shape) if store == "raw" else _Jpegs(path, num, shape, quality)
+        files[modality] = RowFile(path, num, shape) if store == "raw" else JpegFile(path, num, shape, quality)
     _check_disk(out, list(files.values()))
     if (partial / "request.json").exists():
         if read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})") != json.loads(
@@ -110,7 +103,7 @@ def build(
     step = max(1, NUM_PART_ITEMS * len(items) // max(len(items), num))  # few items where one gives many (a video)
     firsts = [0, *accumulate(counts)]
     parts = [
-        _Part(partial / f"part-{i:06d}.json", (start, min(start + step, len(items))), firsts[start])
+        Part(partial / f"part-{i:06d}.json", (start, min(start + step, len(items))), firsts[start])
         for i, start in enumerate(range(0, len(items), step))
     ]
     # Parts come in order, so the digests are taken beside the other processes' work, of rows still in memory.
@@ -128,152 +121,6 @@ def build(
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """The image file of one modality, made at full length: whoever has a row writes it at its place."""
-
-    path: Path
-    num: int
-    shape: tuple[int, int, int]
-
-    def header(self, num: int) -> bytes:
-        """What stands before ``num`` rows; numpy leaves room in it, so that its length is the same for any number."""
-        buffer = io.BytesIO()
-        shape = (num, *self.shape)
-        np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
-        return buffer.getvalue()
-
-    def place(self, row: int) -> int:
-        """Byte of the file at which ``row`` begins."""
-        return len(self.header(self.num)) + row * math.prod(self.shape)
-
-    def need(self) -> int:
-        """Bytes of disk that are yet to be taken."""
-        return self.place(self.num) - (self.path.stat().st_blocks * 512 if self.path.exists() else 0)
-
-    def create(self) -> None:
-        """Make the file, zeros that take no space; what an interrupted build wrote stays."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.touch()
-        with naming(self.path), self.path.open("r+b") as file:
-            file.write(self.header(self.num))
-            file.truncate(self.place(self.num))
-
-    def stored(self, image: np.ndarray) -> Buffer:
-        """``image`` as it is written."""
-        return image.data
-
-    def put(self, part: _Part, start: int, rows: Iterable[Buffer]) -> None:
-        """Write rows ``start`` on of ``part``."""
-        self.write(part.first + start, rows)
-
-    def write(self, first: int, rows: Iterable[Buffer]) -> None:
-        """Write rows ``first`` on. (Not through a map: on a full disk a store into a map kills the process.)"""
-        with naming(self.path), self.path.open("r+b") as file:
-            file.seek(self.place(first))
-            for row in rows:
-                file.write(row)
-
-    def map(self) -> np.ndarray:
-        """All rows, to read, mapped."""
-        return np.load(self.path, mmap_mode="r", allow_pickle=False)
-
-    def found(self, part: _Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
-        """The ``num`` rows of ``part`` as they are on the disk; ``lengths`` are for JPEGs only."""
-        return (image.data for image in self.map()[part.first : part.first + num])
-
-    def join(self, part: _Part, num: int) -> Buffer:
-        """The bytes of the ``num`` rows of ``part``, which are in place."""
-        return self.map()[part.first : part.first + num].data
-
-    def close_holes(self, runs: Sequence[tuple[int, int]]) -> None:
-        """Move rows up so that the ``runs`` (first row, how many), in order, leave nothing between them or behind."""
-        images, to = self.map(), 0
-        for first, num in runs:
-            if first != to:
-                self.write(to, (image.copy().data for image in images[first : first + num]))
-            to += num
-        with naming(self.path), self.path.open("r+b") as file:
-            file.write(self.header(to))
-            file.truncate(self.place(to))
-
-
-@dataclass(frozen=True)
-class _Jpegs:
-    """The image file of one modality where JPEG is stored: each part's rows in a file of its own, then joined in order.
-
-    So an image is on the disk twice until the pack is finished, and whatever interrupts the joining, it begins anew.
-    """
-
-    path: Path
-    num: int
-    shape: tuple[int, int, int]
-    quality: int
-
-    def header(self, num: int) -> bytes:
-        """Nothing stands before the rows."""
-        return b""
-
-    def need(self) -> int:
-        """About how many bytes of disk are yet to be taken, at quality 95."""
-        parts = self.path.parent.parent.glob(f"part-*.{self.path.name}")
-        taken = sum(path.stat().st_size for path in parts) + (self.path.stat().st_size if self.path.exists() else 0)
-        return max(0, 2 * self.num * math.prod(self.shape) // LIKELY_RATIO - taken)
-
-    def create(self) -> None:
-        """Make the file anew, empty: joining begins."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.write_bytes(b"")
-
-    def stored(self, image: np.ndarray) -> Buffer:
-        """``image`` as it is written."""
-        return encode(image, self.quality)
-
-    def part_file(self, part: _Part) -> Path:
-        """Where the rows of ``part`` wait to be joined."""
-        return part.path.with_suffix(f".{self.path.name}")
-
-    def put(self, part: _Part, start: int, rows: Iterable[Buffer]) -> None:
-        """Write rows ``start`` on of ``part``; rows must come in order."""
-        path = self.part_file(part)
-        with naming(path), path.open("ab" if start else "wb") as file:
-            for row in rows:
-                file.write(row)
-
-    def found(self, part: _Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
-        """The ``num`` rows of ``part``, of ``lengths`` bytes each, as they are on the disk."""
-        if num:
-            with self.part_file(part).open("rb") as file:
-                yield from map(file.read, lengths)
-
-    def join(self, part: _Part, num: int) -> Buffer:
-        """Append the rows of ``part`` to those of the parts before it, and give their bytes."""
-        jpegs = self.part_file(part).read_bytes() if num else b""
-        with naming(self.path), self.path.open("ab") as file:
-            file.write(jpegs)
-        return jpegs
-
-    def close_holes(self, runs: Sequence[tuple[int, int]]) -> None:
-        """There are none."""
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Items ``items[0]`` up to ``items[1]``, whose rows begin at ``first``; done where its file says so and is right."""
-
-    path: Path
-    items: tuple[int, int]
-    first: int
-
-    def read(self) -> dict[str, Any]:
-        """columns, damaged, lost, crc and bytes (modality -> sum and, of JPEGs, length of each row); ValueError if it is
-        not there or of other rows."""
-        known = read_json(self.path, "a part of an unfinished pack")
-        if known["items"] != [*self.items] or known["first"] != self.first:
-            raise ValueError(f"{self.path} is of other rows: delete it and run the same command again")
-        return known
-
-
-@dataclass(frozen=True)
 class _Work:
     """What every process that packs needs to know. It goes to each once: a source of 100,000 rows takes seconds to send."""
 
@@ -281,7 +128,7 @@ class _Work:
     spec: DataSpec
     size: int
     counts: Sequence[int]
-    files: dict[str, _Rows | _Jpegs]
+    files: dict[str, RowFile | JpegFile]
 
 
 def _progress(quiet: bool) -> Progress:
@@ -289,7 +136,7 @@ def _progress(quiet: bool) -> Progress:
     return Progress(*columns, disable=quiet)
 
 
-def _check_disk(out: Path, files: Sequence[_Rows | _Jpegs]) -> None:
+def _check_disk(out: Path, files: Sequence[RowFile | JpegFile]) -> None:
     need = sum(rows.need() for rows in files)  # less what an interrupted build has taken
     parent = next(p for p in [out.absolute().parent, *out.absolute().parents] if p.exists())
     free = shutil.disk_usage(parent).free
@@ -297,7 +144,7 @@ def _check_disk(out: Path, files: Sequence[_Rows | _Jpegs]) -> None:
         raise ValueError(f"packing needs about {need / 1e9:.1f} GB, {parent} has {free / 1e9:.1f} GB free")
 
 
-def _run(work: _Work, parts: Sequence[_Part], workers: int) -> Iterator[int]:
+def _run(work: _Work, parts: Sequence[Part], workers: int) -> Iterator[int]:
     """How many rows each of ``parts`` has, in order, as they are done."""
     workers = workers or os.cpu_count() or 1
     if workers == 1 or len(parts) < 2:
@@ -326,11 +173,11 @@ def _start_worker(work: _Work) -> None:
     _work = work
 
 
-def _make_part_here(part: _Part) -> int:
+def _make_part_here(part: Part) -> int:
     return _make_part(_work, part)
 
 
-def _make_part(work: _Work, part: _Part) -> int:
+def _make_part(work: _Work, part: Part) -> int:
     """Write ``part`` unless an interrupted build did, and did it well; returns how many rows it has."""
     with contextlib.suppress(ValueError, KeyError, TypeError, FileNotFoundError):  # not there, or damaged
         known = part.read()
@@ -344,12 +191,12 @@ def _make_part(work: _Work, part: _Part) -> int:
     return _write_part(work, part)
 
 
-def _write_part(work: _Work, part: _Part) -> int:
+def _write_part(work: _Work, part: Part) -> int:
     columns: list[dict[str, Any]] = []
     damaged: list[list[Any]] = []
     lost: list[list[str]] = []
     sums: dict[str, list[int]] = {m: [] for m in work.files}
-    lengths: dict[str, list[int]] = {m: [] for m, rows in work.files.items() if isinstance(rows, _Jpegs)}
+    lengths: dict[str, list[int]] = {m: [] for m, rows in work.files.items() if isinstance(rows, JpegFile)}
     for number in range(*part.items):
         try:
             read = work.source.read(number)
@@ -418,8 +265,8 @@ def _finish(
     partial: Path,
     out: Path,
     request: dict[str, Any],
-    files: dict[str, _Rows | _Jpegs],
-    parts: Sequence[_Part],
+    files: dict[str, RowFile | JpegFile],
+    parts: Sequence[Part],
     digests: dict[str, str],
     items: Sequence[str],
     max_damaged: float,
@@ -430,7 +277,7 @@ def _finish(
     damaged: list[list[Any]] = []
     lost: list[list[str]] = []
     sums: dict[str, list[int]] = {m: [] for m in files}  # so that damage can be told by row
-    lengths: dict[str, list[int]] = {m: [] for m, rows in files.items() if isinstance(rows, _Jpegs)}
+    lengths: dict[str, list[int]] = {m: [] for m, rows in files.items() if isinstance(rows, JpegFile)}
     runs: list[tuple[int, int]] = []
     for part in parts:
         known = part.read()
