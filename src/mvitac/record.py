@@ -10,6 +10,7 @@ import os
 import platform
 import subprocess
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,7 +25,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
     On any failure (a full disk, Ctrl-C) the half-written neighbour is removed and ``path`` keeps its old content.
     """
     made = [parent for parent in path.parents if not parent.exists()]
-    neighbour = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    neighbour = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with neighbour.open("wb") as file:
