@@ -65,10 +65,12 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
 def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Console) -> None:
     """Pre-train ``runs`` at the same time, each in a process of its own, with a line of progress for each.
 
+    Where no one sees bars move (a file, a pipe) a line is printed for every tenth of the way.
     Interrupted after Ctrl-C, when every run has saved its checkpoint; the first run's error if one fails.
     """
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, TextColumn("{task.fields[text]}"), console=console) as progress:
+        tenth = 0
         bars = {path: progress.add_task(f"seed {run.seed}", total=num_steps, text="") for run, path in runs}
         with side_by_side(len(runs)) as pool:
             waiting = {pool.submit(train, run, path, resume=True, quiet=True) for run, path in runs}
@@ -79,6 +81,10 @@ def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Co
                         step, text = _last_line(path / "log.jsonl")
                         finished = (path / "model.safetensors").exists()
                         progress.update(bar, completed=num_steps if finished else step, text=text)
+                    slowest = min(progress.tasks, key=lambda task: task.completed)
+                    if not console.is_terminal and 10 * slowest.completed // num_steps > tenth:
+                        tenth = int(10 * slowest.completed // num_steps)
+                        console.print(f"  {slowest.completed:.0f}/{num_steps} steps  {slowest.fields['text']}")
                     for future in done:
                         future.result()
             except KeyboardInterrupt:  # the terminal sent it to the runs as well, which stop after their step
