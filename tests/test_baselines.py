@@ -30,6 +30,7 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.methods.vicreg import VICReg, VICRegConfig, covariance, variance
 from mvitac.model import load, pack_features
 from mvitac.pack import Pack
+from mvitac.probe import probe_model
 from mvitac.recipes import with_method
 from mvitac.run import Optim
 from mvitac.train import train
@@ -331,6 +332,15 @@ def test_own_classifier_outlives_training(pack: Pack, tmp_path: Path) -> None:
     assert (guess == pack.column("label_pattern")[rows]).mean() > 0.9
     with pytest.raises(ValueError, match="unknown task"):
         model.classify("weight", z)
+    # It is scored on views of the side it learned from, whatever side serves a probe best.
+    model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
+    task = next(t for t in pack.spec.tasks if t.name == "pattern")
+    own = next(r for r in probe_model(model, pack, [task], ["both"], ["linear"]) if r["probe"] == "own")
+    z = {m: pack_features(model, pack, m, rows, for_heads=True) for m in ("vision", "touch")}
+    right = model.classify("pattern", z).argmax(1).numpy() == pack.column("label_pattern")[rows]
+    assert own["accuracy"] == pytest.approx(right.mean()) and not torch.equal(
+        z["touch"], pack_features(model, pack, "touch", rows)
+    )
 
 
 # -- MViTac's ablations -----------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,8 @@ def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model
     )
     was, model.stored = model.stored, stored
     try:
-        found = Graph(model).view(images.permute(0, 2, 3, 1))
+        graph = Graph(model)
+        found = graph.view(images.permute(0, 2, 3, 1), graph.filter)
     finally:
         model.stored = was
     torch.testing.assert_close(found, plain_view(images, 32), atol=1e-4, rtol=0)
@@ -81,6 +83,25 @@ def test_an_export_is_the_trained_model(model: Model, onnx: Path, pack: Pack) ->
         for task, probabilities in said.items():
             np.testing.assert_allclose(found[f"probability_{task}"], probabilities.numpy(), atol=1e-3)
             assert tuple(engine.classes[task]) == model.classes[task]
+
+
+def test_the_heads_have_a_view_of_their_own_where_they_learned_from_one(smoke_run: Path, pack: Pack) -> None:
+    """Embeddings from whole images at one side, the shared space at the side of the training views."""
+    model = mvitac.load(smoke_run)
+    model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
+    graph = Graph(model)
+    assert graph.twice
+    images = {m: pack.images[m][:5].copy() for m in ("vision", "touch")}
+    found = dict(zip(graph.outputs, graph(*(torch.from_numpy(images[m]) for m in graph.modalities)), strict=True))
+    features, shared = model.embed(**images), model.embed(**images, shared=True)
+    for m in images:
+        torch.testing.assert_close(found[f"embedding_{m}"], features[m], atol=1e-3, rtol=1e-3)
+        torch.testing.assert_close(found[f"shared_{m}"], shared[m], atol=1e-3, rtol=1e-3)
+        assert not torch.allclose(shared[m], model.project(m, features[m]), atol=1e-3)
+    check(model, graph, pack)
+    graph.head_filter = graph.head_filter.flip(0)  # the parity check looks at the shared space too
+    with pytest.raises(ValueError, match="shared_"):
+        check(model, graph, pack)
 
 
 def test_int8_reports_what_it_keeps_and_runs(openvino: Path, pack: Pack, model: Model) -> None:

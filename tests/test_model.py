@@ -50,6 +50,11 @@ def test_whole_images_are_seen_at_their_own_size(model: Model, pack: Pack) -> No
     images = torch.from_numpy(pack.images["touch"][[0, 1, 2, 3]]).permute(0, 3, 1, 2)
     expected = smaller.encoders["touch"](plain_view(images, 24)).detach()
     assert torch.equal(smaller.features("touch", images), expected)
+    as_trained = smaller.encoders["touch"](plain_view(images, 16)).detach()  # heads keep to the side they learned from
+    assert torch.equal(smaller.features("touch", images, for_heads=True), as_trained)
+    assert torch.equal(smaller.embed(touch=pack.images["touch"][[0]])["touch"], smaller.features("touch", images[:1]))
+    shared = smaller.embed(touch=pack.images["touch"][[0]], shared=True)["touch"]
+    assert torch.equal(shared, smaller.project("touch", smaller.features("touch", images[:1], for_heads=True)))
     as_crops = Model(model.run.method.build(pack.spec, model.run.encoder), model.run, pack.spec, 32)
     as_crops.load_state_dict(smaller.state_dict())
     assert as_crops.weights_digest() != smaller.weights_digest()  # cached features of one are not the other's

@@ -53,7 +53,8 @@ class Augment:
     """Side of the crop that enters the encoders (paper: 224)."""
     whole: int | None = None
     """Side at which the frozen encoders see whole images; none = size. A random crop shows things larger than the whole
-    image squeezed into the same side does, so features of whole images gain from a larger side (arXiv:1906.06423)."""
+    image squeezed into the same side does, so features of whole images gain from a larger side (arXiv:1906.06423).
+    Heads that were trained along (shared space, own classifiers) do not, and keep to ``size`` (docs/simulator.md)."""
     vision: ViewAugment = ViewAugment()
     touch: ViewAugment = ViewAugment()
 

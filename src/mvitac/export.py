@@ -231,7 +231,9 @@ def reference(model: Model, graph: Graph, pack: Pack, rows: np.ndarray) -> dict[
         features = {m: model.features(m, x) for m, x in images.items()}
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         found = {f"embedding_{m}": x for m, x in features.items()}
-        found |= {f"shared_{m}": model.project(m, features[m]) for m in graph.projectors}
+        found |= {
+            f"shared_{m}": model.project(m, model.features(m, images[m], for_heads=True)) for m in graph.projectors
+        }
         found |= {f"probability_{r.question.task}": r(joined) for r in graph.readouts}  # type: ignore[union-attr]
         chunks.append(found)
     return {name: torch.cat([c[name] for c in chunks]).numpy() for name in graph.outputs}
@@ -254,13 +256,13 @@ def parity(
     ]
     found = {name: np.concatenate([c[i] for c in chunks]) for i, name in enumerate(graph.outputs)}
     report: dict[str, Any] = {"num_rows": len(rows), "cosine": {}, "accuracy": {}}
-    for name in (n for n in graph.outputs if n.startswith("embedding_")):
+    for name in (n for n in graph.outputs if n.startswith(("embedding_", "shared_"))):
         values = cosines(found[name], wanted[name])
         report["cosine"][name] = {"min": float(values.min()), "mean": float(values.mean())}
         if not values.min() >= tolerance.min_cosine:
             raise ValueError(
                 f"the export is not the trained model: {name} has cosine {values.min():.4f} on real inputs, at least"
-                f" {tolerance.min_cosine} is allowed{explain(model, name.removeprefix('embedding_'), found, pack, rows)}"
+                f" {tolerance.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows)}"
             )
     for task in graph.classes:
         labels = pack.column(f"label_{task}")[rows] if f"label_{task}" in pack.table.column_names else np.full(1, -1)

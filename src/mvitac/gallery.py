@@ -108,7 +108,7 @@ def gallery(study: Study) -> str:
     model, pack = run.model, study.pack
     device = next(model.parameters()).device
     z = {
-        m: model.project(m, torch.from_numpy(features(model, pack, m, rows)).to(device)).cpu()
+        m: model.project(m, torch.from_numpy(features(model, pack, m, rows, for_heads=True)).to(device)).cpu()
         for m in ("touch", "vision")
     }
     names = pack.column("group")[rows].astype(str)

@@ -20,6 +20,7 @@ class Graph(nn.Module):
     """What is exported. Its arithmetic is written anew, so that comparing it with ``Model.features`` is a real check."""
 
     filter: Tensor
+    head_filter: Tensor
     scale: Tensor
     shift: Tensor
 
@@ -41,38 +42,50 @@ class Graph(nn.Module):
             + [f"shared_{m}" for m in self.projectors]
             + [f"probability_{task}" for task in self.classes]
         )
-        # Antialiased bilinear resizing is linear along each axis: one matrix [size, S], read off the identity, in the
-        # 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel comes out the same.
-        size, stored = model.run.augment.seen, model.stored
-        eye = torch.eye(stored)[None, None]
-        rows = F.interpolate(eye, (size, stored), mode="bilinear", antialias=True)[0, 0]
-        step = 2.0 ** max(p for p in range(24) if (rows.max() * 2**p).round() < 2**15)
-        rows = (rows * step).round() / step
-        self.resized = size != stored
-        self.register_buffer("filter", rows)
+        sides = model.run.augment
+        self.twice = (
+            bool(self.projectors) and sides.size != sides.seen
+        )  # heads want views of the side they learned from
+        self.register_buffer("filter", _filter(sides.seen, model.stored))
+        self.register_buffer("head_filter", _filter(sides.size, model.stored) if self.twice else torch.empty(0))
         mean, std = (torch.tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
         self.register_buffer("scale", 1 / (255 * std))
         self.register_buffer("shift", -mean / std)
         self.eval()
 
-    def view(self, images: Tensor) -> Tensor:
-        """Normalised [B, C, size, size] of uint8 [B, S, S, C]."""
+    def view(self, images: Tensor, filter: Tensor) -> Tensor:
+        """Normalised [B, C, size, size] of uint8 [B, S, S, C], by a ``filter`` [size, S]."""
         x = images.permute(0, 3, 1, 2).float()
-        if self.resized:
-            x = self._along_width(self._along_width(x).transpose(2, 3)).transpose(2, 3)
+        if filter.shape[0] != filter.shape[1]:
+            x = _along_width(_along_width(x, filter).transpose(2, 3), filter).transpose(2, 3)
         sensors = [x[:, i : i + 3] * self.scale + self.shift for i in range(0, x.shape[1], 3)]
         return torch.cat(sensors, dim=1) if len(sensors) > 1 else sensors[0]
 
-    def _along_width(self, x: Tensor) -> Tensor:
-        """[B, C, H, S] -> [B, C, H, size] in whole grey levels, rounded after each pass as torch's uint8 kernel does.
-
-        As a plain matrix product: OpenVINO 2026.4 cannot compile a batched one followed by a scale per channel.
-        """
-        return (x.flatten(0, 2) @ self.filter.T + 0.5).floor().unflatten(0, x.shape[:3])
-
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
         """The outputs, in the order of ``outputs``, of the images, in the order of ``modalities``."""
-        features = {m: self.encoders[m](self.view(x)) for m, x in zip(self.modalities, images, strict=True)}
-        shared = [F.normalize(head(features[m]), dim=1) for m, head in self.projectors.items()]
+        given = dict(zip(self.modalities, images, strict=True))
+        features = {m: self.encoders[m](self.view(x, self.filter)) for m, x in given.items()}
+        wanted = features
+        if self.twice:
+            wanted = {m: self.encoders[m](self.view(given[m], self.head_filter)) for m in self.projectors}
+        shared = [F.normalize(head(wanted[m]), dim=1) for m, head in self.projectors.items()]
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         return (*features.values(), *shared, *(readout(joined) for readout in self.readouts))
+
+
+def _filter(size: int, stored: int) -> Tensor:
+    """[size, stored]: antialiased bilinear resizing is linear along each axis, so one matrix, read off the identity.
+
+    In the 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel comes out the same.
+    """
+    rows = F.interpolate(torch.eye(stored)[None, None], (size, stored), mode="bilinear", antialias=True)[0, 0]
+    step = 2.0 ** max(p for p in range(24) if (rows.max() * 2**p).round() < 2**15)
+    return (rows * step).round() / step
+
+
+def _along_width(x: Tensor, filter: Tensor) -> Tensor:
+    """[B, C, H, S] -> [B, C, H, size] in whole grey levels, rounded after each pass as torch's uint8 kernel does.
+
+    As a plain matrix product: OpenVINO 2026.4 cannot compile a batched one followed by a scale per channel.
+    """
+    return (x.flatten(0, 2) @ filter.T + 0.5).floor().unflatten(0, x.shape[:3])

@@ -51,22 +51,29 @@ class Model(nn.Module):
         self.eval()
 
     @torch.no_grad()
-    def features(self, modality: str, images: Tensor, *, precision: str = "fp32") -> Tensor:
-        """Pooled features [B, D] (fp32) of uint8 ``images`` [B, C, H, W] as a pack stores them."""
-        view = plain_view(images, self.run.augment.seen)
+    def features(self, modality: str, images: Tensor, *, for_heads: bool = False, precision: str = "fp32") -> Tensor:
+        """Pooled features [B, D] (fp32) of uint8 ``images`` [B, C, H, W] as a pack stores them.
+
+        With ``for_heads`` those that ``project`` and ``classify`` want: at the side of the views the heads learned from,
+        which may be smaller than the side that serves a probe best (``Augment.whole``).
+        """
+        view = plain_view(images, self.run.augment.size if for_heads else self.run.augment.seen)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=precision == "bf16"):
             return self.encoders[modality](view).float()
 
     @torch.no_grad()
     def project(self, modality: str, features: Tensor) -> Tensor:
-        """Features [B, D] into the space that both modalities share [B, E], L2-normalised."""
+        """Features [B, D], those ``for_heads``, into the space that both modalities share [B, E], L2-normalised."""
         if modality not in self.projectors:
             raise ValueError(f"this model has no shared space for {modality}: its method is {self.run.method.name!r}")
         return nn.functional.normalize(self.projectors[modality](features), dim=1)
 
     @torch.no_grad()
     def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Class probabilities [B, K] by the classifier trained along with the encoders (supervised methods only)."""
+        """Class probabilities [B, K] by the classifier trained along with the encoders (supervised methods only).
+
+        ``features`` are those ``for_heads``, by modality.
+        """
         if task not in self.tasks:
             raise unknown("task of this model's own classifiers", task, self.tasks or ("none",))
         joined = torch.cat([features[m] for m in self.encoders], dim=1)
@@ -91,7 +98,7 @@ class Model(nn.Module):
                 raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
             arrays = [fit(a, self.stored) for a in to_arrays(value, self.spec.channels(modality), modality)]
             images = torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).to(device)
-            features = self.features(modality, images)
+            features = self.features(modality, images, for_heads=shared)
             result[modality] = self.project(modality, features) if shared else features
         return result
 
@@ -213,15 +220,17 @@ def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
         raise ValueError(f"{file}: {error}") from None
 
 
-def pack_features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, precision: str = "fp32") -> Tensor:
-    """Features [len(rows), D] of pack rows, in chunks, on the model's device; returned on the CPU."""
+def pack_features(
+    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, precision: str = "fp32"
+) -> Tensor:
+    """Features [len(rows), D] of pack rows, as ``Model.features``, in chunks on the model's device; back on the CPU."""
     device = next(model.parameters()).device
     if device.type == "cpu":
         keep_freed_memory()  # else every activation is mapped anew: twice the time and more on a virtual machine
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        chunks.append(model.features(modality, images, precision=precision).cpu())
+        chunks.append(model.features(modality, images, for_heads=for_heads, precision=precision).cpu())
     return torch.cat(chunks)
 
 

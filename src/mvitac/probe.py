@@ -109,7 +109,7 @@ def probe_model(
     whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
     for task in (task for task in tasks if task.name in model.tasks and whole in modalities):
         rows = parts(pack, task, whole).test
-        z = {m: torch.from_numpy(matrix(m, rows)) for m in model.encoders}
+        z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
         result = score_rows(pack, task, rows, model.classify(task.name, z).numpy())
         records.append({"task": task.name, "modality": whole, "probe": "own", **result})
     return records
@@ -167,7 +167,7 @@ def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
         return []
     device = next(model.parameters()).device
     z = {
-        m: model.project(m, torch.from_numpy(features(model, pack, m, rows)).to(device)).cpu()
+        m: model.project(m, torch.from_numpy(features(model, pack, m, rows, for_heads=True)).to(device)).cpu()
         for m in pack.spec.modalities
     }
     groups = torch.from_numpy(np.unique(pack.column("group")[rows].astype(str), return_inverse=True)[1])

@@ -69,7 +69,7 @@ def embeddings(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, sha
     device = next(model.parameters()).device
     for chunk in np.array_split(rows, max(1, -(-len(rows) // 256))):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        x = model.features(modality, images)
+        x = model.features(modality, images, for_heads=shared)
         yield (model.project(modality, x) if shared else x).cpu().numpy()
 
 

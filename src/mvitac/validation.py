@@ -50,6 +50,8 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
                 )
     if len(model.projectors) == 2:
         device = next(model.parameters()).device
+        if run.augment.size != run.augment.seen:
+            z = {m: pack_features(model, pack, m, panel_rows, for_heads=True, precision=run.precision) for m in z}
         shared = {m: model.project(m, z[m].to(device)).cpu() for m in z}
         groups = torch.from_numpy(np.unique(pack.column("group")[panel_rows], return_inverse=True)[1])
         values["alignment"] = diagnostics.alignment(shared["vision"], shared["touch"])
