@@ -210,8 +210,7 @@ def _surface(
             continue
         finish = thing.finish
         local = (points[seen] - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
-        # At arm's length a pixel is wider than the relief; the print on the surface repeats it at a larger scale.
-        mix = (0.1 + 0.9 * finish.roughness) * (0.5 + 0.5 * np.tanh(3 * finish.pattern(1000 * local, scale=4.5)))
+        mix = 0.5 + 0.5 * np.tanh(3 * finish.printed(1000 * local))
         albedo[seen] = finish.color + (finish.accent - finish.color) * mix[:, None]
         gloss[seen] = finish.gloss
     table = geom == model.geom("table").id
