@@ -97,6 +97,8 @@ def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) ->
     work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path, Session())
     assert "no grayscale" in work.left_out and "the same run as 'MViTac'" in work.left_out["no grayscale"]
     assert "grayscale .2" not in work.left_out
+    assert "plain touch flips" in work.left_out  # these are the recipe's
+    assert "do not follow slopes" in work.left_out["touch flips with their colours"]  # stripes are no touches
     digests = [job.run.digest() for job in work.jobs]
     assert len(set(digests)) == len(digests)
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvitac.batches import training_rows
+from mvitac.batches import gel_mirror, training_rows
 from mvitac.controls import controls_of
 from mvitac.device import describe, pick_device
 from mvitac.encoders import SCRATCH
@@ -78,6 +78,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
         run = plan.run(row, plan.data, 0)
         try:
             run.check(pack.spec, len(training_rows(run, pack)), pack.size)
+            gel_mirror(run, pack, torch.device("cpu"))
             run.method.build(pack.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
         except ValueError as error:
             left_out[row.label] = str(error)
