@@ -8,8 +8,9 @@ it is, where a mirrored touch has -gx, and mirrors the lamps with it. The mirror
 
 Nobody has to measure rx and ry: slopes are derivatives of one height, so d gx / dy = d gy / dx, and of all pairs of
 colour mixtures of a sensor's pictures only those of gx and gy obey it (integrability, as in uncalibrated photometric
-stereo: Yuille and Snow, CVPR 1997). I0 is the sensor's mean picture. That it holds the average contact does no harm as
-long as the average contact is its own mirror image.
+stereo: Yuille and Snow, CVPR 1997). I0 is the sensor's mean picture, in the mean colour of the image at hand: slopes of a
+bump add up to nothing, so that colour is lamps and tint, which differ between copies of a sensor and drift. That the mean
+picture holds the average contact does no harm as long as the average contact is its own mirror image.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class GelMirror:
         self.sensors = np.searchsorted(names, sensors)
         """[pack.num]: number of each row's sensor; what it says of rows that nothing learns from means nothing."""
         self.gels: list[list[tuple[Tensor, Tensor]]] = []
-        """For every sensor and gel M' [3, 3] and what is added then, I0(x) - M I0(-x), [size, size, 3]."""
+        """For every sensor and gel M' [3, 3] and I0(x) - M I0(-x) [size, size, 3], where I0 is without its mean colour."""
         for name in names:
             own = rows[sensors[rows] == name]
             if len(own) < MIN_ROWS:
@@ -111,7 +112,9 @@ class GelMirror:
                 index = (here & which[:, gel]).nonzero().flatten().to(images.device, non_blocking=True)
                 pixels = out[..., 3 * gel : 3 * gel + 3]
                 with torch.autocast(images.device.type, enabled=False):
-                    mirrored = pixels[index].flip(2).float() @ matrix + rest
+                    flipped = pixels[index].flip(2).float()
+                    tint = flipped.mean((1, 2), keepdim=True)
+                    mirrored = tint + (flipped - tint) @ matrix + rest
                 pixels[index] = mirrored.round_().clamp_(0, 255).to(torch.uint8)
         return out.permute(0, 3, 1, 2)
 
@@ -126,9 +129,10 @@ def _shrunk(pack: Pack, rows: np.ndarray) -> Float[Tensor, "N C h w"]:
 
 
 def _learn(gel: Float[Tensor, "N 3 h w"], size: int) -> tuple[Tensor, Tensor]:
-    """M' and I0(x) - M I0(-x) of one gel from pictures of it."""
+    """M' and I0(x) - M I0(-x), I0 without its mean colour, of one gel from pictures of it."""
     mean = gel.mean(0, keepdim=True)
     colours, mixtures, _ = slope_colours((gel - mean).permute(0, 2, 3, 1).double().numpy())
     matrix = torch.from_numpy(mirror_colours(colours, mixtures).T).float()
     rest = F.interpolate(F.adaptive_avg_pool2d(mean, REST), (size, size), mode="bilinear")[0].permute(1, 2, 0)
+    rest = rest - rest.mean((0, 1))
     return matrix, (rest - rest.flip(1) @ matrix).contiguous()
