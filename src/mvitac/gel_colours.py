@@ -32,7 +32,7 @@ SIDE = 64
 REST = 16
 """Side in pixels of the picture at rest: lamps and tint, but no dots, which contact drags along."""
 MAX_CURL, MAX_STRETCH = 0.2, 30.0
-"""Beyond these what was found are not two slopes. Curl is .02 to .12 for gels, simulated and real, .25 to .5 for gray."""
+"""Beyond these what was found are not two slopes. Curl is .03 to .11 for gels, simulated and real, .25 to .5 for gray."""
 
 
 def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.ndarray, float]:
