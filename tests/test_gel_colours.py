@@ -18,7 +18,7 @@ from mvitac.batches import make_views
 from mvitac.datasets.packed import PackConfig
 from mvitac.feed import Feed
 from mvitac.gel_colours import MIN_ROWS, GelMirror, slope_colours
-from mvitac.pack import Pack
+from mvitac.pack import Pack, Store
 from mvitac.packing import build
 from mvitac.recipes import recipe
 from mvitac.run import Run
@@ -198,7 +198,9 @@ def test_views_are_flipped_with_their_colours(gels: Pack, mirror: GelMirror) -> 
         assert torch.equal(flips[0], flips[2]) == (touch["flip"] == 1)
 
 
-def test_training_flips_with_colours_and_says_so(gels: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("store", ["raw", "jpeg"])
+def test_training_flips_with_colours_and_says_so(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gels = build(Gels(), tmp_path / "pack", size=SIDE, quiet=True, store=store)
     calls = []
     real = GelMirror.__call__
     monkeypatch.setattr(GelMirror, "__call__", lambda self, *args: calls.append(len(args[1])) or real(self, *args))
