@@ -47,7 +47,7 @@ def main() -> None:
     mirror, sensors = GelMirror(pack, torch.device("cpu")), pack.column("sensor").astype(str)
     imprints = [imprint(options.world, category, 2 * pack.size) for category in range(len(CLASSES))]
     lines = []
-    print("| sensor | no flip | plain flip | flip with its colours | plain / colours, least and most |\n|---|---:|---:|---:|---:|")
+    print("| sensor | no flip | plain flip | flip with its colours | gain, least to most |\n|---|---:|---:|---:|---:|")
     for name in sorted(set(sensors)):
         clean = replace(SENSORS[name], marker_pitch_mm=0, dirt=0, scratches=0, noise=0)
         pixel = WIDTH_MM / (2 * pack.size)
@@ -66,7 +66,8 @@ def main() -> None:
         made = (seen, seen[:, :, ::-1], coloured)
         none, plain, colour = (np.sqrt(np.square(m.astype(float) - true).mean((1, 2, 3))) for m in made)
         ratio = plain / colour
-        print(f"| {name} | {none.mean():.1f} | {plain.mean():.1f} | {colour.mean():.1f} | {ratio.min():.1f} {ratio.max():.1f} |")
+        means = " | ".join(f"{errors.mean():.1f}" for errors in (none, plain, colour))
+        print(f"| {name} | {means} | {ratio.min():.1f} to {ratio.max():.1f} |")
         lines.append(np.concatenate([picture[CLASSES.index(SHOWN)] for picture in (*made, true)], axis=1))
     if options.picture:
         sheet = np.concatenate(lines).repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
