@@ -232,6 +232,8 @@ OPTIONS: list[tuple[str, str, list[str]]] = [
     ("seed-beyond-64-bits", PRETRAIN + "--seed 99999999999999999999", ["seed 99999999999999999999", "give"]),
     ("heads-beyond-memory", PRETRAIN + "--method.out 99999999999", ["99999999999", "give"]),
     ("scale-reversed", PRETRAIN + "--augment.touch.scale 0.9 0.1", ["(0.9, 0.1)", "low <= high"]),
+    ("gel-flip", PRETRAIN + "--augment.gel-flip color", ["color", "plain, colour"]),
+    ("gel-flip-of-stripes", PRETRAIN + "--augment.gel-flip colour", ["'touch'", "slopes", "--augment.gel-flip plain"]),
     ("imagenet-nowhere", "probe {run} --imagenet {tmp}/none.pth", ["{tmp}/none.pth", "file"]),
     ("imagenet-foreign", "probe {run} --imagenet {pack}/pack.json", ["pack.json", "mvitac_tiny"]),
     ("simulate-huge", "data simulate materials --num 1000000000000 --out {out}", ["1000000000000", "at most"]),

@@ -15,18 +15,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy import toy_pack
+from toy import Toy, toy_pack
 
 from mvitac import compare as module
 from mvitac.cli import main
 from mvitac.compare import cost, do, do_all, gather, lay_out, leaks, seconds_of
 from mvitac.datasets.packed import PackConfig
 from mvitac.pack import Pack
+from mvitac.packing import build
 from mvitac.paper_tables import lines_of, write_tables
 from mvitac.plans import ABLATION, PLANS, TABLE1, TABLE2, Plan, Row, changed, find_plan, setting, slug
 from mvitac.recipes import RECIPES, recipe
 from mvitac.scores import paired_difference
 from mvitac.session import Session
+from mvitac.source import Sample
 
 ROWS = (
     Row(label="MViTac", printed={"touch": {"pattern": 57.6}}),
@@ -97,6 +99,8 @@ def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) ->
     work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path, Session())
     assert "no grayscale" in work.left_out and "the same run as 'MViTac'" in work.left_out["no grayscale"]
     assert "grayscale .2" not in work.left_out
+    assert "plain touch flips" in work.left_out  # these are the recipe's
+    assert "do not follow slopes" in work.left_out["touch flips with their colours"]  # stripes are no touches
     digests = [job.run.digest() for job in work.jobs]
     assert len(set(digests)) == len(digests)
 
@@ -109,6 +113,30 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
     assert {job.label for job in work.jobs} >= {"MViTac", "MoCo per modality", "supervised, touch only"}
     with pytest.raises(ValueError, match="no row that this data allows"):
         lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", Session())
+
+
+def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Path) -> None:
+    """As difference images are: trained and scored on its own pack, beside the others; other samples are refused."""
+
+    class Darker(Toy):
+        def read(self, item: int) -> list[Sample]:
+            return [replace(sample, touch=sample.touch // 2) for sample in super().read(item)]  # type: ignore[operator]
+
+    darker = build(Darker(), tmp_path / "darker", size=32, quiet=True)
+    fewer = toy_pack(tmp_path / "fewer", num=90)
+    rows = (
+        Row(label="MViTac"),
+        Row(label="darker", set={"data.path": str(darker.path)}),
+        Row(label="fewer", set={"data.path": str(fewer.path)}),
+    )
+    session = Session(tasks=("pattern",), modalities=("touch",), controls=False)
+    work = lay_out(small(pack, rows=rows, seeds=1), pack, tmp_path / "out", session)
+    assert list(work.left_out) == ["fewer"] and "another column id" in work.left_out["fewer"]
+    do_all(work, 1, lambda line: None)
+    packs = {job.label: json.loads((job.out / "run.json").read_text())["pack"] for job in work.jobs}
+    assert packs == {"MViTac": pack.digest, "darker": darker.digest}
+    sources = {record["source"] for record in gather(work, tmp_path / "out", session)["records"]}
+    assert {"MViTac", "darker"} <= sources
 
 
 def test_a_plan_from_a_file(tmp_path: Path) -> None:

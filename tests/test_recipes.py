@@ -63,6 +63,7 @@ def test_digest_is_of_the_outcome() -> None:
     assert replace(run, log_every=3, device="cpu").digest() == run.digest()
     assert replace(run, data=replace(run.data, workers=7)).digest() == run.digest()
     assert replace(run, seed=5).digest() != run.digest()
+    assert replace(run, augment=replace(run.augment, gel_flip="colour")).digest() != run.digest()
 
 
 def test_spec_survives_its_record() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -27,7 +28,7 @@ class ViewAugment:
     scale: tuple[float, float] = (0.2, 1.0)
     """Crop area as a share of the image (paper: .2 to 1)."""
     flip: float = 0.5
-    """Probability of a horizontal flip (paper: .5). On touch it also mirrors the LEDs, which no real press does."""
+    """Probability of a horizontal flip (paper: .5)."""
     grayscale: float = 0.2
     """Probability of grayscale (paper: .2 for materials, none for grasping)."""
     jitter: float = 0.0
@@ -55,6 +56,9 @@ class Augment:
     """Side at which the frozen encoders see whole images; none = size. A random crop shows things larger than the whole
     image squeezed into the same side does, so features of whole images gain from a larger side (arXiv:1906.06423).
     Heads that were trained along (shared space, own classifiers) do not, and keep to ``size`` (docs/simulator.md)."""
+    gel_flip: Literal["plain", "colour"] = "plain"
+    """What a flip of touch mirrors. plain: pixels (paper), and with them the lamps, which no real press does. colour: the
+    touch, as the same sensor would show it, by the colours of slope learned from the training rows."""
     vision: ViewAugment = ViewAugment()
     touch: ViewAugment = ViewAugment()
 

@@ -6,6 +6,7 @@ All of it is a function of (seed, step), so a resumed run sees what it would hav
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,6 +17,7 @@ from mvitac.augment import random_view
 from mvitac.batch import Views
 from mvitac.distributed import World
 from mvitac.feed import Feed, ahead, prefetch
+from mvitac.gel_colours import GelMirror
 from mvitac.pack import Pack
 from mvitac.run import Run
 from mvitac.step import Part
@@ -76,6 +78,7 @@ def feed_parts(
     world: World,
     start: int,
     num_steps: int,
+    mirror: GelMirror | None = None,
 ) -> Iterator[list[Part]]:
     """The parts of each step's batch that this process embeds: chunk by chunk of its own share of the rows.
 
@@ -89,7 +92,7 @@ def feed_parts(
     def part(step: int, batch: np.ndarray, number: int) -> Views:
         seed = mix(run.seed, step) if num_parts == 1 else mix(run.seed, step, number)
         chunk = np.split(batch, num_parts)[number]
-        return make_views(run, pack, chunk, num_views, torch.Generator().manual_seed(seed), device, feed)
+        return make_views(run, pack, chunk, num_views, torch.Generator().manual_seed(seed), device, feed, mirror)
 
     numbers = range(per_process * world.rank, per_process * (world.rank + 1))
     steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
@@ -106,6 +109,11 @@ def _same(views: Views) -> Views:
     return views
 
 
+def gel_mirror(run: Run, pack: Pack, device: torch.device) -> GelMirror | None:
+    """What flips the touches of ``run``'s views as touches, or None; ValueError if the pack's colours cannot be learned."""
+    return GelMirror(pack, device) if run.augment.gel_flip == "colour" else None
+
+
 def make_views(
     run: Run,
     pack: Pack,
@@ -114,8 +122,13 @@ def make_views(
     generator: torch.Generator,
     device: torch.device,
     feed: Feed,
+    mirror: GelMirror | None = None,
 ) -> Views:
-    """Random views of the pack's ``rows`` on ``device``, in the precision the networks read them in."""
+    """Random views of the pack's ``rows`` on ``device``, in the precision the networks read them in.
+
+    ``mirror`` is what ``gel_mirror`` gave for the run.
+    """
+    assert (mirror is None) == (run.augment.gel_flip == "plain")
     sources = [rows] * num_views
     if run.positives == "same-touch":
         sources[1:] = [partners(pack, rows, generator) for _ in range(num_views - 1)]
@@ -123,9 +136,13 @@ def make_views(
     images: dict[str, list[Tensor]] = {}
     for modality in pack.spec.modalities:
         config, images[modality] = getattr(run.augment, modality), []
+        if mirror and modality == "touch":
+            config = replace(config, flip=0.0)  # the mirror flips
         own = feed(modality, rows)
         for source in sources:
             seen = own if source is rows else feed(modality, source)
+            if mirror and modality == "touch":
+                seen = mirror.random(seen, source, run.augment.touch, generator)
             view = random_view(seen, config, run.augment.size, generator, dtype)
             images[modality].append(view)
     labels = {t.name: torch.from_numpy(pack.labels(t.name, "train")[rows]).to(device) for t in pack.spec.tasks}

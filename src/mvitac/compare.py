@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvitac.batches import training_rows
+from mvitac.batches import gel_mirror, training_rows
 from mvitac.controls import controls_of
 from mvitac.device import describe, pick_device
 from mvitac.encoders import SCRATCH
@@ -66,7 +66,8 @@ class Work:
 def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "auto") -> Work:
     """The jobs of ``plan`` on the data of its rows, seeds outermost; ValueError if not one row is possible.
 
-    Rows that need what the data lacks (labels, a camera) and rows that are the same run as an earlier one are left out.
+    Rows that need what the data lacks (labels, a camera) and rows that are the same run as an earlier one are left out. A
+    row may read the same samples in another way (difference images of touch), not other samples.
     """
     assert plan.data is not None
     chosen(pack, session)
@@ -77,8 +78,10 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
     for row in plan.rows:
         run = plan.run(row, plan.data, 0)
         try:
-            run.check(pack.spec, len(training_rows(run, pack)), pack.size)
-            run.method.build(pack.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+            own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
+            run.check(own.spec, len(training_rows(run, own)), own.size)
+            gel_mirror(run, own, torch.device("cpu"))
+            run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
         except ValueError as error:
             left_out[row.label] = str(error)
             continue
@@ -96,6 +99,16 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
         for place in (out / "runs" / slug(row.label) / f"seed{seed}",)
     ]
     return Work(plan, pack, jobs, left_out)
+
+
+def _same_samples(own: Pack, pack: Pack) -> Pack:
+    """``own``, if it holds the samples of ``pack`` on the same sides, with the same labels."""
+    for name in ("id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)):
+        if name not in own.table.column_names or not np.array_equal(own.column(name), pack.column(name)):
+            raise ValueError(
+                f"its data {own.path} has another column {name} than {pack.path}: compare the same samples"
+            )
+    return own
 
 
 # -- doing it ---------------------------------------------------------------------------------------------------------
@@ -131,7 +144,7 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
     if num_jobs == 1 or len(todo) < 2:
         for job in todo:
             say(f"{job.label}, seed {job.run.seed} ...")
-            line = do(job, work.pack)
+            line = do(job, work.pack if job.run.data == work.plan.data else None)
             say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.label}, seed {job.run.seed}: {line}")
         return
     gpus = torch.cuda.device_count()

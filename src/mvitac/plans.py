@@ -267,6 +267,8 @@ ABLATION = Plan(
         Row(label="no grayscale", set=_touch_and_vision("grayscale", 0.0)),
         Row(label="no flips", set=_touch_and_vision("flip", 0.0)),
         Row(label="no touch flips", set={"augment.touch.flip": 0.0}),
+        Row(label="plain touch flips", set={"augment.gel_flip": "plain"}),
+        Row(label="touch flips with their colours", set={"augment.gel_flip": "colour"}),
         Row(label="shuffled batches", set={"sampler": "shuffle"}),
         Row(label="one row per touch in a batch", set={"sampler": "one-per-touch"}),
         Row(label="positives of the same image", set={"positives": "same-image"}),

@@ -168,9 +168,11 @@ class Run:
         value = to_json(self)
         for name in ("device", "log_every", "eval_every", "checkpoint_every"):
             del value[name]
-        # A raw pack's run has the digest it had before there were others.
+        # What is as it was before there was a choice has the digest it had then: raw packs, plain flips.
         for name in ("workers", *(("store", "quality") if self.data.store == "raw" else ())):
             del value["data"][name]
+        if self.augment.gel_flip == "plain":
+            del value["augment"]["gel_flip"]
         return digest(value)
 
     @classmethod

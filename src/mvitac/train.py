@@ -17,7 +17,7 @@ import torch
 
 from mvitac import checkpoint
 from mvitac.allocator import keep_freed_memory
-from mvitac.batches import feed_parts, mix, training_rows
+from mvitac.batches import feed_parts, gel_mirror, mix, training_rows
 from mvitac.device import describe, pick_device
 from mvitac.distributed import World, join, local_device, synchronise_norms
 from mvitac.log import Log, Sink
@@ -64,6 +64,7 @@ def train(
         world.wait()
     rows = training_rows(run, pack)
     run.check(pack.spec, len(rows), pack.size)
+    mirror = gel_mirror(run, pack, device)
     _check_world(run, world)
     again = (out / "run.json").exists()
     if again:
@@ -93,7 +94,7 @@ def train(
     log_here = Log(out, start, num_steps, quiet, sinks) if world.writes else nullcontext()
     with log_here as log, _stop_signals() as stopped:
         for at, parts in enumerate(
-            feed_parts(run, pack, rows, method.views, device, world, start, num_steps), start=start
+            feed_parts(run, pack, rows, method.views, device, world, start, num_steps, mirror), start=start
         ):
             rate = run.optim.rate(at, num_steps, at // run.steps_per_epoch(len(rows)))
             losses = step(parts, lr=rate, seed=mix(run.seed, at) + 1, progress=(at + 1) / num_steps)

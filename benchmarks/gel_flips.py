@@ -1,0 +1,82 @@
+"""Which flip of a touch is nearer to the touch mirrored? Asked of the simulator, which can mirror the thing itself.
+
+The colours are learned from a pack of simulated materials, as training does. Then every class is pressed once, as it is
+and mirrored, into clean copies of each sensor (no dots, dirt or noise: these stay where they are in both pictures).
+
+    mvitac data simulate materials --num 2000 --out PACK
+    python -m benchmarks.gel_flips PACK [--world SEED] [--picture FILE.png]
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+
+from mvitac.gel_colours import GelMirror
+from mvitac.pack import Pack
+from mvitac.sim.gel import SENSORS, press, render
+from mvitac.sim.materials import CLASSES, draw_instance
+
+WIDTH_MM = 12.8
+SHOWN = "gravel"
+ZOOM = 2
+COLUMNS = ("touch", "plain flip", "flip with its colours", "mirrored touch")
+
+
+def imprint(world: int, category: int, side: int) -> np.ndarray:
+    """An imprint [side, side] mm of the class's first instance, pressed by 6 N."""
+    thing = draw_instance(world, category, 0)
+    axis = ((np.arange(side) - (side - 1) / 2) * (WIDTH_MM / side)).astype(np.float32)
+    x, y = np.meshgrid(axis, axis)
+    relief = 2 * thing.amplitude_mm * thing.feel(x + 50, y + 50) - 0.1 * np.hypot(x - 1, y + 1)
+    return press(relief.astype(np.float32), force_n=6.0, stiffness=1.0, pixel_mm=WIDTH_MM / side)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("pack", type=Path)
+    parser.add_argument("--world", type=int, default=1, help="seed of the things pressed here")
+    parser.add_argument("--picture", type=Path)
+    options = parser.parse_args()
+    pack = Pack(options.pack)
+    mirror, sensors = GelMirror(pack, torch.device("cpu")), pack.column("sensor").astype(str)
+    imprints = [imprint(options.world, category, 2 * pack.size) for category in range(len(CLASSES))]
+    lines = []
+    print("| sensor | no flip | plain flip | flip with its colours | gain, least to most |\n|---|---:|---:|---:|---:|")
+    for name in sorted(set(sensors)):
+        clean = replace(SENSORS[name], marker_pitch_mm=0, dirt=0, scratches=0, noise=0)
+        pixel = WIDTH_MM / (2 * pack.size)
+        seen, true = (
+            np.stack(
+                [
+                    render(flat[:, ::step], clean, np.random.default_rng(0), pixel_mm=pixel, size=pack.size, unit=unit)
+                    for unit, flat in enumerate(imprints)
+                ]
+            )
+            for step in (1, -1)
+        )
+        rows = np.full(len(seen), np.flatnonzero(sensors == name)[0])
+        images = torch.from_numpy(seen).permute(0, 3, 1, 2)
+        coloured = mirror(images, rows, torch.ones(len(seen), 1, dtype=torch.bool)).permute(0, 2, 3, 1).numpy()
+        made = (seen, seen[:, :, ::-1], coloured)
+        none, plain, colour = (np.sqrt(np.square(m.astype(float) - true).mean((1, 2, 3))) for m in made)
+        ratio = plain / colour
+        means = " | ".join(f"{errors.mean():.1f}" for errors in (none, plain, colour))
+        print(f"| {name} | {means} | {ratio.min():.1f} to {ratio.max():.1f} |")
+        lines.append(np.concatenate([picture[CLASSES.index(SHOWN)] for picture in (*made, true)], axis=1))
+    if options.picture:
+        sheet = np.concatenate(lines).repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
+        whole = Image.new("RGB", (sheet.shape[1], sheet.shape[0] + 14), "white")
+        whole.paste(Image.fromarray(sheet), (0, 14))
+        for i, words in enumerate(COLUMNS):
+            ImageDraw.Draw(whole).text((i * ZOOM * pack.size + 2, 1), words, fill="black")
+        whole.save(options.picture, optimize=True)
+
+
+if __name__ == "__main__":
+    main()
