@@ -24,6 +24,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -34,7 +35,9 @@ from rich.table import Table
 from benchmarks import lightly_parts
 from benchmarks.floor import Floor, clock, peak
 from benchmarks.typical import TypicalStep, typical_batches, write_jpegs
+from mvitac import augment
 from mvitac.allocator import keep_freed_memory
+from mvitac.augment import ViewAugment, draw
 from mvitac.batch import Views
 from mvitac.batches import feed_parts
 from mvitac.device import describe
@@ -162,16 +165,32 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
 
 
 def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
-    """Augmented images/s of each input (four images per pair), without a network."""
+    """Augmented images/s of each input, without a network; on a CPU also by torch's route, and of the views alone."""
     typical = typical_batches(folder, scale.size, scale.batch, workers)
-    feeds = {p: feed(our_run(scale, p), pack, device) for p in ("fp32", "bf16")}
-    variants: dict[str, Callable[[], object]] = {
-        "typical, JPEG files": lambda: next(typical),
-        **{f"ours, pack, {p}": (lambda f=f: next(f)[0]()) for p, f in feeds.items()},
-    }
+    variants: dict[str, Callable[[], object]] = {"typical, JPEG files": lambda: next(typical)}
+    images = torch.from_numpy(pack.images["vision"][np.resize(pack.rows("train"), scale.batch)]).permute(0, 3, 1, 2)
+    drawn = draw(ViewAugment(), len(images), pack.size, torch.Generator().manual_seed(0))
+    for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16)):
+        parts = feed(our_run(scale, name), pack, device)
+        ours: dict[str, Callable[[], object]] = {f"ours, pack, {name}": lambda f=parts: next(f)[0]()}
+        if device.type == "cpu":
+            ours[f"ours, views alone, {name}"] = lambda d=dtype: augment.apply(images, drawn, scale.size, d)
+        if device.type == "cpu" and augment.fused():
+            ours |= {f"{name}, without numba": in_torch(call) for name, call in ours.items()}
+        variants |= ours
     seconds = interleave(variants, scale.rounds, device)
-    slowest = seconds["typical, JPEG files"]
-    return {n: {"images_per_s": 4 * scale.batch / s, "over_typical": slowest / s} for n, s in seconds.items()}
+    speeds = {n: (1 if "alone" in n else 4) * scale.batch / s for n, s in seconds.items()}  # four images per pair
+    return {n: {"images_per_s": v, "over_typical": v / speeds["typical, JPEG files"]} for n, v in speeds.items()}
+
+
+def in_torch(call: Callable[[], object]) -> Callable[[], object]:
+    """``call`` with its views made as where numba is not installed."""
+
+    def without() -> object:
+        with patch.object(augment, "fused", lambda: None):
+            return call()
+
+    return without
 
 
 def feed(run: Run, pack: Pack, device: torch.device) -> Any:

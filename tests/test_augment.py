@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -70,12 +71,85 @@ def test_both_routes_have_the_same_statistics() -> None:
     torch.testing.assert_close(a.std((0, 2, 3)), b.std((0, 2, 3)), atol=0.04, rtol=0)
 
 
-@pytest.mark.parametrize("route", [augment._one_by_one, augment._batched])
+@pytest.mark.parametrize("route", [augment.apply, augment._one_by_one, augment._batched])
 def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> None:
     drawn = draw(ViewAugment(), 8, 40, generator())
     exact, rounded = (route(images(), drawn, 24, dtype) for dtype in (torch.float32, torch.bfloat16))
     assert torch.equal(exact.bfloat16(), rounded)
     assert rounded.is_contiguous(memory_format=torch.channels_last)
+
+
+@pytest.mark.parametrize(("side", "size"), [(40, 28), (42, 28), (40, 40), (40, 56), (9, 9)])
+@pytest.mark.parametrize("channels", [3, 6])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_compiled_views_are_torchs_bit_for_bit(side: int, size: int, channels: int, dtype: torch.dtype) -> None:
+    """On noise, with crops from a pixel to the whole; gray alone sums three products, in an order of its own."""
+    pytest.importorskip("numba")
+    raw = torch.randint(0, 256, (24, channels, side, side), dtype=torch.uint8, generator=generator())
+    drawn = draw(ViewAugment(scale=(0.01, 1.0), grayscale=0.3), 24, side, generator())
+    drawn.boxes[0], drawn.boxes[1] = torch.tensor([0, 0, side, side]), torch.tensor([side - 2, side - 1, 2, 1])
+    torchs, compiled = (route(raw, drawn, size, dtype) for route in (augment._one_by_one, augment.apply))
+    gray = drawn.grayscale
+    assert torch.equal(torchs[~gray], compiled[~gray])
+    torch.testing.assert_close(torchs[gray], compiled[gray], atol=1e-6, rtol=0.01 if dtype == torch.bfloat16 else 1e-5)
+    assert compiled.is_contiguous(memory_format=torch.channels_last)
+
+
+def test_compiled_rounding_to_bf16_is_torchs() -> None:
+    """Also of halves, which go to the even neighbour, and of what is a bit less or more."""
+    pytest.importorskip("numba")
+    from mvitac.fused import _bfloat16
+
+    bits = [
+        high << 16 | low for high in (0x3F80, 0x3F81, 0xBF80, 0xBF81) for low in (0, 1, 0x7FFF, 0x8000, 0x8001, 0xFFFF)
+    ]
+    values = np.array(bits, np.uint32).view(np.float32)
+    rounded = np.array([_bfloat16(value) for value in values])
+    assert rounded.tolist() == torch.from_numpy(values).bfloat16().view(torch.uint16).tolist()
+
+
+def test_compiled_views_are_shared_among_torchs_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One share for each, and the same views however many there are."""
+    pytest.importorskip("numba")
+    from mvitac import fused
+
+    shares, views = [], fused.views
+
+    def counted(*arrays: np.ndarray) -> None:
+        shares.append(len(arrays[0]))
+        views(*arrays)
+
+    monkeypatch.setattr(fused, "views", counted)
+    drawn = draw(ViewAugment(), 8, 40, generator())
+    alone = augment.apply(images(), drawn, 32)
+    assert shares == [8]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    assert torch.equal(augment.apply(images(), drawn, 32), alone)
+    assert sorted(shares[1:]) == [2, 3, 3]
+    shares.clear()
+    augment.apply(images(2), draw(ViewAugment(), 2, 40, generator()), 32)
+    assert shares == [1, 1]
+
+
+def test_torchs_route_where_the_compiled_one_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jitter, other precisions, images far larger than the view, no numba; and whole images do not wait for numba."""
+
+    class Cannot:
+        MAX_SHRINK = 1.5
+
+        def views(self, *_: object) -> None:
+            raise AssertionError("the compiled route was taken")
+
+    monkeypatch.setattr(augment, "fused", Cannot)
+    plain, jittered = (draw(ViewAugment(jitter=j), 8, 40, generator()) for j in (0.0, 0.3))
+    for drawn, size, dtype in ((jittered, 32, torch.float32), (plain, 32, torch.float64), (plain, 26, torch.float32)):
+        expected = augment._one_by_one(images(), drawn, size, dtype)
+        assert torch.equal(augment.apply(images(), drawn, size, dtype), expected)
+    plain_view(images(), 32)
+    with pytest.raises(AssertionError, match="compiled"):
+        augment.apply(images(), plain, 32)
+    monkeypatch.setattr(augment, "fused", lambda: None)
+    assert torch.equal(augment.apply(images(), plain, 32), augment._one_by_one(images(), plain, 32, torch.float32))
 
 
 def test_flip_is_exact() -> None:

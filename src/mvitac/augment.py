@@ -6,8 +6,10 @@ Parameters are drawn first (``draw``), from an explicit generator, then applied 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from types import ModuleType
 from typing import Literal
 
 import torch
@@ -118,12 +120,55 @@ def apply(
 
     Computed in fp32 and rounded to ``dtype`` once, as autocast would round it before the first convolution.
     """
-    route = _one_by_one if images.device.type == "cpu" else _batched
-    return route(images, drawn, size, dtype)
+    if images.device.type != "cpu":
+        return _batched(images, drawn, size, dtype)
+    plain = dtype in (torch.float32, torch.bfloat16) and not bool((drawn.gains != 1).any())
+    compiled = fused() if plain else None
+    if compiled is None or max(images.shape[2:]) > compiled.MAX_SHRINK * size:
+        return _one_by_one(images, drawn, size, dtype)
+    return _in_one_pass(images, drawn, size, dtype, compiled)
+
+
+@cache
+def fused() -> ModuleType | None:
+    """``mvitac.fused``, where a numba that works with this numpy is installed (extra ``fast``)."""
+    try:
+        from mvitac import fused
+    except ImportError:
+        return None
+    return fused
+
+
+def _in_one_pass(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, compiled: ModuleType) -> Tensor:
+    """The CPU's fast route, without jitter: a share of the images for each of torch's threads.
+
+    The levels of ``_one_by_one``, and so its views bit for bit, but for the last bits of a gray one.
+    """
+    num, channels = images.shape[:2]
+    out = torch.empty(num, size, size, channels, dtype=dtype)
+    bits = out.view(torch.uint16) if dtype == torch.bfloat16 else out  # numpy has no bfloat16
+    given = (images.permute(0, 2, 3, 1), drawn.boxes, drawn.flip, drawn.grayscale)
+    each = [*(t.contiguous() for t in given), bits]
+    shared = [t.numpy() for t in (_luma(images.device).flatten(), *_normalisation(images.device))]
+
+    def fill(*share: Tensor) -> None:
+        compiled.views(*(t.numpy() for t in share), *shared)
+
+    num_threads = min(num, torch.get_num_threads())
+    if num_threads < 2:
+        fill(*each)
+    else:
+        list(_threads(num_threads).map(fill, *(t.tensor_split(num_threads) for t in each)))
+    return out.permute(0, 3, 1, 2)
+
+
+@cache
+def _threads(num: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num, "views")
 
 
 def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
-    """The CPU's route: an image stays in the cache from crop to normalised view, and is uint8 until the last step."""
+    """The CPU's route in torch: an image stays in the cache from crop to normalised view, uint8 until the last step."""
     num, channels = images.shape[:2]
     out = torch.empty(num, size, size * channels, dtype=dtype)  # a line of pixels with its channels: long inner loops
     factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device))
@@ -233,4 +278,7 @@ def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B 
     num, _, side, _ = images.shape
     whole = torch.tensor([[0, 0, side, side]]).expand(num, 4)
     never = torch.zeros(num, dtype=torch.bool)
-    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size)
+    route = (
+        _one_by_one if images.device.type == "cpu" else _batched
+    )  # few images or a network behind: numba need not start
+    return route(images, Drawn(whole, never, never, torch.ones(num, 5)), size, torch.float32)
