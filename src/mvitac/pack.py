@@ -175,11 +175,8 @@ class Pack:
 
     def _open(self, files: dict[str, str]) -> dict[str, Images]:
         """The images of each modality, which lie in ``files``."""
-        return {m: self._read(self._file(name), m, range(self.num)) for name, m in files.items()}
-
-    def _read(self, path: Path, modality: str, rows: range) -> Images:
-        """The images in the file ``path``, which holds ``rows`` of ``modality``."""
-        return {"raw": self._map, "jpeg": self._jpegs}[self.store](path, modality, rows)
+        reader = {"raw": self._map, "jpeg": self._jpegs}[self.store]
+        return {m: reader(m, self._file(name)) for name, m in files.items()}
 
     def _check_digest(self, name: str, modality: str = "") -> None:
         if digest_file(self._file(name)) != self.digests[name]:
@@ -192,7 +189,7 @@ class Pack:
         if f"crc_{modality}" not in self.table.column_names:
             return ""
         sums = self.table.column(f"crc_{modality}").slice(first, len(images)).to_pylist()
-        stored = images.jpeg if isinstance(images, Jpegs) else images.__getitem__
+        stored: Any = images.jpeg if isinstance(images, Jpegs) else images.__getitem__
         rows = [first + i for i in range(len(images)) if zlib.crc32(stored(i)) != sums[i]]
         if not rows:
             return " in its header"
@@ -208,19 +205,19 @@ class Pack:
     def _shape(self, modality: str, num: int) -> tuple[int, int, int, int]:
         return num, self.size, self.size, self.spec.channels(modality)
 
-    def _jpegs(self, path: Path, modality: str, rows: range) -> Jpegs:
+    def _jpegs(self, modality: str, path: Path, rows: slice = slice(None)) -> Jpegs:
         name = f"bytes_{modality}"
         if name not in self.table.column_names or not pa.types.is_uint32((column := self.table.column(name)).type):
             raise ValueError(f"{self.path / 'samples.parquet'} has no column {name} of uint32: make the pack again")
         if column.null_count:
             raise ValueError(f"{self.path / 'samples.parquet'}: column {name} has empty rows: make the pack again")
         try:
-            return Jpegs(path, self._shape(modality, len(rows)), self.column(name)[rows.start : rows.stop])
+            return Jpegs(path, self._shape(modality, len(lengths := self.column(name)[rows])), lengths)
         except (ValueError, OSError) as error:
             raise ValueError(f"{brief(error)}: the pack is damaged, make it again") from None
 
-    def _map(self, path: Path, modality: str, rows: range) -> np.ndarray:
-        expected = self._shape(modality, len(rows))
+    def _map(self, modality: str, path: Path) -> np.ndarray:
+        expected = self._shape(modality, self.num)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about headers that only damage can produce

@@ -12,6 +12,7 @@ Rows of one touch are in one shard if they fit, in random order otherwise, so an
 from __future__ import annotations
 
 import functools
+import gc
 import itertools
 import os
 import shutil
@@ -32,6 +33,8 @@ from mvitac.registry import from_json
 
 NUM_FETCHING = 4
 """Files on their way at a time."""
+HEADER = 128
+"""Bytes before the rows of a .npy; numpy leaves room in it for any number of them."""
 
 
 def reach(url: str) -> tuple[Any, str]:
@@ -120,9 +123,7 @@ class StreamedPack(Pack):
         """Bytes of the file that holds ``rows``."""
         if self.store == "jpeg":
             return int(self.column(f"bytes_{modality}")[rows.start : rows.stop].sum(dtype=np.int64))
-        return 128 + int(
-            np.prod(self._shape(modality, len(rows)), dtype=np.int64)
-        )  # numpy pads its header to 128 bytes
+        return 128 + int(np.prod(self._shape(modality, len(rows)), dtype=np.int64))  # numpy pads its header to 128
 
     def _shard(self, modality: str, number: int) -> Images:
         """The images of shard ``number``; who reads one shard after another finds the next one under way."""
@@ -142,6 +143,12 @@ class StreamedPack(Pack):
                 path.unlink()
                 raise ValueError(f"{self.url}/{name} does not match its digest{where}: make the shards again")
         return self._read(path, modality, rows)
+
+    def _read(self, path: Path, modality: str, rows: range) -> Images:
+        if self.store == "jpeg":
+            return self._jpegs(modality, path, slice(rows.start, rows.stop))
+        # Not np.load: Python's parser, which it gives the header to, fails where threads use it together (CPython 106905).
+        return np.memmap(path, np.uint8, "r", HEADER, self._shape(modality, len(rows)))
 
     def _fetch(self, name: str, path: Path, missing: str = "it is damaged, make it again") -> None:
         part = path.with_name(f"{path.name}.part")
@@ -239,6 +246,7 @@ class Cache:
 
 def _own_folder(cache: Path) -> tuple[Path, FileLock]:
     """A folder in ``cache`` for this process alone, as long as the lock lives; those of ended processes are deleted."""
+    gc.collect()  # of this process's own packs, those that nobody uses any more: they hold locks
     cache.mkdir(parents=True, exist_ok=True)
     own: tuple[Path, FileLock] | None = None
     for number in itertools.count():
