@@ -6,7 +6,7 @@ import io
 import json
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from test_bad_inputs import seal
 from test_train import assert_equal_weights, power_cut, smoke
 from toy import Toy
 
+from mvitac import validation
 from mvitac.batches import batches, epoch_order, mix, partners, shard_order, training_rows
 from mvitac.cli import main
 from mvitac.datasets.stream import StreamConfig
@@ -220,7 +221,7 @@ def test_features_are_those_of_the_pack(pack: Pack, shards: Path, tmp_path: Path
 
 
 @pytest.fixture
-def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, int]]]:
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     """Files that were fetched, with the bytes of shards in the cache's folder as each had come."""
     seen: list[tuple[str, int]] = []
     real = StreamedPack._fetch
@@ -237,11 +238,11 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, int]]]:
             seen.append((name, sum(size(file) for file in path.parent.glob("shard-*"))))
 
     monkeypatch.setattr(StreamedPack, "_fetch", fetch)
-    yield seen
+    return seen
 
 
 def epoch(pack: StreamedPack, run: Run, start: int, end: int) -> None:
-    for rows in batches(run, pack, training_rows(run, pack), start, end):
+    for rows in batches(run, pack, training_rows(run, pack), start, end, expect=pack.expect):
         for modality in pack.spec.modalities:
             pack.images[modality][rows]
 
@@ -297,21 +298,43 @@ def test_a_damaged_file_in_the_cache_is_fetched_anew(shards: Path, tmp_path: Pat
     assert found.images["touch"][:8].any() and found.fetched == FILE
 
 
-def test_reading_in_sequence_reads_ahead(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    came: dict[str, threading.Event] = {f"shard-{n:05d}.touch.npy": threading.Event() for n in range(15)}
+@pytest.fixture
+def came(monkeypatch: pytest.MonkeyPatch) -> list[threading.Event]:
+    """Whether the touch of each shard was fetched."""
+    events = [threading.Event() for _ in range(15)]
     real = StreamedPack._fetch
 
     def fetch(self: StreamedPack, name: str, path: Path, **missing: str) -> None:
         real(self, name, path, **missing)
-        if name in came:
-            came[name].set()
+        if name.endswith("touch.npy"):
+            events[int(name[6:11])].set()
 
     monkeypatch.setattr(StreamedPack, "_fetch", fetch)
+    return events
+
+
+def test_what_is_expected_comes_before_it_is_read(shards: Path, tmp_path: Path, came: list[threading.Event]) -> None:
+    found = opened(shards, tmp_path)
+    found.expect(np.array([25, 70, 24, 5, 71, 40, 3, 100, 90]))
+    assert all(came[number].wait(10) for number in (3, 8, 0, 5))
+    assert not came[12].is_set()  # there is no room for a fifth
+    assert (found.images["touch"][[25, 70, 5, 40]].any((1, 2, 3))).all() and found.fetched == 8 * FILE
+
+
+def test_evaluation_reads_few_shards(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validation, "NUM_EVAL_TRAIN", 8)
+    monkeypatch.setattr(validation, "NUM_EVAL_VAL", 8)
+    found, run = opened(shards, tmp_path), stream(shards, tmp_path)
+    values = validation.evaluate(fresh(run, found.spec, found.size), found, run)
+    assert values["touch/rankme"] > 0 and found.fetched == 4 * FILE  # one shard of train, one of val
+
+
+def test_reading_in_sequence_reads_ahead(shards: Path, tmp_path: Path, came: list[threading.Event]) -> None:
     found = opened(shards, tmp_path)
     found.images["touch"][:8]
     found.images["touch"][8:16]
-    assert came["shard-00002.touch.npy"].wait(10)
-    assert not any(came[f"shard-{n:05d}.touch.npy"].is_set() for n in range(3, 15))
+    assert came[2].wait(10)
+    assert not any(event.is_set() for event in came[3:])
     for start in range(16, 120, 8):
         found.images["touch"][start : start + 8]
     assert found.fetched == 15 * FILE

@@ -5,7 +5,7 @@ All of it is a function of (seed, step), so a resumed run sees what it would hav
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
 
@@ -43,10 +43,16 @@ def mix(*numbers: int) -> int:
 
 
 def batches(
-    run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int, world: World | None = None
+    run: Run,
+    pack: Pack,
+    rows: np.ndarray,
+    start: int,
+    num_steps: int,
+    world: World | None = None,
+    expect: Callable[[np.ndarray], None] | None = None,
 ) -> Iterator[np.ndarray]:
     """Pack rows of each step from ``start`` on; an epoch's order depends on (seed, epoch) alone, and where a pack comes in
-    shards on how many processes take part. Such a pack is told what this process will read."""
+    shards on how many processes take part. ``expect`` (``Pack.expect``) is then told what this process will read."""
     world = world or World()
     per_epoch, share = run.steps_per_epoch(len(rows)), run.batch_size // world.size
     touch_groups = pack.touch_groups[rows] if run.sampler == "one-per-touch" else None
@@ -67,11 +73,12 @@ def batches(
     num_ahead = min(-(-pack.window * np.bincount(shards).max() // share), per_epoch)
     try:
         for step in range(start, num_steps):
-            if pack.window:
-                pack.expect(np.concatenate([own(s) for s in range(step, min(step + num_ahead, num_steps))]))
+            if expect and pack.window:
+                expect(np.concatenate([own(s) for s in range(step, min(step + num_ahead, num_steps))]))
             yield epoch_batches(step // per_epoch)[step % per_epoch]
     finally:
-        pack.expect(rows[:0])
+        if expect:
+            expect(rows[:0])
 
 
 def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
@@ -135,7 +142,8 @@ def feed_parts(
         return make_views(run, pack, chunk, num_views, torch.Generator().manual_seed(seed), device, feed, mirror)
 
     numbers = range(per_process * world.rank, per_process * (world.rank + 1))
-    steps = enumerate(batches(run, pack, rows, start, num_steps, world), start=start)
+    expect = None if feed.resident else pack.expect
+    steps = enumerate(batches(run, pack, rows, start, num_steps, world, expect), start=start)
     if per_process == 1 and (device.type == "cuda" or any(isinstance(i, Lazy) for i in pack.images.values())):
         views = (part(step, batch, numbers[0]) for step, batch in steps)
         for made in ahead(views, device) if device.type == "cuda" else prefetch(views):

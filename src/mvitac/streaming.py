@@ -53,7 +53,7 @@ def shard_name(number: int, modality: str, store: str) -> str:
 
 
 class StreamedPack(Pack):
-    """The pack in shards at ``url``. ``fetched`` counts the bytes of images that came from there."""
+    """The pack in shards at ``url``."""
 
     format: ClassVar[str] = SHARDED
 
@@ -62,7 +62,8 @@ class StreamedPack(Pack):
 
         ``window``: shards whose rows training mixes. ValueError if two such windows do not fit into the cache.
         """
-        self.url, self.window, self.fetched, self._limit = url, window, 0, limit
+        self.url, self.window, self._limit = url, window, limit
+        self._fetched: list[int] = []
         self._system, self._place = reach(url)
         check_place(cache / "0")
         folder, self._lock = _own_folder(cache)
@@ -80,6 +81,11 @@ class StreamedPack(Pack):
         except ValueError as error:
             (folder / "samples.parquet").unlink(missing_ok=True)  # else it would stay when the one at the URL is mended
             raise ValueError(str(error).replace(str(folder), url)) from None
+
+    @property
+    def fetched(self) -> int:
+        """Bytes of images that came from ``url`` so far."""
+        return sum(self._fetched)
 
     @functools.cached_property
     def shards(self) -> np.ndarray:
@@ -102,8 +108,8 @@ class StreamedPack(Pack):
         starts = np.cumsum([0, *self._counts])
         pieces = [range(start, end) for start, end in itertools.pairwise(starts.tolist())]
         rows = dict(zip(files, pieces * len(self.spec.modalities), strict=True))
-        sizes = {name: self._size(modality, rows[name]) for name, modality in files.items()}
-        by_shard = np.reshape([*sizes.values()], (-1, len(pieces))).sum(axis=0)
+        lengths = np.stack([self._lengths(modality, starts) for modality in self.spec.modalities])
+        sizes, by_shard = dict(zip(files, lengths.ravel().tolist(), strict=True)), lengths.sum(axis=0)
         need = int(min(2 * self.window * by_shard.max(), by_shard.sum())) + max(sizes.values())
         if need > self._limit:
             raise ValueError(
@@ -119,11 +125,11 @@ class StreamedPack(Pack):
             m: Shards(self._shape(m, self.num), starts, functools.partial(self._shard, m)) for m in self.spec.modalities
         }
 
-    def _size(self, modality: str, rows: range) -> int:
-        """Bytes of the file that holds ``rows``."""
+    def _lengths(self, modality: str, starts: np.ndarray) -> np.ndarray:
+        """[number of shards] int64: bytes of each file."""
         if self.store == "jpeg":
-            return int(self.column(f"bytes_{modality}")[rows.start : rows.stop].sum(dtype=np.int64))
-        return 128 + int(np.prod(self._shape(modality, len(rows)), dtype=np.int64))  # numpy pads its header to 128
+            return np.add.reduceat(self.column(f"bytes_{modality}").astype(np.int64), starts[:-1])
+        return HEADER + np.diff(starts) * int(np.prod(self._shape(modality, 1)))
 
     def _shard(self, modality: str, number: int) -> Images:
         """The images of shard ``number``; who reads one shard after another finds the next one under way."""
@@ -134,7 +140,7 @@ class StreamedPack(Pack):
         path = self.path / name
         if not (path.is_file() and digest_file(path) == self.digests[name]):
             self._fetch(name, path)
-            self.fetched += path.stat().st_size
+            self._fetched.append(path.stat().st_size)
             if digest_file(path) != self.digests[name]:
                 try:
                     where = self._damaged_rows(modality, self._read(path, modality, rows), rows.start)

@@ -119,6 +119,7 @@ def shard(argv: list[str]) -> None:
         """A pack in shards, for data larger than a machine's memory or disk: shards are read whole and in sequence.
 
         mvitac data shard PACK s3://bucket/path
+
         mvitac pretrain --data stream --data.url s3://bucket/path --data.cache /scratch/cache --data.cache-gb 50 ...
 
         Rows of one touch stay together, touches come in random order. What was interrupted is written again.

@@ -24,7 +24,7 @@ class StreamConfig(DatasetConfig):
     cache: Path | None = None
     """Folder for the shards that are in use; default: "shards" in the cache of packs. A fast local disk."""
     cache_gb: float = 8.0
-    """What it may hold, all processes of a machine together. If that is all there is, every shard is fetched once."""
+    """What it may hold, all processes of a machine together; a set that fits is fetched once."""
     window: int = 8
     """Shards whose rows each process mixes at a time: batches are drawn from these, while as many again are on their way."""
 
