@@ -100,8 +100,8 @@ def test_training_reads_shards_of_its_own_and_a_touch_lies_in_one(shards: Path, 
 def test_what_is_larger_than_a_shard_is_cut(pack: Pack) -> None:
     row = 2 * 32 * 32 * 3
     assert [len(rows) for rows in deal_rows(pack, row - 1, 0)] == [1] * 120
-    parts = deal_rows(pack, row, 0)
-    assert sorted(np.concatenate(parts)) == [*range(120)]
+    parts = deal_rows(pack, 7 * row, 0)
+    assert sorted(np.concatenate(parts)) == [*range(120)] and max(map(len, parts)) == 6  # touches of two stay whole
 
 
 def test_partners_stay_in_the_shard(pack: Pack, tmp_path: Path) -> None:
@@ -149,8 +149,12 @@ def test_processes_read_what_one_epoch_has(shards: Path, tmp_path: Path) -> None
         assert sorted(np.concatenate(order)) == rows.tolist()
         own = [set(found.shards[np.concatenate([np.split(b, 2)[rank] for b in order])]) for rank in (0, 1)]
         assert len(own[0] & own[1]) <= 1
-    resumed = list(batches(run, found, rows, 9, 12, World(1, 2)))
+    told: list[np.ndarray] = []
+    resumed = list(batches(run, found, rows, 9, 12, World(1, 2), told.append))
     assert np.array_equal(resumed, order[3:])
+    own = [batch[6:] for batch in resumed]
+    assert all(np.array_equal(rows, np.concatenate(own[i:])) for i, rows in enumerate(told[:3]))
+    assert not len(told[3]) and len(told) == 4
 
 
 @pytest.mark.parametrize("sampler", ["shuffle", "one-per-touch"])
@@ -266,6 +270,22 @@ def test_what_fits_is_fetched_once_ever(shards: Path, tmp_path: Path, watched: l
     again = opened(shards, tmp_path, limit=10**6)
     epoch(again, run, 12, 16)
     assert len(watched) == 18
+
+
+def test_what_an_earlier_process_left_counts(shards: Path, tmp_path: Path) -> None:
+    opened(shards, tmp_path, limit=10**6).images["touch"][:]
+    found = opened(shards, tmp_path)
+    assert [*found.path.glob("shard-*")] and sum(f.stat().st_size for f in found.path.glob("shard-*")) <= LIMIT
+
+
+def test_what_is_expected_stays(tmp_path: Path) -> None:
+    names = [f"f{i}" for i in range(9)]
+    loaded: list[str] = []
+    cache = Cache(tmp_path, dict.fromkeys(names, 10), 50, lambda name: loaded.append(name) or np.zeros(1))
+    cache.expect(names[:4])
+    for name in [*names[4:], *names[:4]]:
+        cache.get(name)
+    assert sorted(loaded) == names
 
 
 def test_a_cache_of_something_else_is_cleared(pack: Pack, shards: Path, tmp_path: Path) -> None:
@@ -435,7 +455,12 @@ def test_a_damaged_description(shards: Path, tmp_path: Path, spoil: Callable[[Pa
     spoil(place)
     with pytest.raises(ValueError, match=says) as error:
         opened(place, tmp_path / "c")
-    assert str(place) in str(error.value) and str(tmp_path / "c") not in str(error.value)
+    text = str(error.value)
+    del error  # it holds what was opened, and so the folder
+    assert str(place) in text and str(tmp_path / "c") not in text
+    for name in ("pack.json", "samples.parquet"):
+        (place / name).write_bytes((shards / name).read_bytes())
+    assert opened(place, tmp_path / "c").num == 120  # mended
 
 
 TRAIN = ["pretrain", "--recipe", "smoke", "--data", "stream", "--data.cache", "{tmp}/c", "--out", "{tmp}/out"]
