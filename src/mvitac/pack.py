@@ -166,6 +166,11 @@ class Pack:
         """[N] int: number of the shard each row lies in; a pack on the disk is one."""
         return np.zeros(self.num, np.int64)
 
+    def near(self, rows: np.ndarray, num: int) -> np.ndarray:
+        """Those of ``rows`` (ascending) in the first shards, as many shards as hold ``num`` of them: to draw a sample from.
+        All of a pack on the disk; shards are in random order."""
+        return rows[self.shards[rows] <= self.shards[rows[:num]].max(initial=0)]
+
     def expect(self, rows: np.ndarray) -> None:
         """Be told that ``rows`` are read next, in this order, and no others are soon: shards are fetched ahead by it."""
 
