@@ -24,6 +24,7 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.pack import Pack
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
+from mvitac.sharding import write_shards
 from mvitac.step import Step
 
 RUN = replace(
@@ -79,12 +80,16 @@ def test_two_processes_equal_one_on_the_joint_batch(tmp_path: Path, method: str)
 
 
 @pytest.mark.slow
-def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["pack", "shards"])
+def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tmp_path: Path, kind: str) -> None:
+    if kind == "shards":
+        write_shards(pack, str(tmp_path / "shards"), shard_mb=0.05, quiet=True)
+    data = str(pack.path if kind == "pack" else tmp_path / "shards")
     straight, cut = tmp_path / "straight", tmp_path / "cut"
-    together([WORKER, "train", str(pack.path), str(straight), "99"])
-    together([WORKER, "train", str(pack.path), str(cut), "3"], fails=True)
+    together([WORKER, "train", data, str(straight), "99"])
+    together([WORKER, "train", data, str(cut), "3"], fails=True)
     assert not (cut / "model.safetensors").exists()
-    together([WORKER, "train", str(pack.path), str(cut), "99"])
+    together([WORKER, "train", data, str(cut), "99"])
     a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     for path in (straight, cut):

@@ -13,6 +13,7 @@ from test_step import split
 
 from mvitac import batches
 from mvitac.datasets.packed import PackConfig
+from mvitac.datasets.stream import StreamConfig
 from mvitac.distributed import join, synchronise_norms
 from mvitac.recipes import recipe
 from mvitac.step import Step
@@ -33,7 +34,9 @@ def step(folder: Path, name: str) -> None:
 
 def train(pack: Path, out: Path, die_after: int) -> None:
     """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw."""
-    run = replace(recipe("smoke", PackConfig(path=pack)), steps=4, checkpoint_every=2, log_every=1)
+    shards = StreamConfig(url=str(pack), cache=pack.with_name("cache"), cache_gb=1e-3, window=2)
+    data = shards if pack.name == "shards" else PackConfig(path=pack)
+    run = replace(recipe("smoke", data), steps=4, checkpoint_every=2, log_every=1)
     real, seen = batches.make_views, []
 
     def watched(*args: object) -> object:

@@ -5,9 +5,9 @@ All of it is a function of (seed, step), so a resumed run sees what it would hav
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from mvitac.batch import Views
 from mvitac.distributed import World
 from mvitac.feed import Feed, ahead, prefetch
 from mvitac.gel_colours import GelMirror
+from mvitac.jpegs import Lazy
 from mvitac.pack import Pack
 from mvitac.run import Run
 from mvitac.step import Part
@@ -41,16 +42,43 @@ def mix(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
 
 
-def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) -> Iterator[np.ndarray]:
-    """Pack rows of each step from ``start`` on; an epoch's order depends on (seed, epoch) alone."""
-    per_epoch = run.steps_per_epoch(len(rows))
+def batches(
+    run: Run,
+    pack: Pack,
+    rows: np.ndarray,
+    start: int,
+    num_steps: int,
+    world: World | None = None,
+    expect: Callable[[np.ndarray], None] | None = None,
+) -> Iterator[np.ndarray]:
+    """Pack rows of each step from ``start`` on; an epoch's order depends on (seed, epoch) alone, and where a pack comes in
+    shards on how many processes take part. ``expect`` (``Pack.expect``) is then told what this process will read."""
+    world = world or World()
+    per_epoch, share = run.steps_per_epoch(len(rows)), run.batch_size // world.size
     touch_groups = pack.touch_groups[rows] if run.sampler == "one-per-touch" else None
-    order, ordered_epoch = rows, -1
-    for step in range(start, num_steps):
-        epoch, place = divmod(step, per_epoch)
-        if epoch != ordered_epoch:
-            order, ordered_epoch = rows[epoch_order(len(rows), touch_groups, mix(run.seed, 1, epoch))], epoch
-        yield order[place * run.batch_size : (place + 1) * run.batch_size]
+    shards = pack.shards[rows]
+
+    @lru_cache(2)
+    def epoch_batches(epoch: int) -> np.ndarray:
+        """[per_epoch, batch_size]"""
+        seed, num = mix(run.seed, 1, epoch), per_epoch * run.batch_size
+        if not pack.window:
+            return rows[epoch_order(len(rows), touch_groups, seed)[:num]].reshape(per_epoch, -1)
+        lanes = shard_order(shards, touch_groups, pack.window, world.size, num, seed)
+        return rows[lanes.reshape(world.size, per_epoch, share).swapaxes(0, 1).reshape(per_epoch, -1)]
+
+    def own(step: int) -> np.ndarray:
+        return epoch_batches(step // per_epoch)[step % per_epoch, share * world.rank : share * (world.rank + 1)]
+
+    num_ahead = min(-(-pack.window * np.bincount(shards).max() // share), per_epoch)
+    try:
+        for step in range(start, num_steps):
+            if expect and pack.window:
+                expect(np.concatenate([own(s) for s in range(step, min(step + num_ahead, num_steps))]))
+            yield epoch_batches(step // per_epoch)[step % per_epoch]
+    finally:
+        if expect:
+            expect(rows[:0])
 
 
 def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
@@ -67,6 +95,25 @@ def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
     occurrence = np.empty(num, np.int64)
     occurrence[by_group] = np.arange(num) - np.repeat(np.cumsum(counts) - counts, counts)
     return order[np.argsort(occurrence, kind="stable")]
+
+
+def shard_order(
+    shards: np.ndarray, groups: np.ndarray | None, window: int, num_lanes: int, num: int, seed: int
+) -> np.ndarray:
+    """[num_lanes, num / num_lanes] of 0..N-1, each at most once: the shards (``shards`` [N] is each row's) in a random
+    sequence, cut into one lane per process; within a lane rows are mixed as by ``epoch_order``, ``window`` shards at a time.
+
+    So a process reads its own shards one after another and needs few at a time; only one that is cut is read by two.
+    """
+    place = np.random.default_rng(seed).permutation(shards.max() + 1)[shards]
+    lanes = np.argsort(place, kind="stable")[:num].reshape(num_lanes, -1)
+    for number, lane in enumerate(lanes):
+        held = np.unique(place[lane])
+        windows = np.array_split(held, -(-len(held) // window))
+        firsts = np.searchsorted(place[lane], [some[0] for some in windows])
+        for i, rows in enumerate(np.split(lane, firsts[1:])):  # views of the lane
+            rows[:] = rows[epoch_order(len(rows), None if groups is None else groups[rows], mix(seed, number, i))]
+    return lanes
 
 
 def feed_parts(
@@ -95,8 +142,9 @@ def feed_parts(
         return make_views(run, pack, chunk, num_views, torch.Generator().manual_seed(seed), device, feed, mirror)
 
     numbers = range(per_process * world.rank, per_process * (world.rank + 1))
-    steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
-    if per_process == 1 and (device.type == "cuda" or pack.store == "jpeg"):
+    expect = None if feed.resident else pack.expect
+    steps = enumerate(batches(run, pack, rows, start, num_steps, world, expect), start=start)
+    if per_process == 1 and (device.type == "cuda" or any(isinstance(i, Lazy) for i in pack.images.values())):
         views = (part(step, batch, numbers[0]) for step, batch in steps)
         for made in ahead(views, device) if device.type == "cuda" else prefetch(views):
             yield [partial(_same, made)]
@@ -150,14 +198,16 @@ def make_views(
 
 
 def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
-    """For each of ``rows`` a random other row of its touch group in the same split, or itself if it is alone there."""
-    groups, split = pack.touch_groups, pack.column("split")
+    """For each of ``rows`` a random other row of its touch group in the same split, and shard if the pack comes in such,
+    or itself if it is alone there."""
+    groups, split, shards = pack.touch_groups, pack.column("split"), pack.shards
     whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]))
         others = others[(others != row) & (split[others] == split[row]) & whole[others]]
+        others = others[shards[others] == shards[row]]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found

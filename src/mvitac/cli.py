@@ -18,6 +18,7 @@ what the features are worth.
   demo                 the whole road in minutes, on simulated data
   data simulate KIND   simulate materials or grasps into a pack
   data pack            read any dataset (--data NAME) into a pack
+  data shard PACK URL  write a pack in shards, for --data stream
   data info PACK       what is in a pack
   data check PACK      what is wrong with a pack, or with --data NAME (doctor)
   data sheet KIND      a picture of what the simulator makes
@@ -46,6 +47,7 @@ COMMANDS = {
     "demo": "learn:demo",
     "data simulate": "data:simulate",
     "data pack": "data:pack",
+    "data shard": "data:shard",
     "data info": "data:info",
     "data check": "check:check",
     "data sheet": "data:sheet",

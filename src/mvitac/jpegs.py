@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import io
 import os
+from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -49,44 +50,56 @@ def decode(jpeg: bytes, shape: tuple[int, int, int]) -> np.ndarray:
     return sensors.transpose(1, 2, 0, 3).reshape(shape)
 
 
-class Jpegs:
-    """The array uint8 [N, S, S, C] that a file of JPEGs stands for: rows are decoded as they are indexed, many at once by
-    as many threads as there are cores, or as OMP_NUM_THREADS allows. Safe to share between threads.
+class Lazy(ABC):
+    """An array uint8 [N, S, S, C] whose rows are made when they are indexed. Safe to share between threads.
 
     Indexed as numpy does it, rows first: a number, a slice, an array of numbers or a mask, then anything of an image's axes.
     """
 
     dtype = np.dtype(np.uint8)
 
-    def __init__(self, path: Path, shape: tuple[int, int, int, int], lengths: np.ndarray) -> None:
-        """``lengths`` [N] are the bytes of each row; ValueError if the file has not as many."""
-        self.path, self.shape = path, shape
-        self._ends = np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
-        self._numbers = np.arange(len(lengths))
-        if (held := path.stat().st_size) != self._ends[-1]:
-            raise ValueError(f"{path} holds {held} bytes, its table promises {self._ends[-1]}")
-        self._file = np.memmap(path, np.uint8, "r") if held else np.zeros(0, np.uint8)  # nothing cannot be mapped
+    def __init__(self, shape: tuple[int, int, int, int]) -> None:
+        self.shape = shape
+        self._numbers = np.arange(shape[0])
 
     def __len__(self) -> int:
         return self.shape[0]
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all images once decoded."""
+        """Bytes of all images once made."""
         return int(np.prod(self.shape, dtype=np.int64))
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        """A new array, as numpy would give it; ValueError names the file and the row that is damaged."""
+        rows, *within = index if isinstance(index, tuple) else (index,)
+        rows = np.asarray(self._numbers[rows])
+        images = self._made(rows.ravel()).reshape(*rows.shape, *self.shape[1:])
+        return images[(..., *within, *[slice(None)] * (3 - len(within)))] if within else images
+
+    @abstractmethod
+    def _made(self, rows: np.ndarray) -> np.ndarray:
+        """uint8 [n, S, S, C]: the images of ``rows`` [n], which are numbers of rows that are there."""
+
+
+class Jpegs(Lazy):
+    """What a file of JPEGs stands for: rows are decoded, many at once by as many threads as there are cores, or as
+    OMP_NUM_THREADS allows."""
+
+    def __init__(self, path: Path, shape: tuple[int, int, int, int], lengths: np.ndarray) -> None:
+        """``lengths`` [N] are the bytes of each row; ValueError if the file has not as many."""
+        super().__init__(shape)
+        self.path = path
+        self._ends = np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
+        if (held := path.stat().st_size) != self._ends[-1]:
+            raise ValueError(f"{path} holds {held} bytes, its table promises {self._ends[-1]}")
+        self._file = np.memmap(path, np.uint8, "r") if held else np.zeros(0, np.uint8)  # nothing cannot be mapped
 
     def jpeg(self, row: int) -> bytes:
         """Row ``row`` as it is stored."""
         return self._file[self._ends[row] : self._ends[row + 1]].tobytes()
 
-    def __getitem__(self, index: Any) -> np.ndarray:
-        """A new array, as numpy would give it of the decoded ones; ValueError names the file and the row that is damaged."""
-        rows, *within = index if isinstance(index, tuple) else (index,)
-        rows = np.asarray(self._numbers[rows])
-        images = self._decoded(rows.ravel()).reshape(*rows.shape, *self.shape[1:])
-        return images[(..., *within, *[slice(None)] * (3 - len(within)))] if within else images
-
-    def _decoded(self, rows: np.ndarray) -> np.ndarray:
+    def _made(self, rows: np.ndarray) -> np.ndarray:
         images = np.empty((len(rows), *self.shape[1:]), np.uint8)
 
         def fill(some: np.ndarray) -> None:

@@ -17,19 +17,20 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from mvitac.jpegs import Jpegs
+from mvitac.jpegs import Jpegs, Lazy
 from mvitac.record import brief, digest, digest_file, read_json
 from mvitac.registry import from_json, unknown
 from mvitac.spec import DataSpec
 
 FORMAT = "mvitac-pack"
+SHARDED = "mvitac-shards"
 FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}
 """By how the images are stored."""
 SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}
@@ -37,12 +38,16 @@ SPLITS = ("train", "val", "test", "unlabelled")
 """Pre-training sees train and unlabelled; val chooses (kNN while training, a probe's regularisation); test only scores."""
 
 Store = Literal["raw", "jpeg"]
-Images = np.ndarray | Jpegs
+Images = np.ndarray | Lazy
 
 
 class Pack:
     """An opened pack: ``table`` (pyarrow), ``images[modality]`` (uint8 [N, S, S, C], memory-mapped or decoded as they are
     indexed), ``spec``."""
+
+    format: ClassVar[str] = FORMAT
+    window: int = 0
+    """Shards whose rows training may mix at a time; 0 where all rows are equally near (``streaming.py`` has others)."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
         """Open and check ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""
@@ -50,7 +55,9 @@ class Pack:
         if not self.path.is_dir():
             raise ValueError(f"no pack at {self.path}: make one with `mvitac data simulate` or `mvitac data pack`")
         meta = read_json(self.path / "pack.json", "a pack's description")
-        if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        if isinstance(meta, dict) and meta.get("format") == SHARDED != self.format:
+            raise ValueError(f"{self.path} is a pack in shards: read it with --data stream --data.url {self.path}")
+        if not isinstance(meta, dict) or meta.get("format") != self.format:
             raise ValueError(f"{self.path / 'pack.json'} does not describe a pack: choose a folder `mvitac data` wrote")
         if (version := meta.get("format_version")) not in FORMAT_VERSIONS.values():
             known = " and ".join(map(str, FORMAT_VERSIONS.values()))
@@ -60,6 +67,7 @@ class Pack:
             raise ValueError(
                 f"{self.path / 'pack.json'} does not match its digest: it was changed or damaged, re-pack it"
             )
+        self.meta: dict[str, Any] = meta
         try:
             self.spec: DataSpec = from_json(DataSpec, meta.get("spec"), "spec")
             self.num, self.size = (int(from_json(int, meta.get(name), name)) for name in ("num", "size"))
@@ -67,12 +75,11 @@ class Pack:
             if FORMAT_VERSIONS[self.store] != version:
                 raise ValueError(f"store: {self.store} is not of format {version}")
             self.digests: dict[str, str] = from_json(dict[str, str], meta.get("digests"), "digests")
-            files = {f"{m}{SUFFIXES[self.store]}": m for m in self.spec.modalities}
+            files = self._files()
             if sorted(self.digests) != sorted(names := ("samples.parquet", *files)):
                 raise ValueError(f"digests: expected those of {', '.join(names)}")
         except ValueError as error:
             raise ValueError(f"{self.path / 'pack.json'} is damaged ({error}): re-pack it") from None
-        self.meta: dict[str, Any] = meta
         self._check_digest("samples.parquet")
         try:
             self.table: pa.Table = pq.read_table(self._file("samples.parquet"))
@@ -88,8 +95,7 @@ class Pack:
             check_table(self.table, self.spec)
         except ValueError as error:
             raise ValueError(f"{self.path / 'samples.parquet'}: {error} (make the pack again)") from None
-        reader = {"raw": self._map, "jpeg": self._jpegs}[self.store]
-        self.images: dict[str, Images] = {m: reader(m, self._file(name)) for name, m in files.items()}
+        self.images: dict[str, Images] = self._open(files)
         for name, modality in files.items() if verify else ():
             self._check_digest(name, modality)
 
@@ -155,23 +161,45 @@ class Pack:
         """Ascending row numbers of touch group number ``touch_group``."""
         return self._rows_by_touch_group[touch_group]
 
+    @functools.cached_property
+    def shards(self) -> np.ndarray:
+        """[N] int: number of the shard each row lies in; a pack on the disk is one."""
+        return np.zeros(self.num, np.int64)
+
+    def near(self, rows: np.ndarray, num: int) -> np.ndarray:
+        """Those of ``rows`` (ascending) in the first shards, as many shards as hold ``num`` of them: to draw a sample from.
+        All of a pack on the disk; shards are in random order."""
+        return rows[self.shards[rows] <= self.shards[rows[:num]].max(initial=0)]
+
+    def expect(self, rows: np.ndarray) -> None:
+        """Be told that ``rows`` are read next, in this order, and no others are soon: shards are fetched ahead by it."""
+
+    def _files(self) -> dict[str, str]:
+        """Name of each image file that pack.json promises -> its modality."""
+        return {f"{m}{SUFFIXES[self.store]}": m for m in self.spec.modalities}
+
+    def _open(self, files: dict[str, str]) -> dict[str, Images]:
+        """The images of each modality, which lie in ``files``."""
+        reader = {"raw": self._map, "jpeg": self._jpegs}[self.store]
+        return {m: reader(m, self._file(name)) for name, m in files.items()}
+
     def _check_digest(self, name: str, modality: str = "") -> None:
         if digest_file(self._file(name)) != self.digests[name]:
-            where = self._damaged_rows(modality) if modality else ""
+            where = self._damaged_rows(modality, self.images[modality]) if modality else ""
             raise ValueError(f"{self.path / name} does not match its digest{where}: the pack is damaged, make it again")
 
-    def _damaged_rows(self, modality: str) -> str:
-        """Which rows of a damaged image file do not match their own sums, for the error; "" if that cannot be said."""
+    def _damaged_rows(self, modality: str, images: Images, first: int = 0) -> str:
+        """Which rows of a damaged image file, from row ``first`` on, do not match their own sums, for the error; "" if
+        that cannot be said."""
         if f"crc_{modality}" not in self.table.column_names:
             return ""
-        sums, images = self.table.column(f"crc_{modality}").to_pylist(), self.images[modality]
-        stored = map(images.jpeg, range(self.num)) if isinstance(images, Jpegs) else images
-        rows = [i for i, one in enumerate(stored) if zlib.crc32(one) != sums[i]]
+        sums = self.table.column(f"crc_{modality}").slice(first, len(images)).to_pylist()
+        stored: Any = images.jpeg if isinstance(images, Jpegs) else images.__getitem__
+        rows = [first + i for i in range(len(images)) if zlib.crc32(stored(i)) != sums[i]]
         if not rows:
             return " in its header"
-        return (
-            f" in {len(rows)} of {self.num} rows, first row {rows[0]} (id {self.table.column('id')[rows[0]].as_py()!r})"
-        )
+        name = self.table.column("id")[rows[0]].as_py()
+        return f" in {len(rows)} of {len(images)} rows, first row {rows[0]} (id {name!r})"
 
     def _file(self, name: str) -> Path:
         path = self.path / name
@@ -179,22 +207,22 @@ class Pack:
             raise ValueError(f"{path} is missing: the pack is damaged, make it again")
         return path
 
-    def _shape(self, modality: str) -> tuple[int, int, int, int]:
-        return self.num, self.size, self.size, self.spec.channels(modality)
+    def _shape(self, modality: str, num: int) -> tuple[int, int, int, int]:
+        return num, self.size, self.size, self.spec.channels(modality)
 
-    def _jpegs(self, modality: str, path: Path) -> Jpegs:
+    def _jpegs(self, modality: str, path: Path, rows: slice = slice(None)) -> Jpegs:
         name = f"bytes_{modality}"
         if name not in self.table.column_names or not pa.types.is_uint32((column := self.table.column(name)).type):
             raise ValueError(f"{self.path / 'samples.parquet'} has no column {name} of uint32: make the pack again")
         if column.null_count:
             raise ValueError(f"{self.path / 'samples.parquet'}: column {name} has empty rows: make the pack again")
         try:
-            return Jpegs(path, self._shape(modality), self.column(name))
+            return Jpegs(path, self._shape(modality, len(lengths := self.column(name)[rows])), lengths)
         except (ValueError, OSError) as error:
             raise ValueError(f"{brief(error)}: the pack is damaged, make it again") from None
 
     def _map(self, modality: str, path: Path) -> np.ndarray:
-        expected = self._shape(modality)
+        expected = self._shape(modality, self.num)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about headers that only damage can produce

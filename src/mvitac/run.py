@@ -169,7 +169,7 @@ class Run:
         for name in ("device", "log_every", "eval_every", "checkpoint_every"):
             del value[name]
         # What is as it was before there was a choice has the digest it had then: raw packs, plain flips.
-        for name in ("workers", *(("store", "quality") if self.data.store == "raw" else ())):
+        for name in (*self.data.local, *(("store", "quality") if self.data.store == "raw" else ())):
             del value["data"][name]
         if self.augment.gel_flip == "plain":
             del value["augment"]["gel_flip"]

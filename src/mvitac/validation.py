@@ -22,6 +22,7 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
 
     def some(rows: np.ndarray, num: int) -> np.ndarray:
+        rows = pack.near(rows, num)
         return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
     whole = pack.spec.modalities

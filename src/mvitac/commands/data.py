@@ -109,6 +109,43 @@ def sheet(argv: list[str]) -> None:
     Console().print(f"{out}", soft_wrap=True, highlight=False)
 
 
+def shard(argv: list[str]) -> None:
+    """mvitac data shard PACK URL [--shard-mb 64]"""
+    from rich.console import Console
+    from tyro.conf import Positional
+
+    @dataclass(frozen=True)
+    class Options:
+        """A pack in shards, for data larger than a machine's memory or disk: shards are read whole and in sequence.
+
+        mvitac data shard PACK s3://bucket/path
+
+        mvitac pretrain --data stream --data.url s3://bucket/path --data.cache /scratch/cache --data.cache-gb 50 ...
+
+        Rows of one touch stay together, touches come in random order. What was interrupted is written again.
+        """
+
+        pack: Positional[Path]
+        """Folder of the pack."""
+        url: Positional[str]
+        """Where the shards go: a folder, file:///..., s3://bucket/path (needs mvitac[s3]), or whatever fsspec
+        opens."""
+        shard_mb: float = 64
+        """Megabytes of images per shard at most, camera and touch together."""
+        seed: int = 0
+        """Another number is another order of the touches."""
+        quiet: bool = False
+        """No progress bar."""
+
+    options = parse(Options, argv, "data shard")
+    from mvitac.pack import Pack
+    from mvitac.sharding import write_shards
+
+    pack = Pack(options.pack)
+    num = write_shards(pack, options.url, shard_mb=options.shard_mb, seed=options.seed, quiet=options.quiet)
+    Console().print(f"{options.url}: {pack.num} samples in {num} shards", soft_wrap=True, highlight=False)
+
+
 def info(argv: list[str]) -> None:
     """mvitac data info PACK"""
     import numpy as np

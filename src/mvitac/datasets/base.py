@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 from mvitac.jpegs import QUALITY
 from mvitac.pack import Pack, Store
@@ -19,6 +20,9 @@ KEEPING = ("size", "workers", "store", "quality")
 @dataclass(frozen=True, kw_only=True)
 class DatasetConfig(Registered, ABC):
     """Base of every dataset's config. Adding a dataset is one file: a ``Source`` and a config naming it."""
+
+    local: ClassVar[tuple[str, ...]] = ("workers",)
+    """Options that decide nothing of the outcome."""
 
     size: int = 256
     """Side in pixels at which images are stored; crops are cut from it (paper: 256)."""

@@ -1,0 +1,115 @@
+"""What it costs to train from shards: pairs/s of an epoch's batches and bytes fetched over those of the set, beside a pack.
+
+Images are noise. Shards are read from file:// into a cache that holds two windows and a file, less than the set; each epoch
+is read as training reads it. With --step-ms a batch is followed by that much sleep, for the network's step, and what is
+reported is the time spent waiting for input. Both are read in turn, warm (the disk's own speed is not in it).
+
+    python -m benchmarks.streaming [--num 2000] [--size 256] [--shard-mb 16] [--window 8] [--batch 128] [--step-ms 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvitac.batches import batches, training_rows
+from mvitac.datasets.stream import StreamConfig
+from mvitac.pack import Pack
+from mvitac.packing import build
+from mvitac.recipes import recipe
+from mvitac.record import provenance, write_json
+from mvitac.run import Run
+from mvitac.sharding import write_shards
+from mvitac.source import Sample, Source
+from mvitac.spec import DataSpec
+from mvitac.streaming import StreamedPack
+
+
+@dataclass
+class Noise(Source):
+    """Pairs of noise, eight to a touch."""
+
+    num: int
+    size: int
+
+    def spec(self) -> DataSpec:
+        words = {"name": "noise", "group_by": "touch", "licence": "none", "source": "benchmarks/streaming.py"}
+        return DataSpec(vision_channels=3, touch_channels=3, tasks=(), **words)  # type: ignore[arg-type]
+
+    def items(self) -> list[str]:
+        return [str(row) for row in range(self.num)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"noise": [self.num, self.size]}
+
+    def read(self, item: int) -> list[Sample]:
+        pixels = np.random.default_rng(item).integers(0, 256, (2, self.size, self.size, 3), np.uint8)
+        columns = {"id": str(item), "group": str(item // 8), "split": "train"}
+        return [Sample(vision=pixels[0], touch=pixels[1], columns=columns)]
+
+
+def epoch(run: Run, pack: Pack, number: int, step_s: float) -> float:
+    """Seconds that an epoch's batches were waited for."""
+    rows = training_rows(run, pack)
+    per_epoch, waited = run.steps_per_epoch(len(rows)), 0.0
+    order = batches(run, pack, rows, number * per_epoch, (number + 1) * per_epoch, expect=pack.expect)
+    while True:
+        began = time.perf_counter()
+        if (batch := next(order, None)) is None:
+            return waited
+        for modality in pack.spec.modalities:
+            pack.images[modality][batch]
+        waited += time.perf_counter() - began
+        time.sleep(step_s)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--num", type=int, default=2000, help="pairs")
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--shard-mb", type=float, default=16)
+    parser.add_argument("--window", type=int, default=8)
+    parser.add_argument("--batch", type=int, default=128)
+    parser.add_argument("--step-ms", type=float, default=0)
+    parser.add_argument("--epochs", type=int, default=5)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        pack = build(Noise(options.num, options.size), Path(place) / "pack", size=options.size, workers=0, quiet=True)
+        url = f"file://{place}/shards"
+        num = write_shards(pack, url, shard_mb=options.shard_mb, quiet=True)
+        limit = int((2 * options.window + 1) * 1e6 * options.shard_mb)
+        shards = StreamedPack(url, Path(place) / "cache", limit=limit, window=options.window)
+        run = replace(recipe("smoke", StreamConfig(window=options.window)), batch_size=options.batch)
+        times: dict[str, list[float]] = {"pack": [], "shards": []}
+        fetched = []
+        for number in range(options.epochs):
+            before = shards.fetched
+            for name, one in (("pack", pack), ("shards", shards)):
+                times[name].append(epoch(run, one, number, options.step_ms / 1e3))
+            fetched.append(shards.fetched - before)
+        whole = sum(images.nbytes for images in pack.images.values())
+        pairs = run.steps_per_epoch(pack.num) * options.batch
+        result: dict[str, Any] = {
+            "set_mb": whole / 1e6,
+            "cache_mb": limit / 1e6,
+            "shards": num,
+            "fetched_over_set": [round(f / whole, 3) for f in fetched],
+            "waited_s": {name: statistics.median(seconds) for name, seconds in times.items()},
+            "pairs_per_s_of_waiting": {n: pairs / statistics.median(seconds) for n, seconds in times.items()},
+        }
+        for name, value in result.items():
+            print(name, value)
+    if options.json:
+        write_json(options.json, {"options": {**vars(options), "json": None}, **result, **provenance()})
+
+
+if __name__ == "__main__":
+    main()
