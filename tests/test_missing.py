@@ -88,9 +88,9 @@ def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch:
     asked: dict[str, set[int]] = {"vision": set(), "touch": set()}
     real = probe_module.features
 
-    def features(model: object, pack: Pack, modality: str, rows: np.ndarray) -> np.ndarray:
+    def features(model: object, pack: Pack, modality: str, rows: np.ndarray, **options: bool) -> np.ndarray:
         asked[modality] |= set(rows.tolist())
-        return real(model, pack, modality, rows)  # type: ignore[arg-type]
+        return real(model, pack, modality, rows, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(probe_module, "features", features)
     result = probe_runs([tmp_path / "run"], Session(tasks=("pattern",)), holes)

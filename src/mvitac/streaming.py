@@ -153,7 +153,7 @@ class StreamedPack(Pack):
     def _read(self, path: Path, modality: str, rows: range) -> Images:
         if self.store == "jpeg":
             return self._jpegs(modality, path, slice(rows.start, rows.stop))
-        # Not np.load: Python's parser, which it gives the header to, fails where threads use it together (CPython 106905).
+        # Not np.load: Python's parser, which it gives the header to, failed once where threads used it together.
         return np.memmap(path, np.uint8, "r", HEADER, self._shape(modality, len(rows)))
 
     def _fetch(self, name: str, path: Path, missing: str = "it is damaged, make it again") -> None:
