@@ -10,7 +10,7 @@ here=$(dirname "$0")
 mvitac=(python -m mvitac)
 [ -d "$out/manifests" ] || python "$here/real_manifests.py" "$data" "$out/manifests"
 
-# pretrain NAME SPLIT SEED OPTIONS...: one run of the recipe demo in half its steps (the sets are small); a finished one
+# pretrain NAME SPLIT SEED OPTIONS...: one run of the recipe demo cut to 300 steps (the sets are small); a finished one
 # is left alone
 pretrain() {
   local name=$1 split=$2 seed=$3 run="$out/$1/$2-seed$3"
