@@ -44,7 +44,7 @@ from mvitac.model import Model, safetensors_digest
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.recipes import recipe
-from mvitac.record import digest, digest_file
+from mvitac.record import digest, digest_file, write_atomic
 from mvitac.registry import to_json
 from mvitac.train import train
 
@@ -499,6 +499,18 @@ FULL: list[tuple[str, str, str, tuple[str, ...]]] = [
         ("cache", "r/probe.json"),
     ),
 ]
+
+
+def test_numpy_on_a_full_disk(tmp_path: Path) -> None:
+    """Of a large array numpy says how much was written, but neither why not more nor where."""
+
+    def write(file: Any) -> None:
+        file.write(b"half")
+        raise OSError("1000 requested and 4 written")
+
+    with pytest.raises(OSError, match=r"No space left on device.*features\.npy"):
+        write_atomic(tmp_path / "features.npy", write)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("name", "command", "left"), cases(FULL))

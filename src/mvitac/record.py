@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import importlib.metadata
 import json
@@ -40,6 +41,8 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
             for parent in made:  # deepest first; only empty ones go
                 parent.rmdir()
         if isinstance(error, OSError) and error.filename in (None, str(neighbour)):
+            if error.errno is None:  # numpy's own "1000 requested and 0 written", of a large array on a full disk
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
             error.filename = str(path)  # the system names no file when a write fails
         raise
 
