@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from mvitac.sim import gel, grasps, objects, physics
+from mvitac.sim import gel, grasps, objects, physics, skin
 
 SIZE = 40
 
@@ -142,7 +142,7 @@ def test_forces_balance():
 
 def test_a_harder_grip_prints_a_wider_patch():
     bench = physics.Bench(thing("can"))
-    smooth = dataclasses.replace(objects.draw_patch(np.random.default_rng(0)), amplitude_mm=0.0)
+    smooth = dataclasses.replace(skin.draw_patch(np.random.default_rng(0)), amplitude_mm=0.0)
     patch = []
     for force in (2.0, 5.0, 11.0):
         for moment in bench.moments(plan(force_n=force)):
@@ -158,7 +158,7 @@ def test_outcomes_are_mixed_and_the_solver_is_stable():
         bench = physics.Bench(objects.make_thing(0, index))
         for i in range(3):
             rng = np.random.default_rng([99, index, i])
-            patch = objects.draw_patch(rng)
+            patch = skin.draw_patch(rng)
             results.append(list(bench.moments(grasps.draw_plan(bench.thing, patch, rng)))[-1])
     assert 0.4 < np.mean([r.success for r in results]) < 0.75
     assert np.mean([r.unstable for r in results]) < 0.02
@@ -169,7 +169,7 @@ def test_peaks_and_pits_differ_in_the_sign_of_their_skewness_and_nothing_else():
     rng = np.random.default_rng(1)
     points = np.stack([np.zeros(4000), *rng.uniform(-40, 40, (2, 4000))], 1)
     for draw in range(12):
-        patch = dataclasses.replace(objects.draw_patch(np.random.default_rng(draw)), peaks=True)
+        patch = dataclasses.replace(skin.draw_patch(np.random.default_rng(draw)), peaks=True)
         peaks, pits = patch.relief_mm(points), dataclasses.replace(patch, peaks=False).relief_mm(points)
         assert np.array_equal(peaks, -pits)
         assert np.mean((peaks - peaks.mean()) ** 3) > 0.2 * peaks.std() ** 3
@@ -179,7 +179,7 @@ def test_the_camera_does_not_see_what_the_fingers_slide_on():
     """Before the fingers close, the picture is the same whether the patch grips or slides."""
     bench, seen = physics.Bench(thing("rod")), {}
     for peaks in (True, False):
-        patch = dataclasses.replace(objects.draw_patch(np.random.default_rng(0)), peaks=peaks)
+        patch = dataclasses.replace(skin.draw_patch(np.random.default_rng(0)), peaks=peaks)
         key = {"size": SIZE, "held_out_sensor": False, "phases": grasps.PHASES}
         seen[peaks] = grasps._record(bench, patch, plan(friction=0.85 if peaks else 0.3), (0, 2, 0), **key)
     assert np.array_equal(seen[True][0]["vision"], seen[False][0]["vision"])
@@ -193,7 +193,7 @@ def test_how_hard_the_hand_presses_says_nothing_of_the_outcome():
         some = objects.make_thing(0, index)
         for i in range(10):
             rng = np.random.default_rng([98, index, i])
-            patch = objects.draw_patch(rng)
+            patch = skin.draw_patch(rng)
             share[patch.peaks].append(grasps.draw_plan(some, patch, rng).force_n / (9.81 * some.mass))
     assert np.mean(share[True]) == pytest.approx(np.mean(share[False]), rel=0.05)
     assert np.std(share[True]) < 0.15

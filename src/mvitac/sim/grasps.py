@@ -8,7 +8,7 @@ after the lift. It is a simulation: numbers from it are never to be set beside t
 outcome and 'before' shows no contact, so a probe reads 'during'. Split by object, never by grasp.
 
 The outcome is physics, and what decides it is half seen, half felt: how far from the centre of mass the fingers grip
-(camera), and whether the patch of skin under them grips or slides (gels: `mvitac.sim.objects.Patch`). How big and bright
+(camera), and whether the patch of skin under them grips or slides (gels: `mvitac.sim.skin.Patch`). How big and bright
 the imprint is says nothing: the hand knows the weight and presses as hard as a middling friction would need. Shape, mass,
 sensor copy, lamp, colours, table, wall, clutter and viewpoint change and mean nothing by themselves.
 
@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from mvitac.sim import camera, gel, objects, physics
+from mvitac.sim import camera, gel, objects, physics, skin
 from mvitac.sim.objects import object_name
 from mvitac.sim.physics import PHASES
 
@@ -62,7 +62,7 @@ BEHIND_M = 3.0
 _PLAN, _VIEW, _TOUCH = 0x67A50, 0x67A51, 0x67A52
 
 
-def draw_plan(thing: objects.Thing, patch: objects.Patch, rng: np.random.Generator) -> physics.Plan:
+def draw_plan(thing: objects.Thing, patch: skin.Patch, rng: np.random.Generator) -> physics.Plan:
     """Draw where, how hard and how high one grip of ``thing`` on ``patch`` is."""
     low, high = thing.bounds
     middle, half = (low + high) / 2, (high - low) / 2
@@ -110,7 +110,7 @@ def grasp(
         raise ValueError(f"size must be in 16..1024 pixels, got {size}")
     bench = _bench(seed, obj)
     rng = np.random.default_rng([_PLAN, seed, obj, index])
-    patch = objects.draw_patch(rng)
+    patch = skin.draw_patch(rng)
     return _record(
         bench,
         patch,
@@ -129,7 +129,7 @@ def _bench(seed: int, obj: int) -> physics.Bench:
 
 def _record(
     bench: physics.Bench,
-    patch: objects.Patch,
+    patch: skin.Patch,
     plan: physics.Plan,
     key: tuple[int, int, int],
     *,
@@ -200,7 +200,7 @@ def _sensor(draw: float, held_out: bool) -> gel.Sensor:
 
 
 def _imprint(
-    bench: physics.Bench, patch: objects.Patch, data: mujoco.MjData, side: int, normal_n: float, size: int
+    bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, normal_n: float, size: int
 ) -> np.ndarray:
     """Return the imprint [grid, grid] in mm of the thing in one gel; row 0 is up, seen from behind the gel."""
     grid = max(GRID, size)

@@ -1,9 +1,6 @@
-"""Things to grasp: shapes, finishes and masses, and the MJCF of the scene around one of them.
+"""Things to grasp: shapes and masses, and the MJCF of the scene around one of them.
 
-A thing is a few primitive geoms with a *finish* that the camera sees, and a skin that is a patchwork: every grip meets
-another *patch*, whose relief only the gels can feel. Peaks dig into the gel and grip, pits leave a plateau that slides
-(a skewness of opposite sign at one spectrum and one range of depth, so neither contrast nor the size of the imprint tells
-them apart). Heavy parts are drawn as bare metal.
+A thing is a few primitive geoms of one mass, with a finish that the camera sees (`skin.py`). Heavy parts are bare metal.
 
 Frames: the gripper closes along x, a thing's long side lies along y, z is up and the table is z = 0.
 Shapes: N points. Units: metres, kilograms and newtons, except names that end in ``_mm``.
@@ -14,6 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
+from mvitac.sim.skin import Finish, draw_finish
 
 OBJECT_TAG = 0x0B1EC7
 """First word of the seed sequence of object properties; grasps use other tags, because trailing zeros do not count."""
@@ -37,14 +36,7 @@ OPEN_M = 0.047
 """Distance of an open pad's apex from the hand's axis."""
 
 MASS_KG = 0.25, 0.7
-
-PATTERNS = ("ribs", "knurl", "grain", "bumps")
-
-PEAKS = 0.76
-"""Part of the patches whose relief is peaks."""
-
-GRIPS, SLIDES = 0.85, 0.3
-"""Sliding friction against the gel of a relief of peaks and of pits."""
+"""Least and most that a thing weighs."""
 
 CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045"), ("capsule", ".015 .05"))
 """MuJoCo types and sizes of what lies about."""
@@ -100,62 +92,6 @@ class Part:
             x, y, z = np.resize(self.size, 3)
             across, along = x / z**2, x / y**2
         return 1 / np.sqrt((dome + across) * (dome + along))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pattern:
-    """A procedural texture in a thing's own coordinates: few high places, much low ground."""
-
-    kind: str
-    """One of ``PATTERNS``."""
-    wavelength_mm: float
-    waves: np.ndarray
-    """Unit directions [7, 3] of the pattern's waves."""
-    phases: np.ndarray
-    """Their phases [7] in radians."""
-
-    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return the pattern in [-1, 1] at points [N, 3] of the thing's frame."""
-        angle = points_mm @ self.waves.T * (2 * np.pi / self.wavelength_mm) + self.phases
-        if self.kind == "ribs":
-            wave = np.sin(angle[:, 0])
-        elif self.kind == "knurl":
-            wave = np.sin(angle[:, 0]) * np.sin(angle[:, 1])
-        elif self.kind == "bumps":
-            wave = np.cos(angle[:, :2]).mean(1)
-        else:
-            wave = np.tanh(np.sin(angle).sum(1) * 1.5 / np.sqrt(angle.shape[1]))
-        return 2 * ((wave + 1) / 2) ** 3 - 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class Finish:
-    """What a thing looks like to the camera; it says nothing about friction."""
-
-    printed: Pattern
-    color: np.ndarray
-    """Linear RGB [3] of the body."""
-    accent: np.ndarray
-    """Linear RGB [3] of the print."""
-    gloss: float
-    """Strength of the highlight, 0..1."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Patch:
-    """The piece of skin that one grip meets. Its relief is too fine for the camera; the gels feel it."""
-
-    pattern: Pattern
-    peaks: bool
-    """Whether the pattern stands out of the surface, which grips, or is sunk into it, which slides."""
-    amplitude_mm: float
-    """Half the height from the deepest to the highest points; the same for peaks and pits."""
-    friction: float
-    """Sliding friction coefficient against the gel."""
-
-    def relief_mm(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return the relief in mm at points [N, 3] of the thing's frame."""
-        return (self.amplitude_mm if self.peaks else -self.amplitude_mm) * self.pattern(points_mm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,48 +206,12 @@ def _parts(kind: str, rng: np.random.Generator) -> tuple[Part, ...]:
     raise AssertionError(kind)
 
 
-def _pattern(rng: np.random.Generator, low_mm: float, high_mm: float) -> Pattern:
-    kind = str(rng.choice(PATTERNS))
-    waves = rng.normal(size=(7, 3))
-    # The flanks that meet the pads face x: a wave along x would be invisible to the gel.
-    waves[:, 0] *= 0.3
-    waves /= np.linalg.norm(waves, axis=1, keepdims=True)
-    if kind in ("knurl", "bumps"):
-        waves[1] = np.cross(waves[0], [1.0, 0.0, 0.0])
-        waves[1] /= np.linalg.norm(waves[1])
-    return Pattern(
-        kind=kind, wavelength_mm=rng.uniform(low_mm, high_mm), waves=waves, phases=rng.uniform(0, 2 * np.pi, 7)
-    )
-
-
-def _finish(rng: np.random.Generator) -> Finish:
-    # Saturated, so that a thing stands out from the pale tables: the picture should tell where it is gripped.
-    color = rng.permutation([rng.uniform(0.02, 0.15), rng.uniform(0.02, 0.9), rng.uniform(0.6, 0.95)])
-    return Finish(
-        printed=_pattern(rng, 8, 20),
-        color=color,
-        accent=np.clip(color * rng.uniform(0.25, 1.6) + rng.normal(0, 0.12, 3), 0.02, 1),
-        gloss=float(np.clip(rng.uniform(-0.3, 1.05), 0, 1)),
-    )
-
-
-def draw_patch(rng: np.random.Generator) -> Patch:
-    """Draw the skin under the fingers of one grip."""
-    peaks = bool(rng.random() < PEAKS)
-    return Patch(
-        pattern=_pattern(rng, 2.2, 4.5),
-        peaks=peaks,
-        amplitude_mm=float(0.09 * 2.5 ** rng.uniform()),
-        friction=float((GRIPS if peaks else SLIDES) * np.exp(rng.normal(0, 0.06))),
-    )
-
-
 def make_thing(seed: int, index: int) -> Thing:
     """Draw object ``index`` of data seed ``seed``."""
     rng = np.random.default_rng([OBJECT_TAG, seed, index])
     kind = KINDS[index % len(KINDS)]
     parts = _parts(kind, rng)
-    finish = _finish(rng)
+    finish = draw_finish(rng)
     return Thing(
         name=object_name(seed, index),
         kind=kind,
