@@ -21,6 +21,7 @@ from mvitac import compare as module
 from mvitac.cli import main
 from mvitac.compare import cost, do, do_all, gather, lay_out, leaks, seconds_of
 from mvitac.datasets.packed import PackConfig
+from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.paper_tables import lines_of, write_tables
@@ -61,7 +62,7 @@ def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
 def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
     plan = replace(PLANS[name], recipe=recipe_name)
     for row in plan.rows:
-        run = plan.run(row, PackConfig(), 7)
+        run = plan.run(row, MaterialsConfig(), 7)
         assert run.seed == 7 and run.method.name == row.method
         for field, value in row.set.items():
             found: object = run
@@ -101,6 +102,7 @@ def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) ->
     assert "grayscale .2" not in work.left_out
     assert "plain touch flips" in work.left_out  # these are the recipe's
     assert "do not follow slopes" in work.left_out["touch flips with their colours"]  # stripes are no touches
+    assert "'pack' has no data.difference" in work.left_out["difference images of touch"]
     digests = [job.run.digest() for job in work.jobs]
     assert len(set(digests)) == len(digests)
 

@@ -9,10 +9,12 @@ from itertools import product
 import numpy as np
 import pytest
 
+from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.sim import gel
 from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, area_resize, background, press, pressure, relax, render
 from mvitac.sim.materials import CLASSES, draw_instance, touch
 from mvitac.sim.relief import KINDS, Relief, draw_tables, noise
+from mvitac.source import Sample
 
 LIST = "import sys; from mvitac.sim.materials import touch; import hashlib; p = touch(3, 7, 2, 1, size=32); "
 PRINT = "print(hashlib.sha256(p['vision'].tobytes() + p['touch'].tobytes()).hexdigest())"
@@ -67,6 +69,23 @@ def test_the_held_out_sensor_is_never_drawn_otherwise():
     pair = touch(0, 0, 0, 0, size=16, held_out_sensor=True)
     assert SENSORS[pair["sensor"]].held_out
     assert (pair["vision"] == touch(0, 0, 0, 0, size=16)["vision"]).all()
+
+
+def test_difference_images_are_of_the_same_sensor_before_contact():
+    plain, differing = (MaterialsConfig(num=60, size=32, difference=d).source() for d in (False, True))
+    assert "difference" not in plain.fingerprint(), "packs made before there was a choice stay known"
+    assert differing.fingerprint() != plain.fingerprint()
+    reached = []
+    for item in (0, 23, 47):
+        a, b = plain.read(item)[0], differing.read(item)[0]
+        assert isinstance(a, Sample) and isinstance(b, Sample) and a.columns == b.columns
+        assert a.vision is not None and a.touch is not None and b.touch is not None
+        assert np.array_equal(a.vision, b.vision)
+        drawn = touch(0, item % 20, 0, item // 20, size=32, background=True)
+        assert np.array_equal(drawn["touch"], a.touch), "drawing the background changes no other picture"
+        assert np.abs(2.0 * b.touch - 256 + drawn["background"] - a.touch).max() <= 1
+        reached.append([np.abs(a.touch - np.median(a.touch)).mean(), np.abs(b.touch - 128.0).mean()])
+    assert np.mean(reached, axis=0)[1] < np.mean(reached, axis=0)[0] / 2  # lamps, dots and dirt are gone
 
 
 def test_labels_are_balanced_and_not_the_category_again():

@@ -76,6 +76,9 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
     left_out: dict[str, str] = {}
     seen: dict[str, str] = {}
     for row in plan.rows:
+        if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
+            left_out[row.label] = f"dataset {plan.data.name!r} has no {', '.join(missing)}"
+            continue
         run = plan.run(row, plan.data, 0)
         try:
             own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)

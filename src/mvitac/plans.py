@@ -269,10 +269,13 @@ ABLATION = Plan(
         Row(label="no touch flips", set={"augment.touch.flip": 0.0}),
         Row(label="plain touch flips", set={"augment.gel_flip": "plain"}),
         Row(label="touch flips with their colours", set={"augment.gel_flip": "colour"}),
+        Row(label="difference images of touch", set={"data.difference": True}),
         Row(label="shuffled batches", set={"sampler": "shuffle"}),
         Row(label="one row per touch in a batch", set={"sampler": "one-per-touch"}),
         Row(label="positives of the same image", set={"positives": "same-image"}),
         Row(label="positives of the same touch", set={"positives": "same-touch"}),
+        Row(label="networks in fp32", set={"precision": "fp32"}),
+        Row(label="networks in bf16", set={"precision": "bf16"}),
     ),
 )
 """The paper's design, one choice at a time. A row that changes nothing under the chosen recipe is left out of a run."""

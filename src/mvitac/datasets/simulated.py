@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mvitac.datasets.base import KEEPING, DatasetConfig
+from mvitac.datasets.places import difference
 from mvitac.sim import grasps, materials
 from mvitac.source import Sample, Source
 from mvitac.spec import DataSpec, Task
@@ -51,6 +52,8 @@ class MaterialsConfig(SimulatedConfig):
 
     touches: int = 5
     """Touches per instance, each at another place, force, sensor and lamp."""
+    difference: bool = False
+    """Store touch minus the same sensor before contact, halved, plus one half (no contact is mid-gray)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,7 +89,8 @@ class Materials(Source):
         return ["{:02d}-{:04d}-{:02d}".format(*self._address(i)) for i in range(self.config.num)]
 
     def fingerprint(self) -> dict[str, Any]:
-        return self.config._fingerprint(materials.VERSION)
+        known = self.config._fingerprint(materials.VERSION)
+        return known if self.config.difference else {k: v for k, v in known.items() if k != "difference"}  # as ever
 
     def _address(self, item: int) -> tuple[int, int, int]:
         num_classes, touches = len(materials.CLASSES), self.config.touches
@@ -101,9 +105,12 @@ class Materials(Source):
             touch,
             size=self.config.size,
             held_out_sensor=self.config.held_out_sensor,
+            background=self.config.difference,
         )
         labels = {f"label_{task}": int(made.pop(task)) for task in ("category", "soft", "rough")}
         vision, pressed = made.pop("vision"), made.pop("touch")
+        if self.config.difference:
+            pressed = difference(pressed, made.pop("background"))
         group = f"{category:02d}-{instance:04d}"
         # Of every 20 instances of a class, 4 test and 3 choose: instances are independent draws, so any fixed rule will do.
         split = "test" if instance % 20 in (2, 7, 12, 17) else "val" if instance % 20 in (5, 10, 15) else "train"

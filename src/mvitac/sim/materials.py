@@ -12,6 +12,7 @@ above an untrained trunk, and below 97 %. Hence:
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,11 +150,19 @@ def draw_instance(seed: int, category: int, instance: int) -> Instance:
 
 
 def touch(
-    seed: int, category: int, instance: int, touch: int, *, size: int, held_out_sensor: bool = False
+    seed: int,
+    category: int,
+    instance: int,
+    touch: int,
+    *,
+    size: int,
+    held_out_sensor: bool = False,
+    background: bool = False,
 ) -> dict[str, Any]:
     """Draw one pair: "vision" and "touch" uint8 [size, size, 3], "category", "soft", "rough" and the latents.
 
     `held_out_sensor` draws the tactile picture with a sensor that is never used otherwise; all else stays the same.
+    `background` also draws "background", the same copy of the sensor before the contact.
     """
     for name, value in (("seed", seed), ("instance", instance), ("touch", touch)):
         if value < 0:
@@ -167,10 +176,9 @@ def touch(
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
     vision = _look(thing, eye, angle + eye.normal(0, 0.1), place, size)
-    tactile, pressed = _feel(thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor)
+    pressed = _feel(thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor, background)
     return {
         "vision": vision,
-        "touch": tactile,
         "category": category,
         "soft": int(thing.soft),
         "rough": int(thing.rough),
@@ -289,9 +297,15 @@ def _table(x: F, y: F, rng: np.random.Generator, width: float, pixel: float) -> 
 
 
 def _feel(
-    thing: Instance, rng: np.random.Generator, angle: float, place: NDArray[np.float64], size: int, held_out: bool
-) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-    """Press the thing into a gel: uint8 [size, size, 3] and what describes the press."""
+    thing: Instance,
+    rng: np.random.Generator,
+    angle: float,
+    place: NDArray[np.float64],
+    size: int,
+    held_out: bool,
+    background: bool,
+) -> dict[str, Any]:
+    """Press the thing into a gel: "touch" uint8 [size, size, 3], if asked "background" alike, what describes the press."""
     choice = [s for s in SENSORS.values() if s.held_out == held_out]
     sensor = choice[int(rng.random() * len(choice))]
     force = float(np.exp(rng.uniform(*np.log((2.0, 12.0)))))
@@ -317,14 +331,9 @@ def _feel(
     bulge = np.float32(yielding * rng.uniform(0.6, 1.2) / (2 * dome))
     relief = relief + tilt[0] * x + tilt[1] * y - bulge * (x * x + y * y)
     imprint = press(relief, force_n=force, stiffness=thing.stiffness, pixel_mm=pixel, dome_radius_mm=dome)
-    picture = render(
-        imprint,
-        sensor,
-        rng,
-        pixel_mm=pixel,
-        shear_mm=(float(shear[0]), float(shear[1])),
-        size=size,
-        unit=int(rng.integers(2**31)),
-        gain=gain,
-    )
-    return picture, {"sensor": sensor.name, "force_n": force}
+    unit = int(rng.integers(2**31))
+    draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
+    made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
+    if background:  # drawn last, so that the other pictures do not change
+        made["background"] = draw(np.zeros_like(imprint))
+    return {**made, "sensor": sensor.name, "force_n": force}
