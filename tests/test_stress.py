@@ -23,7 +23,7 @@ from mvitac.probe import parts, probe_features
 from mvitac.recipes import recipe
 from mvitac.run import Optim
 from mvitac.session import Session, probe_runs
-from mvitac.stress import MISSING, NOISE, STRESSES, stress
+from mvitac.stress import LEAK, MISSING, NOISE, STRESSES, stress
 from mvitac.train import train
 
 
@@ -45,9 +45,12 @@ def records(trained: Path, pack: Pack) -> dict[tuple[str, str, str], dict]:
 
 def test_every_stress_of_every_modality(records: dict) -> None:
     tasks = ("pattern", "bright")
-    anywhere = {(t, m, k) for t in tasks for m in ("touch", "vision", "both") for k in STRESSES[:3]}
+    anywhere = {(t, m, k) for t in tasks for m in ("touch", "vision", "both") for k in (*STRESSES[:3], *LEAK)}
     assert set(records) == anywhere | {(t, "both", k) for t in tasks for k in MISSING.values()}
-    assert len({tuple(r["group_sizes"]) for r in records.values()}) == 1  # all on the same test rows
+    sizes = {
+        leak: {tuple(r["group_sizes"]) for r in records.values() if (r["probe"] in LEAK) == leak} for leak in (0, 1)
+    }
+    assert len(sizes[0]) == len(sizes[1]) == 1  # all on the same test rows, or all on the same half of them
 
 
 def test_a_missing_modality_leaves_what_the_other_says(trained: Path, pack: Pack, records: dict) -> None:
@@ -75,6 +78,21 @@ def test_few_labels_take_their_share_and_one_of_each_class(pack: Pack) -> None:
     assert not np.array_equal(
         module._few(rows, labels, 0.1, seed=4)[1].train, module._few(rows, labels, 0.1, 3)[1].train
     )
+
+
+def test_a_leak_gives_half_of_each_test_group_away_and_nothing_else(pack: Pack) -> None:
+    rows, groups = parts(pack, pack.spec.tasks[0]), pack.column("group")
+    everything = np.concatenate([rows.train, rows.val, rows.test])
+    (keep, honest), (keep_leaking, leaking) = (module._halved(rows, groups, leaks, seed=1) for leaks in (False, True))
+    assert np.array_equal(everything[keep], np.concatenate([honest.train, honest.val, honest.test]))
+    assert np.array_equal(everything[keep_leaking], np.concatenate([leaking.train, leaking.val, leaking.test]))
+    assert np.array_equal(honest.test, leaking.test) and np.array_equal(honest.train, rows.train)
+    assert not set(groups[honest.train]) & set(groups[honest.test])
+    given = set(leaking.train) - set(rows.train)
+    assert given == set(rows.test) - set(leaking.test) and len(leaking.train) == len(rows.train)
+    assert {str(name) for name in groups[sorted(given)]} == {str(name) for name in groups[leaking.test]}
+    lonely = np.array([f"{i}" for i in range(len(groups))])
+    assert not len(module._halved(rows, lonely, True, seed=1)[1].test)  # no group can leak: nothing to score
 
 
 def test_noise_is_that_strong_the_same_for_all_and_on_test_images_only(
@@ -115,7 +133,8 @@ def test_touch_only_models_miss_nothing(pack: Pack) -> None:
     torch.manual_seed(0)
     model = Model(run.method.build(pack.spec, run.encoder), run, pack.spec, pack.size)
     found = stress(model, pack, pack.spec.tasks[:1], ["touch", "vision", "both"])
-    assert {r["modality"] for r in found} == {"touch"} and {r["probe"] for r in found} == set(STRESSES[:3])
+    assert {r["modality"] for r in found} == {"touch"}
+    assert {r["probe"] for r in found} == {*STRESSES[:3], *LEAK}
 
 
 def test_in_a_comparison_and_on_the_command_line(

@@ -66,7 +66,7 @@ class Plan:
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
     """Modalities to score; none given = all."""
     stress: bool = False
-    """Also score few labels, noisy test images and a modality missing at test time (``mvitac.stress``)."""
+    """Also score few labels, noisy test images, a modality missing at test time, a leaking split (``mvitac.stress``)."""
     printed_on: str = ""
     """Name of the dataset that the paper's numbers are about."""
     printed_majority: dict[str, float] = field(default_factory=dict)

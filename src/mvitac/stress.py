@@ -1,7 +1,8 @@
-"""What features are worth when things are worse: few labels, noisy images, one modality missing at test time.
+"""What features are worth when things are worse: few labels, noisy images, one modality missing at test time; or made to
+look better, by a split that leaks.
 
-All by the linear probe, as further records under their own probe names (``STRESSES``). What a probe learns from is always
-clean; only the amount of labels or the test images change. Compare within one name only.
+All by the linear probe, as further records under their own probe names (``STRESSES``). Compare within one name only, but for
+the two of ``LEAK``: their difference is what a split by frames adds to one by groups.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ NOISE_LEVELS = 20.0
 """Standard deviation of the noise on each 8-bit channel of test images."""
 MISSING = {"vision": "vision missing", "touch": "touch missing"}
 """modality -> name; a probe on both modalities meets test rows whose features of this one are train's mean."""
-STRESSES = (*SHARES, NOISE, *MISSING.values())
+LEAK = {"unseen groups": False, "groups seen in training": True}
+"""name -> whether half of every test group's rows are learned from, in place of as many rows of train; scored is the other
+half both times, so that the same rows show what a split by frames or touches is worth in points."""
+STRESSES = (*SHARES, NOISE, *MISSING.values(), *LEAK)
 
 
 def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]) -> list[dict[str, Any]]:
@@ -54,6 +58,10 @@ def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence
         for kind, share in SHARES.items():
             keep, few = _few(rows, pack.labels(task.name), share, seed)
             score(kind, x[keep], few)
+        for kind, leaks in LEAK.items():
+            keep, halved = _halved(rows, pack.column("group"), leaks, seed)
+            if len(halved.test):
+                score(kind, x[keep], halved)
         test = np.concatenate([np.stack([noisy[m][int(row)] for row in rows.test]) for m in names], axis=1)
         score(NOISE, np.concatenate([x[: len(learned)], test]))
         for lost, kind in MISSING.items() if modality == "both" else ():
@@ -78,6 +86,25 @@ def _few(rows: Parts, labels: np.ndarray, share: float, seed: int) -> tuple[np.n
     num_train, num_val = len(rows.train), len(rows.val)
     test = num_train + num_val + np.arange(len(rows.test))
     return np.concatenate([train, num_train + val, test]), Parts(rows.train[train], rows.val[val], rows.test)
+
+
+def _halved(rows: Parts, groups: np.ndarray, leaks: bool, seed: int) -> tuple[np.ndarray, Parts]:
+    """Places to keep in [train, val, test], and the parts that are left: half the rows of each test group are scored; the
+    other half is learned from if it ``leaks``, in place of as many rows of train. A group of one row takes no part."""
+    rng = np.random.default_rng([seed, 2])
+    given, scored = [], []
+    for name in np.unique(groups[rows.test]):
+        mine = rng.permutation(np.flatnonzero(groups[rows.test] == name))
+        half = len(mine) // 2
+        given += mine[:half].tolist()
+        scored += mine[half:].tolist() if half else []
+    train = np.arange(len(rows.train))
+    val, test = len(train) + np.arange(len(rows.val)), len(train) + len(rows.val)
+    if leaks:
+        train = np.concatenate([rng.permutation(train)[len(given) :], test + np.array(given, np.int64)])
+    keep = np.concatenate([train, val, test + np.array(scored, np.int64)])
+    everything = np.concatenate([rows.train, rows.val, rows.test])
+    return keep, Parts(everything[train], rows.val, rows.test[scored])
 
 
 def _noisy_features(model: Model, pack: Pack, modality: str, rows: np.ndarray, seed: int) -> np.ndarray:

@@ -47,7 +47,7 @@ def compare(argv: list[str]) -> None:
         imagenet: Path | None = None
         """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
         stress: bool = plan.stress
-        """Also score 1 % and 10 % of the labels, noisy test images, and a modality missing at test time."""
+        """Also score 1 % and 10 % of the labels, noisy test images, a modality missing at test time, and a leaking split."""
         dry_run: bool = False
         """Print the plan, what is finished and what is left, and stop."""
         tables_only: bool = False

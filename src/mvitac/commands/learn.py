@@ -84,7 +84,8 @@ def probe(argv: list[str]) -> None:
         on: Path | None = None
         """Probe on this pack instead of the data the runs were trained on."""
         stress: bool = False
-        """Also learn from 1 % and 10 % of the labels, and score noisy test images and a modality missing at test time."""
+        """Also learn from 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and say
+        what a split that leaks groups would add."""
         json: Path | None = None
         """Also write everything that is printed, and more, to this file."""
 
