@@ -16,8 +16,9 @@ from test_train import smoke
 from toy import Toy
 
 from mvitac.diagnostics import spread
+from mvitac.distributed import World
 from mvitac.losses import queue_nce
-from mvitac.memory import Bank, Queue
+from mvitac.memory import Bank, Queue, shard_banks
 from mvitac.methods.byol import BYOLConfig, regression
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.cmc import CMC, CMCConfig, nce
@@ -75,6 +76,38 @@ def test_bank_moves_exactly_the_batchs_rows() -> None:
             assert torch.equal(bank.values[row], before[row])
 
 
+@pytest.mark.parametrize(("size", "held"), [(1, [7]), (2, [4, 3]), (3, [3, 2, 2]), (9, [1] * 7 + [0, 0])])
+def test_a_sharded_bank_finds_scores_and_moves_its_own_rows(size: int, held: list[int]) -> None:
+    """Any number of rows over any number of processes: each row on one of them, and only there told, moved and restored."""
+    whole, at, z = Bank(7, 3), torch.tensor([6, 2, 3]), F.normalize(torch.randn(3, 3), dim=1)
+    shards = [copy.deepcopy(whole) for _ in range(size)]
+    drawn = torch.randint(7, (3, 20))
+    dots, _ = whole.dots(z, drawn)
+    counted, state = torch.zeros(3, 20), copy.deepcopy(whole.state_dict())
+    whole.follow(at, z, 0.5)
+    moved = torch.full((7, 3), torch.nan)
+    for rank, shard in enumerate(shards):
+        shard_banks(shard, World(rank, size))
+        shard.values.zero_()
+        shard.load_state_dict(state)
+        assert shard.num_own == held[rank] and len(shard.values) == held[rank] + (size > 1)
+        own, mine = shard.dots(z, drawn)
+        torch.testing.assert_close(own[mine], dots[mine])
+        counted += mine
+        shard.follow(at, z, 0.5)
+        moved[rank::size] = shard.values[: held[rank]]
+    assert torch.equal(counted, torch.ones(3, 20)) and torch.equal(moved, whole.values)
+
+
+def test_a_bank_of_other_rows_is_refused_by_every_process() -> None:
+    state = Bank(8, 3).state_dict()
+    for rank in (0, 1):
+        shard = Bank(7, 3)
+        shard_banks(shard, World(rank, 2))
+        with pytest.raises(RuntimeError, match="size mismatch"):
+            shard.load_state_dict(state)
+
+
 # -- CMC --------------------------------------------------------------------------------------------------------------
 
 
@@ -91,7 +124,10 @@ def slow_nce(scores: list[list[float]], num_rows: int) -> float:
 
 def test_nce_is_the_owners() -> None:
     scores = torch.rand(6, 12) * 0.1
-    assert float(nce(scores, 50)) == pytest.approx(slow_nce(scores.tolist(), 50), rel=1e-5)
+    held = torch.rand(6, 12) < 0.5
+    whole, *parts = (float(nce(scores, 50, own)) for own in (held | True, held, ~held))
+    assert whole == pytest.approx(slow_nce(scores.tolist(), 50), rel=1e-5)
+    assert sum(parts) == pytest.approx(whole, rel=1e-5)
 
 
 @pytest.mark.parametrize("softmax", [False, True])

@@ -7,25 +7,36 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
 from test_methods import small
 from test_step import assert_close, gradients, views
 from test_step import build as build_from
+from test_train import power_cut
+from torch import Tensor
 
+from mvitac import checkpoint
+from mvitac.batches import batches, training_rows
+from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.packed import PackConfig
 from mvitac.distributed import World
 from mvitac.methods.base import Method
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.pack import Pack
-from mvitac.recipes import recipe
+from mvitac.recipes import recipe, with_method
 from mvitac.run import Optim, Run
 from mvitac.sharding import write_shards
-from mvitac.step import Step
+from mvitac.step import Part, Step
+from mvitac.train import train
 
 RUN = replace(
     recipe("smoke"), optim=Optim(lr=1e-3), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
@@ -34,12 +45,19 @@ HERE = Path(__file__).parent
 WORKER = str(HERE / "worker_distributed.py")
 
 
+METHODS = {"mvitac": RUN.method, "cmc": small("cmc"), "cmc softmax": replace(small("cmc"), softmax=True)}  # type: ignore[call-arg]
+
+
 def run_of(method: str) -> Run:
-    return RUN if method == "mvitac" else replace(RUN, method=small(method))
+    return replace(RUN, method=METHODS[method])
 
 
 def build(method: str = "mvitac") -> Method:
     return build_from(run_of(method))
+
+
+def loop_run(data: DatasetConfig, method: str) -> Run:
+    return replace(with_method(recipe("smoke", data), method), steps=4, checkpoint_every=2, log_every=1)
 
 
 def together(command: list[str], num: int = 2, fails: bool = False) -> None:
@@ -62,21 +80,71 @@ def together(command: list[str], num: int = 2, fails: bool = False) -> None:
         assert (process.returncode != 0) == fails, errors
 
 
-@pytest.mark.parametrize("method", ["mvitac", "cmc"])
-def test_two_processes_equal_one_on_the_joint_batch(tmp_path: Path, method: str) -> None:
+def three_steps(
+    start: Callable[[], tuple[Method, Step]], parts: list[Part], run: Run, to: Path, world: World | None = None
+) -> dict[str, Any]:
+    """What three steps on ``parts`` make, with a checkpoint ``to`` after the second."""
+    method, step = start()
+    result = {"losses": step(parts, lr=1e-3, seed=0, progress=0.5), "gradients": gradients(method)}
+    result["memory"] = {k: v.clone() for k, v in method.state_dict().items() if k.startswith(("banks.", "z_norm"))}
+    step(parts, lr=1e-3, seed=1, progress=0.5)
+    checkpoint.save(to, run, method, step.optimiser, 2, world)
+    result["last"] = step(parts, lr=1e-3, seed=2, progress=0.5)
+    result["own"] = {m: bank.values[: bank.num_own] for m, bank in getattr(method, "banks", {}).items()}
+    return {**result, "weights": method.state_dict()}
+
+
+def third_step(start: Callable[[], tuple[Method, Step]], parts: list[Part], run: Run, of: Path) -> dict[str, Tensor]:
+    """The weights after the last of these, begun from the checkpoint ``of``."""
+    method, step = start()
+    assert checkpoint.restore(of, run, method, step.optimiser, 3) == 2
+    step(parts, lr=1e-3, seed=2, progress=0.5)
+    return method.state_dict()
+
+
+def alone(name: str) -> tuple[Method, Step]:
+    method = build(name)
+    return method, Step(run_of(name), method, torch.device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of every method a folder: what one process makes (alone.pt) and what two make (rank0.pt, rank1.pt)."""
+    folder = tmp_path_factory.mktemp("pair")
+    for name in METHODS:
+        (folder / name).mkdir()
+        made = three_steps(partial(alone, name), [views], run_of(name), folder / name / "one.pt")
+        torch.save(made, folder / name / "alone.pt")
+    together([WORKER, "step", str(folder)])
+    return folder
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> None:
     """Synchronised BatchNorm in trunks and heads, gathered negatives, summed gradients: one process's to rounding. So are
-    CMC's banks, which every process holds whole and moves alike."""
-    together([WORKER, "step", str(tmp_path), method])
-    first, second = (torch.load(tmp_path / f"rank{r}.pt", weights_only=True) for r in (0, 1))
-    alone = build(method)
-    step = Step(run_of(method), alone, torch.device("cpu"))
-    losses = step([views], lr=1e-3, seed=0, progress=0.5)
-    assert_close(losses, first["losses"], 1e-5)
-    assert_close(gradients(alone), first["gradients"], 1e-3)
-    step([views], lr=1e-3, seed=0, progress=0.5)
-    assert_close(alone.state_dict(), first["weights"], 5e-3)  # Adam magnifies the smallest gradients
-    for name, value in first["weights"].items():
-        assert torch.equal(value, second["weights"][name]), name
+    CMC's banks, of which each process holds its rows and scores queries against them, and Z."""
+    one, first, second = (torch.load(pair / method / f"{name}.pt") for name in ("alone", "rank0", "rank1"))
+    assert_close(one["losses"], first["losses"], 1e-5)
+    assert_close(one["gradients"], first["gradients"], 1e-3)
+    assert one["memory"].keys() == first["memory"].keys() and bool(one["memory"]) == method.startswith("cmc")
+    for name, value in one["memory"].items():
+        torch.testing.assert_close(first["memory"][name], value, rtol=1e-4, atol=1e-5)
+    assert_close(one["last"], first["last"], 1e-3)
+    assert_close(one["weights"], first["weights"], 1e-2)  # Adam magnifies the smallest gradients
+    assert first["weights"].keys() - second["weights"].keys() == {f"banks.{m}.values" for m in first["own"]}
+    for name, value in second["weights"].items():
+        assert torch.equal(value, first["weights"][name]), name
+    for rank, own in enumerate((first["own"], second["own"])):
+        for name, rows in own.items():
+            assert len(rows) == (7, 6)[rank] and torch.equal(rows, first["weights"][f"banks.{name}.values"][rank::2])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_process_goes_on_where_two_stopped_and_two_where_one_did(pair: Path, method: str) -> None:
+    one, first = (torch.load(pair / method / f"{name}.pt") for name in ("alone", "rank0"))
+    assert_close(one["weights"], first["resumed"], 1e-2)
+    resumed = third_step(partial(alone, method), [views], run_of(method), pair / method / "two.pt")
+    assert_close(resumed, first["weights"], 1e-2)
 
 
 @pytest.mark.slow
@@ -86,10 +154,10 @@ def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tm
         write_shards(pack, str(tmp_path / "shards"), shard_mb=0.05, quiet=True)
     data = str(pack.path if kind == "pack" else tmp_path / "shards")
     straight, cut = tmp_path / "straight", tmp_path / "cut"
-    together([WORKER, "train", data, str(straight), "99"])
-    together([WORKER, "train", data, str(cut), "3"], fails=True)
+    together([WORKER, "train", data, str(straight), "99", "mvitac"])
+    together([WORKER, "train", data, str(cut), "3", "mvitac"], fails=True)
     assert not (cut / "model.safetensors").exists()
-    together([WORKER, "train", data, str(cut), "99"])
+    together([WORKER, "train", data, str(cut), "99", "mvitac"])
     a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     for path in (straight, cut):
@@ -98,6 +166,37 @@ def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tm
     first, second = (torch.load(tmp_path / f"straight-rows{r}.pt") for r in (0, 1))
     epoch = [[*chain(*rows)] for rows in (first[:3], second[:3])]  # 60 training rows: three batches of 16 per epoch
     assert len(set(epoch[0])) == len(set(epoch[1])) == 24 and not set(epoch[0]) & set(epoch[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [1, 2])
+def test_the_loop_keeps_whole_banks_when_the_number_of_processes_changes(
+    pack: Pack, tmp_path: Path, first: int
+) -> None:
+    """Cut after step 3 of 4, resumed from step 2 by another number: in the end the rows seen by either have moved, to unit
+    length, and the others are where they were at the start."""
+    out, run = tmp_path / "run", loop_run(PackConfig(path=pack.path), "cmc")
+    if first == 1:
+        with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+            train(run, out, quiet=True)
+        together([WORKER, "train", str(pack.path), str(out), "99", "cmc"])
+    else:
+        together([WORKER, "train", str(pack.path), str(out), "3", "cmc"], fails=True)
+        assert torch.load(out / "checkpoint.pt")["step"] == 2
+        train(run, out, resume=True, quiet=True)
+    rows = training_rows(run, pack)
+    seen = np.isin(rows, np.concatenate(list(batches(run, pack, rows, 0, 4))))
+    assert 0 < seen.sum() < len(rows)
+    torch.manual_seed(run.seed)
+    start = run.method.build(pack.spec, run.encoder)
+    start.prepare(torch.from_numpy(rows))
+    state = torch.load(out / "checkpoint.pt")
+    assert state["step"] == 4 and (state["method"]["z_norm"] > 0).all()
+    for name, before in start.state_dict().items():
+        if name.startswith("banks."):
+            bank = state["method"][name]
+            assert torch.equal(bank[~seen], before[~seen]) and not torch.isclose(bank[seen], before[seen]).all(1).any()
+            torch.testing.assert_close(bank[seen].norm(dim=1), torch.ones(int(seen.sum())))
 
 
 def test_a_batch_that_does_not_divide_is_named(pack: Pack, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ CPU = torch.device("cpu")
 def build(run: Run = RUN, norm: bool = True) -> Method:
     torch.manual_seed(0)
     method = run.method.build(Toy().spec(), run.encoder)
-    method.prepare(torch.arange(12))
+    method.prepare(torch.arange(13))  # two processes hold 7 and 6
     for layer in method.modules():
         if isinstance(layer, nn.BatchNorm2d):
             nn.init.ones_(layer.weight)  # timm starts each block's last BatchNorm at zero, which would hide the block

@@ -1,5 +1,6 @@
 """checkpoint.pt, from which a killed run continues: weights, optimiser and step, and whose run they are.
 
+One file, whatever the number of processes: sharded memory comes together in it, and a run may go on with another number.
 No generator state: everything random is a function of (seed, step). Never unpickled.
 """
 
@@ -10,14 +11,22 @@ from pathlib import Path
 
 import torch
 
+from mvitac.distributed import World
 from mvitac.methods.base import Method
 from mvitac.record import brief, write_atomic
 from mvitac.run import Run
 
 
-def save(path: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, step: int) -> None:
-    """Write ``method`` and ``optimiser`` as they are after ``step`` steps; a reader finds the old file or the new one."""
+def save(
+    path: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, step: int, world: World | None = None
+) -> None:
+    """Write ``method`` and ``optimiser`` as they are after ``step`` steps; a reader finds the old file or the new one.
+
+    All processes of ``world`` call it, one writes.
+    """
     state = {"method": method.state_dict(), "optimiser": optimiser.state_dict(), "step": step}
+    if world and not world.writes:
+        return
     buffer = io.BytesIO()  # written in one go: torch.save itself hides a full disk behind its own error
     torch.save({**state, "run": run.digest()}, buffer)
     write_atomic(path, lambda file: file.write(buffer.getbuffer()))

@@ -3,6 +3,10 @@
 Without torchrun there is a world of one and everything here does nothing. Process r embeds its own rows; the embeddings
 of all are gathered, each process takes the whole loss and so holds the full gradient of its own embeddings; parameter
 gradients are then summed. That is the gradient of one process on the joint batch (tests/test_distributed.py).
+
+Of memory that is sharded, process r holds rows r, r + size, ... (`shard`). What it makes of these with embeddings that all
+have goes through `spread`, what comes of it through `sum`: value and gradient are then complete on every process (the f
+and g of Shoeybi et al., arXiv:1909.08053).
 """
 
 from __future__ import annotations
@@ -39,6 +43,34 @@ class World:
     def own(self, everyones: Tensor, num: int) -> Tensor:
         """This process's ``num`` rows of what ``gather`` made."""
         return everyones[self.rank * num : (self.rank + 1) * num]
+
+    def sum(self, part: Tensor) -> Tensor:
+        """The sum of every process's ``part``; its gradient, the same on all, is that of each part."""
+        return part if self.size == 1 else _Sum.apply(part, True, False)  # type: ignore[return-value]
+
+    def spread(self, value: Tensor) -> Tensor:
+        """``value``, which all processes have, for each to make a part of a ``sum`` of: its gradients are summed."""
+        return value if self.size == 1 else _Sum.apply(value, False, True)  # type: ignore[return-value]
+
+    def shard(self, whole: Tensor) -> Tensor:
+        """The rows of ``whole`` [N, ...] that this process holds where memory is sharded: rank, rank + size, ..."""
+        return whole[self.rank :: self.size]
+
+    def unshard(self, own: Tensor, num: int) -> Tensor | None:
+        """All ``num`` rows of which ``own`` is this process's ``shard``: on rank 0 in main memory, None elsewhere."""
+        if self.size == 1:
+            return own
+        if self.rank:
+            dist.send(own.contiguous(), 0)
+            return None
+        whole = torch.empty(num, *own.shape[1:], dtype=own.dtype)
+        self.shard(whole).copy_(own)
+        for rank in range(1, self.size):
+            theirs = World(rank, self.size).shard(whole)
+            received = torch.empty_like(theirs, device=own.device, memory_format=torch.contiguous_format)
+            dist.recv(received, rank)
+            theirs.copy_(received)
+        return whole
 
     def sum_gradients(self, module: nn.Module) -> None:
         """Add up the gradients of all processes, in one message."""
@@ -133,20 +165,23 @@ class SyncedBatchNorm(nn.BatchNorm2d):
 
 
 class _Sum(torch.autograd.Function):
-    """All-reduce by sum, whose gradient is all-reduced too."""
+    """All-reduce by sum: of the value, of its gradient, or of both."""
 
     @staticmethod
-    def forward(ctx: Any, value: Tensor) -> Tensor:
-        total = value.clone()
-        dist.all_reduce(total)
-        return total
+    def forward(ctx: Any, value: Tensor, there: bool, back: bool) -> Tensor:
+        ctx.back = back
+        return _all_reduced(value) if there else value.view_as(value)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        total = gradients[0].clone()
-        dist.all_reduce(total)
-        return total
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        return _all_reduced(gradients[0]) if ctx.back else gradients[0], None, None
+
+
+def _all_reduced(value: Tensor) -> Tensor:
+    total = value.clone(memory_format=torch.contiguous_format)
+    dist.all_reduce(total)
+    return total
 
 
 def _sum_over_processes(value: Tensor) -> Tensor:
-    return _Sum.apply(value)  # type: ignore[return-value]
+    return _Sum.apply(value, True, True)  # type: ignore[return-value]

@@ -5,10 +5,14 @@ Both are read in ``forward`` and written in ``after_step`` only. Shapes: D dimen
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+
+from mvitac.distributed import World
 
 
 class Queue(nn.Module):
@@ -35,17 +39,74 @@ class Queue(nn.Module):
 
 
 class Bank(nn.Module):
-    """One L2-normalised embedding per training row, which moves towards each new one of that row."""
+    """One L2-normalised embedding per training row, which moves towards each new one of that row.
+
+    It lies whole until ``shard_banks`` deals its rows out to many processes. ``state_dict`` is then to be asked for by all
+    at once: rank 0 gets the whole bank, the others none of it. ``load_state_dict`` wants the whole one everywhere.
+    """
 
     values: Tensor
-    """[N, D]."""
+    """[N, D]. Sharded: this process's rows and a spare one, at which all others are looked up and written: so shapes depend
+    on no draw, and nothing waits for a GPU."""
 
     def __init__(self, num_rows: int, width: int) -> None:
         super().__init__()
+        self.num, self.world = num_rows, World()
         bound = (3 / width) ** 0.5  # uniform in +-sqrt(3 / D): unit length in expectation, as CMC's code starts it
         self.register_buffer("values", torch.empty(num_rows, width).uniform_(-bound, bound))
+
+    @property
+    def num_own(self) -> int:
+        """Rows of the bank that this process holds."""
+        return len(range(self.world.rank, self.num, self.world.size))
+
+    def find(self, at: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
+        """Where in ``values`` the bank's rows ``at`` are."""
+        rank, size = self.world.rank, self.world.size
+        return at if size == 1 else torch.where(at % size == rank, at // size, self.num_own)
+
+    def dots(
+        self, query: Float[Tensor, "B D"], at: Int[Tensor, "B K"]
+    ) -> tuple[Float[Tensor, "B K"], Bool[Tensor, "B K"]]:
+        """Each query's inner products with the bank's rows ``at``, the same on all processes, and which of them this process
+        holds; the rest of the products mean nothing. What is made of them goes through ``world.sum``."""
+        # All rows held at once, then the drawn ones: the same numbers as fetching B x K rows, in far less memory.
+        place = self.find(at)
+        return (self.world.spread(query) @ self.values.T).gather(1, place), place < self.num_own
 
     @torch.no_grad()
     def follow(self, at: Int[Tensor, " B"], z: Float[Tensor, "B D"], m: float) -> None:
         """values[at] <- normalised m values[at] + (1 - m) z."""
+        at = self.find(at)
         self.values[at] = F.normalize(m * self.values[at] + (1 - m) * z.float(), dim=1)
+
+    def _cut(self, whole: Float[Tensor, "N D"]) -> Tensor:
+        """What this process holds of ``whole``, as ``values``."""
+        return whole if self.world.size == 1 else torch.cat([self.world.shard(whole), whole[:1]])
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        own = destination.pop(f"{prefix}values")
+        whole = self.world.unshard(own[: self.num_own], self.num)
+        if whole is not None:
+            destination[f"{prefix}values"] = whole
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        whole = state_dict.get(f"{prefix}values")
+        if isinstance(whole, Tensor) and len(whole) == self.num:  # else torch says what is wrong with it
+            state_dict[f"{prefix}values"] = self._cut(whole)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def shard_banks(module: nn.Module, world: World) -> None:
+    """Keep this process's rows only of every bank in ``module``; the banks must be the same on all processes."""
+    for bank in module.modules():
+        if isinstance(bank, Bank):
+            bank.world = world
+            bank.values = bank._cut(bank.values)
+
+
+def replicated(module: nn.Module) -> list[Tensor]:
+    """The parameters and buffers of ``module`` that every process holds alike: all but the shards of banks."""
+    parts = [part for part in module.modules() if not isinstance(part, Bank)]
+    return [tensor for part in parts for tensor in (*part.parameters(False), *part.buffers(False))]

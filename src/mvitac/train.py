@@ -21,6 +21,7 @@ from mvitac.batches import feed_parts, gel_mirror, mix, training_rows
 from mvitac.device import describe, pick_device
 from mvitac.distributed import World, join, local_device, synchronise_norms
 from mvitac.log import Log, Sink
+from mvitac.memory import replicated, shard_banks
 from mvitac.methods.base import Method
 from mvitac.model import Model, load_run
 from mvitac.pack import Pack
@@ -77,6 +78,7 @@ def train(
     torch.manual_seed(run.seed)
     method = run.method.build(pack.spec, run.encoder)
     method.prepare(torch.from_numpy(rows))
+    shard_banks(method, world)
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _try(method, run, pack)
     synchronise_norms(method, world)
@@ -84,7 +86,7 @@ def train(
     num_steps, start = run.num_steps(len(rows)), 0
     if (out / "checkpoint.pt").exists():
         start = checkpoint.restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
-    world.same_everywhere([*method.parameters(), *method.buffers()])  # and no one writes before all have looked
+    world.same_everywhere(replicated(method))  # and no one writes before all have looked
     if not again and world.writes:
         record = {"run": to_json(run), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
         write_json(out / "run.json", {**record, "device": describe(device), **provenance()})
@@ -107,16 +109,13 @@ def train(
                 if log:
                     log.step(done, values, rate, run.batch_size)
             stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
-            if log is None:
-                if stopping and done < num_steps:
-                    raise Interrupted(f"stopped after step {done} of {num_steps}")
-                continue
-            log.advance(done)
-            if done == num_steps or (run.eval_every and done % run.eval_every == 0):
-                log.evaluation(done, evaluate(Model(method, run, pack.spec, pack.size), pack, run))
-                method.train()
+            if log:
+                log.advance(done)
+                if done == num_steps or (run.eval_every and done % run.eval_every == 0):
+                    log.evaluation(done, evaluate(Model(method, run, pack.spec, pack.size), pack, run))
+                    method.train()
             if done == num_steps or done % every == 0 or stopping:
-                checkpoint.save(out / "checkpoint.pt", run, method, step.optimiser, done)
+                checkpoint.save(out / "checkpoint.pt", run, method, step.optimiser, done, world)
             if stopping and done < num_steps:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
     if world.writes:

@@ -8,6 +8,7 @@ training row; a vision query is told its own row of the touch bank from K rows d
 
 The K rows are drawn evenly, with replacement, the query's own row not excluded, one draw for both directions. After the
 step, bank rows move: bank[i] <- normalised .5 bank[i] + .5 z_i. There is no momentum encoder and one view per image.
+On many processes each holds its share of the banks' rows and scores every query against the drawn ones among them.
 Sources: arXiv:1906.05849 (eq. 8 - 12); https://github.com/HobbitLong/CMC (NCE/);
 https://github.com/fredfyyang/Touch-and-Go (train_CMC_touch.py: K 16384, tau .07, bank momentum .5, 128-d).
 
@@ -21,10 +22,11 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvitac.batch import Views
+from mvitac.distributed import World
 from mvitac.encoders import EncoderConfig, build_towers
 from mvitac.memory import Bank
 from mvitac.methods.base import Contrastive, MethodConfig
@@ -61,13 +63,27 @@ class CMCConfig(MethodConfig):
         return CMC(self, spec, encoder)
 
 
-def nce(scores: Float[Tensor, "B K+1"], num_rows: int) -> Float[Tensor, ""]:
-    """NCE of normalised ``scores`` (column 0 is the positive's) against even noise over ``num_rows`` rows."""
+def nce(scores: Float[Tensor, "B K+1"], num_rows: int, held: Bool[Tensor, "B K+1"]) -> Float[Tensor, ""]:
+    """NCE of normalised ``scores`` (column 0 is the positive's) against even noise over ``num_rows`` rows: the part of it
+    that those ``held`` by this process make up."""
     noise = (scores.shape[1] - 1) / num_rows
     positive, negatives = scores[:, 0], scores[:, 1:]
     told = torch.log(positive / (positive + noise + EPS))
-    rejected = torch.log(noise / (negatives + noise + EPS)).sum(1)
-    return -(told + rejected).mean()
+    rejected = torch.log(noise / (negatives + noise + EPS))
+    told, rejected = torch.where(held[:, 0], told, 0.0), torch.where(held[:, 1:], rejected, 0.0)
+    return -(told + rejected.sum(1)).mean()
+
+
+def condensed(logits: Float[Tensor, "B K+1"], held: Bool[Tensor, "B K+1"], world: World) -> Float[Tensor, "B _"]:
+    """Logits with the same softmax at column 0, complete on every process: the positive's, then the log-sum-exp of the
+    negatives ``held`` by each process. On one process all logits as they are."""
+    if world.size == 1:
+        return logits
+    none = torch.finfo(logits.dtype).min  # and not -inf, whose gradient is no number where a process holds none
+    part = logits.new_zeros(len(logits), 1 + world.size)
+    part[:, 0] = torch.where(held[:, 0], logits[:, 0], 0.0)
+    part[:, 1 + world.rank] = torch.where(held[:, 1:], logits[:, 1:], none).logsumexp(1)
+    return world.sum(part)
 
 
 class CMC(Contrastive):
@@ -101,20 +117,22 @@ class CMC(Contrastive):
         drawn = torch.randint(len(self.rows), (len(at), self.config.num_negatives + 1), device=at.device)
         drawn[:, 0] = at
         with torch.autocast(at.device.type, enabled=False):
-            vt, z_vision = self._contrast(z["vision"], "touch", drawn, self.z_norm[0])
-            tv, z_touch = self._contrast(z["touch"], "vision", drawn, self.z_norm[1])
+            bank: dict[str, Bank] = dict(self.banks.items())  # type: ignore[arg-type]
+            vt, z_vision = self._contrast(z["vision"], bank["touch"], drawn, self.z_norm[0])
+            tv, z_touch = self._contrast(z["touch"], bank["vision"], drawn, self.z_norm[1])
         self.pending = (at, {m: z[m].detach() for m in self.towers}, torch.stack([z_vision, z_touch]))
         return {"loss": vt + tv, "vt": vt, "tv": tv}
 
-    def _contrast(self, query: Tensor, bank: str, drawn: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of ``query`` against the bank of modality ``bank``, and its Z."""
-        # All N scores at once, then the drawn ones: the same numbers as fetching B x K rows, in far less memory.
-        logits = (query @ self.banks[bank].values.T).gather(1, drawn) / self.config.temperature  # type: ignore[union-attr]
+    def _contrast(self, query: Tensor, bank: Bank, drawn: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss of ``query`` against ``bank``, and its Z."""
+        dots, held = bank.dots(query, drawn)
+        logits, world = dots / self.config.temperature, bank.world
         if self.config.softmax:
-            return F.cross_entropy(logits, torch.zeros_like(drawn[:, 0])), fixed
+            return F.cross_entropy(condensed(logits, held, world), torch.zeros_like(drawn[:, 0])), fixed
         scores = logits.exp()
-        norm = torch.where(fixed > 0, fixed, scores.detach().mean() * len(self.rows))
-        return nce(scores / norm, len(self.rows)), norm
+        mean = world.sum(torch.where(held, scores.detach(), 0.0).mean())
+        norm = torch.where(fixed > 0, fixed, mean * len(self.rows))
+        return world.sum(nce(scores / norm, len(self.rows), held)), norm
 
     def after_step(self, progress: float) -> None:
         assert self.pending is not None, "forward comes first"
