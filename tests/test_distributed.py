@@ -39,13 +39,17 @@ from mvitac.step import Part, Step
 from mvitac.train import train
 
 RUN = replace(
-    recipe("smoke"), optim=Optim(lr=1e-3), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
+    recipe("smoke"), optim=Optim(name="sgd"), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
 )
 HERE = Path(__file__).parent
 WORKER = str(HERE / "worker_distributed.py")
 
 
 METHODS = {"mvitac": RUN.method, "cmc": small("cmc"), "cmc softmax": replace(small("cmc"), softmax=True)}  # type: ignore[call-arg]
+
+
+CHAOS = 0.02
+"""Of the largest entry: weights 1e-7 apart are up to 4e-3 apart three steps later, where a ReLU turns over."""
 
 
 def run_of(method: str) -> Run:
@@ -85,11 +89,11 @@ def three_steps(
 ) -> dict[str, Any]:
     """What three steps on ``parts`` make, with a checkpoint ``to`` after the second."""
     method, step = start()
-    result = {"losses": step(parts, lr=1e-3, seed=0, progress=0.5), "gradients": gradients(method)}
+    result = {"losses": step(parts, lr=5e-3, seed=0, progress=0.5), "gradients": gradients(method)}
     result["memory"] = {k: v.clone() for k, v in method.state_dict().items() if k.startswith(("banks.", "z_norm"))}
-    step(parts, lr=1e-3, seed=1, progress=0.5)
+    step(parts, lr=5e-3, seed=1, progress=0.5)
     checkpoint.save(to, run, method, step.optimiser, 2, world)
-    result["last"] = step(parts, lr=1e-3, seed=2, progress=0.5)
+    result["last"] = step(parts, lr=5e-3, seed=2, progress=0.5)
     result["own"] = {m: bank.values[: bank.num_own] for m, bank in getattr(method, "banks", {}).items()}
     return {**result, "weights": method.state_dict()}
 
@@ -98,7 +102,7 @@ def third_step(start: Callable[[], tuple[Method, Step]], parts: list[Part], run:
     """The weights after the last of these, begun from the checkpoint ``of``."""
     method, step = start()
     assert checkpoint.restore(of, run, method, step.optimiser, 3) == 2
-    step(parts, lr=1e-3, seed=2, progress=0.5)
+    step(parts, lr=5e-3, seed=2, progress=0.5)
     return method.state_dict()
 
 
@@ -125,12 +129,13 @@ def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> 
     CMC's banks, of which each process holds its rows and scores queries against them, and Z."""
     one, first, second = (torch.load(pair / method / f"{name}.pt") for name in ("alone", "rank0", "rank1"))
     assert_close(one["losses"], first["losses"], 1e-5)
+    assert_close(first["losses"], second["losses"], 0)
     assert_close(one["gradients"], first["gradients"], 1e-3)
     assert one["memory"].keys() == first["memory"].keys() and bool(one["memory"]) == method.startswith("cmc")
     for name, value in one["memory"].items():
         torch.testing.assert_close(first["memory"][name], value, rtol=1e-4, atol=1e-5)
     assert_close(one["last"], first["last"], 1e-3)
-    assert_close(one["weights"], first["weights"], 1e-2)  # Adam magnifies the smallest gradients
+    assert_close(one["weights"], first["weights"], CHAOS)
     assert first["weights"].keys() - second["weights"].keys() == {f"banks.{m}.values" for m in first["own"]}
     for name, value in second["weights"].items():
         assert torch.equal(value, first["weights"][name]), name
@@ -142,9 +147,9 @@ def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> 
 @pytest.mark.parametrize("method", METHODS)
 def test_one_process_goes_on_where_two_stopped_and_two_where_one_did(pair: Path, method: str) -> None:
     one, first = (torch.load(pair / method / f"{name}.pt") for name in ("alone", "rank0"))
-    assert_close(one["weights"], first["resumed"], 1e-2)
+    assert_close(one["weights"], first["resumed"], CHAOS)
     resumed = third_step(partial(alone, method), [views], run_of(method), pair / method / "two.pt")
-    assert_close(resumed, first["weights"], 1e-2)
+    assert_close(resumed, first["weights"], CHAOS)
 
 
 @pytest.mark.slow

@@ -91,11 +91,11 @@ class Bank(nn.Module):
         if whole is not None:
             destination[f"{prefix}values"] = whole
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         whole = state_dict.get(f"{prefix}values")
         if isinstance(whole, Tensor) and len(whole) == self.num:  # else torch says what is wrong with it
             state_dict[f"{prefix}values"] = self._cut(whole)
-        super()._load_from_state_dict(state_dict, prefix, *rest)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
 def shard_banks(module: nn.Module, world: World) -> None:

@@ -117,9 +117,8 @@ class CMC(Contrastive):
         drawn = torch.randint(len(self.rows), (len(at), self.config.num_negatives + 1), device=at.device)
         drawn[:, 0] = at
         with torch.autocast(at.device.type, enabled=False):
-            bank: dict[str, Bank] = dict(self.banks.items())  # type: ignore[arg-type]
-            vt, z_vision = self._contrast(z["vision"], bank["touch"], drawn, self.z_norm[0])
-            tv, z_touch = self._contrast(z["touch"], bank["vision"], drawn, self.z_norm[1])
+            vt, z_vision = self._contrast(z["vision"], self.banks["touch"], drawn, self.z_norm[0])  # type: ignore[arg-type]
+            tv, z_touch = self._contrast(z["touch"], self.banks["vision"], drawn, self.z_norm[1])  # type: ignore[arg-type]
         self.pending = (at, {m: z[m].detach() for m in self.towers}, torch.stack([z_vision, z_touch]))
         return {"loss": vt + tv, "vt": vt, "tv": tv}
 
