@@ -82,7 +82,8 @@ def test_a_sharded_bank_finds_scores_and_moves_its_own_rows(size: int, held: lis
     whole, at, z = Bank(7, 3), torch.tensor([6, 2, 3]), F.normalize(torch.randn(3, 3), dim=1)
     shards = [copy.deepcopy(whole) for _ in range(size)]
     drawn = torch.randint(7, (3, 20))
-    dots, _ = whole.dots(z, drawn)
+    dots, all_held = whole.dots(z, whole.find_drawn(drawn))
+    assert all_held.all()
     counted, state = torch.zeros(3, 20), copy.deepcopy(whole.state_dict())
     whole.follow(at, z, 0.5)
     moved = torch.full((7, 3), torch.nan)
@@ -91,12 +92,24 @@ def test_a_sharded_bank_finds_scores_and_moves_its_own_rows(size: int, held: lis
         shard.values.zero_()
         shard.load_state_dict(state)
         assert shard.num_own == held[rank] and len(shard.values) == held[rank] + (size > 1)
-        own, mine = shard.dots(z, drawn)
+        own, mine = shard.dots(z, shard.find(drawn))
         torch.testing.assert_close(own[mine], dots[mine])
         counted += mine
         shard.follow(at, z, 0.5)
         moved[rank::size] = shard.values[: held[rank]]
     assert torch.equal(counted, torch.ones(3, 20)) and torch.equal(moved, whole.values)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_a_process_looks_at_little_more_than_the_drawn_rows_it_holds(size: int) -> None:
+    bank, drawn, found = Bank(53, 3), torch.randint(53, (4, 3000)), []
+    for rank in range(size):
+        shard = copy.deepcopy(bank)
+        shard_banks(shard, World(rank, size))
+        place = shard.find_drawn(drawn)
+        assert place.shape[1] <= 3000 / size * 1.7
+        found += [(q, int(p) * size + rank) for q in range(4) for p in place[q] if p < shard.num_own]
+    assert sorted(found) == sorted((q, int(row)) for q in range(4) for row in drawn[q])
 
 
 def test_a_bank_of_other_rows_is_refused_by_every_process() -> None:
@@ -125,7 +138,7 @@ def slow_nce(scores: list[list[float]], num_rows: int) -> float:
 def test_nce_is_the_owners() -> None:
     scores = torch.rand(6, 12) * 0.1
     held = torch.rand(6, 12) < 0.5
-    whole, *parts = (float(nce(scores, 50, own)) for own in (held | True, held, ~held))
+    whole, *parts = (float(nce(scores, 11 / 50, own)) for own in (held | True, held, ~held))
     assert whole == pytest.approx(slow_nce(scores.tolist(), 50), rel=1e-5)
     assert sum(parts) == pytest.approx(whole, rel=1e-5)
 

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from test_methods import small
 from test_step import assert_close, gradients, views
 from test_step import build as build_from
 from test_train import power_cut
@@ -30,6 +29,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.packed import PackConfig
 from mvitac.distributed import World
 from mvitac.methods.base import Method
+from mvitac.methods.cmc import CMCConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.pack import Pack
 from mvitac.recipes import recipe, with_method
@@ -43,11 +43,13 @@ RUN = replace(
 )
 HERE = Path(__file__).parent
 WORKER = str(HERE / "worker_distributed.py")
-
-
-METHODS = {"mvitac": RUN.method, "cmc": small("cmc"), "cmc softmax": replace(small("cmc"), softmax=True)}  # type: ignore[call-arg]
-
-
+METHODS = {
+    "mvitac": RUN.method,
+    "cmc": CMCConfig(out=12, num_negatives=1500),
+    "cmc softmax": CMCConfig(out=12, num_negatives=1500, softmax=True),
+    "cmc softmax, 2 negatives": CMCConfig(out=12, num_negatives=2, softmax=True),  # often a process holds neither
+}
+NUM_ROWS = 601  # of which two processes hold 301 and 300
 CHAOS = 0.02
 """Of the largest entry: weights 1e-7 apart are up to 4e-3 apart three steps later, where a ReLU turns over."""
 
@@ -57,7 +59,7 @@ def run_of(method: str) -> Run:
 
 
 def build(method: str = "mvitac") -> Method:
-    return build_from(run_of(method))
+    return build_from(run_of(method), num_rows=NUM_ROWS)
 
 
 def loop_run(data: DatasetConfig, method: str) -> Run:
@@ -141,7 +143,9 @@ def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> 
         assert torch.equal(value, first["weights"][name]), name
     for rank, own in enumerate((first["own"], second["own"])):
         for name, rows in own.items():
-            assert len(rows) == (7, 6)[rank] and torch.equal(rows, first["weights"][f"banks.{name}.values"][rank::2])
+            assert len(rows) == (301, 300)[rank] and torch.equal(
+                rows, first["weights"][f"banks.{name}.values"][rank::2]
+            )
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -5,6 +5,7 @@ Both are read in ``forward`` and written in ``after_step`` only. Shapes: D dimen
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -65,13 +66,26 @@ class Bank(nn.Module):
         rank, size = self.world.rank, self.world.size
         return at if size == 1 else torch.where(at % size == rank, at // size, self.num_own)
 
+    def find_drawn(self, at: Int[Tensor, "B K"]) -> Int[Tensor, "B k"]:
+        """``find`` of those of the rows ``at``, drawn evenly, that this process holds, and of the spare row in between.
+
+        On one process k = K. On more it is a little above K times the share of rows held: that a query has more of them, and
+        loses those beyond, has a probability below 1e-32 (Chernoff's bound).
+        """
+        place, mean = self.find(at), at.shape[1] * self.num_own / self.num
+        width = math.ceil(mean + 12 * mean**0.5 + 50)
+        if width >= at.shape[1]:
+            return place
+        held = place < self.num_own
+        column = torch.where(held, held.cumsum(1) - 1, width).clamp(max=width)
+        return place.new_full((len(place), width + 1), self.num_own).scatter_(1, column, place)[:, :width]
+
     def dots(
-        self, query: Float[Tensor, "B D"], at: Int[Tensor, "B K"]
+        self, query: Float[Tensor, "B D"], place: Int[Tensor, "B K"]
     ) -> tuple[Float[Tensor, "B K"], Bool[Tensor, "B K"]]:
-        """Each query's inner products with the bank's rows ``at``, the same on all processes, and which of them this process
-        holds; the rest of the products mean nothing. What is made of them goes through ``world.sum``."""
+        """Inner products of each query, the same on all processes, with the rows found at ``place``; False where that is the
+        spare one, whose products mean nothing. What is made of the others goes through ``world.sum``."""
         # All rows held at once, then the drawn ones: the same numbers as fetching B x K rows, in far less memory.
-        place = self.find(at)
         return (self.world.spread(query) @ self.values.T).gather(1, place), place < self.num_own
 
     @torch.no_grad()

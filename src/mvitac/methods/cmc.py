@@ -18,7 +18,7 @@ N rows of training data, B in a batch, K negatives, D = 128.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -63,10 +63,9 @@ class CMCConfig(MethodConfig):
         return CMC(self, spec, encoder)
 
 
-def nce(scores: Float[Tensor, "B K+1"], num_rows: int, held: Bool[Tensor, "B K+1"]) -> Float[Tensor, ""]:
-    """NCE of normalised ``scores`` (column 0 is the positive's) against even noise over ``num_rows`` rows: the part of it
-    that those ``held`` by this process make up."""
-    noise = (scores.shape[1] - 1) / num_rows
+def nce(scores: Float[Tensor, "B _"], noise: float, held: Bool[Tensor, "B _"]) -> Float[Tensor, ""]:
+    """NCE of normalised ``scores`` (column 0 is the positive's) against even ``noise`` (K / N): what those ``held`` by this
+    process add to it."""
     positive, negatives = scores[:, 0], scores[:, 1:]
     told = torch.log(positive / (positive + noise + EPS))
     rejected = torch.log(noise / (negatives + noise + EPS))
@@ -74,7 +73,7 @@ def nce(scores: Float[Tensor, "B K+1"], num_rows: int, held: Bool[Tensor, "B K+1
     return -(told + rejected.sum(1)).mean()
 
 
-def condensed(logits: Float[Tensor, "B K+1"], held: Bool[Tensor, "B K+1"], world: World) -> Float[Tensor, "B _"]:
+def condensed(logits: Float[Tensor, "B _"], held: Bool[Tensor, "B _"], world: World) -> Float[Tensor, "B _"]:
     """Logits with the same softmax at column 0, complete on every process: the positive's, then the log-sum-exp of the
     negatives ``held`` by each process. On one process all logits as they are."""
     if world.size == 1:
@@ -114,24 +113,25 @@ class CMC(Contrastive):
     def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
         assert len(self.rows), "prepare(rows) comes first"
         at = torch.searchsorted(self.rows, z["rows"])
-        drawn = torch.randint(len(self.rows), (len(at), self.config.num_negatives + 1), device=at.device)
-        drawn[:, 0] = at
+        drawn = torch.randint(len(self.rows), (len(at), self.config.num_negatives + 1), device=at.device)[:, 1:]
+        vision, touch = cast(Bank, self.banks["vision"]), cast(Bank, self.banks["touch"])
+        place = torch.cat([touch.find(at)[:, None], touch.find_drawn(drawn)], dim=1)  # in either bank
         with torch.autocast(at.device.type, enabled=False):
-            vt, z_vision = self._contrast(z["vision"], self.banks["touch"], drawn, self.z_norm[0])  # type: ignore[arg-type]
-            tv, z_touch = self._contrast(z["touch"], self.banks["vision"], drawn, self.z_norm[1])  # type: ignore[arg-type]
+            vt, z_vision = self._contrast(z["vision"], touch, place, self.z_norm[0])
+            tv, z_touch = self._contrast(z["touch"], vision, place, self.z_norm[1])
         self.pending = (at, {m: z[m].detach() for m in self.towers}, torch.stack([z_vision, z_touch]))
         return {"loss": vt + tv, "vt": vt, "tv": tv}
 
-    def _contrast(self, query: Tensor, bank: Bank, drawn: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of ``query`` against ``bank``, and its Z."""
-        dots, held = bank.dots(query, drawn)
-        logits, world = dots / self.config.temperature, bank.world
+    def _contrast(self, query: Tensor, bank: Bank, place: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss of ``query`` against the rows of ``bank`` at ``place``, the positive's first, and its Z."""
+        dots, held = bank.dots(query, place)
+        logits, world, num = dots / self.config.temperature, bank.world, self.config.num_negatives
         if self.config.softmax:
-            return F.cross_entropy(condensed(logits, held, world), torch.zeros_like(drawn[:, 0])), fixed
+            return F.cross_entropy(condensed(logits, held, world), torch.zeros_like(place[:, 0])), fixed
         scores = logits.exp()
-        mean = world.sum(torch.where(held, scores.detach(), 0.0).mean())
-        norm = torch.where(fixed > 0, fixed, mean * len(self.rows))
-        return world.sum(nce(scores / norm, len(self.rows), held)), norm
+        mean = torch.where(held, scores.detach(), 0.0).mean() * (place.shape[1] / (num + 1))
+        norm = torch.where(fixed > 0, fixed, world.sum(mean) * len(self.rows))
+        return world.sum(nce(scores / norm, num / len(self.rows), held)), norm
 
     def after_step(self, progress: float) -> None:
         assert self.pending is not None, "forward comes first"
