@@ -219,4 +219,5 @@ def test_a_world_of_one_does_nothing() -> None:
     z = torch.randn(4, 3)
     world = World()
     assert world.gather(z) is z and torch.equal(world.own(z, 4), z)
+    assert world.sum(z) is z and world.spread(z) is z and world.unshard(z, 4) is z and torch.equal(world.shard(z), z)
     assert world.writes and world.anyone(True) and not world.anyone(False)
