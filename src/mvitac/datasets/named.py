@@ -50,6 +50,10 @@ def read_backgrounds(
     They stand in ``columns`` beside the touch, or are the first of the rows of its ``sensor`` that meet ``no_contact``.
     """
     if not no_contact:
+        if not columns and "background" not in (*manifest.columns, *manifest.found):
+            raise ValueError(
+                f"{manifest.file} has no column 'background': difference images need background columns, or no_contact rows"
+            )
         columns = columns or ("background",)
         if len(columns) != len(touch):
             raise ValueError(
