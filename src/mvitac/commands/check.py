@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mvitac.options import parse, selectors
+from mvitac.options import parse, selectors, short
 
 _COLOURS = {"ok": "green", "look": "yellow", "broken": "bold red", "not checkable": "dim"}
 
@@ -59,7 +59,7 @@ def check(argv: list[str]) -> int:
         """No progress bar."""
 
     OfSource.__doc__ = manual
-    options = parse(OfSource, rest, f"data check --data {chosen['--data']}")
+    options = parse(OfSource, short(rest), f"data check --data {chosen['--data']}")
     _check_places(options)
     if options.num < 0:
         raise ValueError(f"--num {options.num}: give how many items to read, 0 for all")
