@@ -59,7 +59,7 @@ def missing_labels(pack: Pack) -> Finding:
     for task in pack.spec.tasks:
         labels = pack.column(f"label_{task.name}")
         for split in ("train", "val", "test"):
-            asked = pack.rows(split, only=task.only)
+            asked = pack.rows(split, only=task.only, by=task.split)
             empty = asked[labels[asked] < 0]
             if len(asked) == len(empty) and split != "val":
                 verdict = "broken"
@@ -87,7 +87,7 @@ def class_balance(pack: Pack) -> list[Finding]:
         labels = pack.column(f"label_{task.name}").astype(int)
         counts = {}
         for side, splits in (("train", ("train", "val")), ("test", ("test",))):
-            found = labels[pack.rows(*splits, only=task.only)]
+            found = labels[pack.rows(*splits, only=task.only, by=task.split)]
             counts[side] = np.bincount(found[found >= 0], minlength=len(task.classes))
         item = f"classes of {task.name}"
         if not counts["train"].sum() or not counts["test"].sum():
@@ -192,7 +192,7 @@ def mixture(pack: Pack) -> Finding:
             verdict = "look"
             notes.append(f"{column} {some(alone)} only in test")
         for task in pack.spec.tasks:
-            rows = pack.rows("train", "val", "test", only=task.only)
+            rows = pack.rows("train", "val", "test", only=task.only, by=task.split)
             labels = pack.column(f"label_{task.name}").astype(int)[rows]
             counted = (labels >= 0) & (values[rows] != "None")
             mine, labels = values[rows][counted], labels[counted]
@@ -255,7 +255,7 @@ def give_aways(pack: Pack) -> Finding:
     notes = []
     known = {column for columns in pack.spec.controls.values() for column in columns}
     for task in pack.spec.tasks:
-        rows = pack.rows("train", "val", only=task.only)
+        rows = pack.rows("train", "val", only=task.only, by=task.split)
         labels = pack.column(f"label_{task.name}").astype(int)[rows]
         rows, labels = rows[labels >= 0], labels[labels >= 0]
         if len(rows) < 64:
@@ -289,12 +289,15 @@ def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
 
 
 def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, labels and sums."""
+    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, names of groups, labels and
+    sums."""
+    names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
     for name in pack.table.column_names:
         values = pack.column(name)
+        if name == "id" or name.startswith(("label_", "crc_")) or any((values.astype(str) == n).all() for n in names):
+            continue
         values = _parsed(values) if values.dtype.kind == "O" else values
-        counted = name != "id" and not name.startswith(("label_", "crc_"))
-        if counted and values is not None and values.dtype.kind in "fiub":
+        if values is not None and values.dtype.kind in "fiub":
             yield name, values.astype(float)
 
 
@@ -304,7 +307,7 @@ def _parsed(values: np.ndarray) -> np.ndarray | None:
     known = 0
     for i, cell in enumerate(values):
         try:
-            out[i] = float(cell)
+            out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name, though Python reads a number
             known += 1
         except (TypeError, ValueError):
             continue
