@@ -120,25 +120,28 @@ def sides_of(splits: np.ndarray) -> np.ndarray:
     return np.where(splits == "unlabelled", "train", splits)
 
 
-def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, sides [N]) of ``split`` and of every other column that holds nothing but split names (folds)."""
+def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """(name, rows that count, their sides) of ``split`` and of every other column that holds nothing but split names
+    (folds). In a task's own column the rows without its label are on no side: nobody learns from them or is asked."""
     for name in pack.table.column_names:
         values = pack.column(name)
         if values.dtype == object and set(np.unique(values.astype(str))) <= set(SPLITS):
-            sides = sides_of(values.astype(str))
+            own = [pack.column(f"label_{task.name}") >= 0 for task in pack.spec.tasks if task.split == name != "split"]
+            rows = np.flatnonzero(np.logical_or.reduce(own)) if own else np.arange(pack.num)
+            sides = sides_of(values.astype(str)[rows])
             if name == "split" or len(np.unique(sides)) > 1:
-                yield name, sides
+                yield name, rows, sides
 
 
 def leaks(pack: Pack) -> list[Finding]:
     """Groups, touch groups and other keys that lie on two sides, for every split column; sound folds are one finding."""
     findings, sound = [], []
     names = [n for n in ("group", "touch_group", *KEYS) if n in pack.table.column_names]
-    for split, sides in split_columns(pack):
+    for split, counted, sides in split_columns(pack):
         verdict: Verdict = "ok"
         notes, rows = [], []
         for name in names:
-            values = pack.column(name).astype(str)
+            values = pack.column(name).astype(str)[counted]
             on = {side: set(values[sides == side].tolist()) for side in np.unique(sides)}
             both = sorted({v for a in on for b in on if a < b for v in on[a] & on[b]})
             if both:
@@ -149,7 +152,7 @@ def leaks(pack: Pack) -> list[Finding]:
                 notes.append(f"{name}{kind}: {len(both)} of {len(set(values))} on two sides, e.g. {both[0]!r}{of}")
                 for one in both[:4]:  # a row from each side, next to each other on the sheet
                     mine = np.flatnonzero(values == one)
-                    rows += [int(mine[sides[mine] == side][0]) for side in np.unique(sides[mine])]
+                    rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
         if split != "split" and not notes:
             sound.append(split)
             continue
