@@ -189,6 +189,8 @@ def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.
     for name in ("group", "split"):
         assert (back.column(name) == toy.column(name)[at]).all()
     assert (back.column("label_label_bright") == toy.column("label_bright")[at]).all()
+    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    assert "crc_touch" in toy.table.column_names and not {"crc_vision", "crc_touch"} & set(features)
     times = back.column("timestamp").astype(float)
     assert np.allclose(times * 25, back.column("frame").astype(int), atol=1e-4)
     episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()

@@ -401,6 +401,19 @@ def test_names_of_groups_are_no_measurements(tmp_path: Path) -> None:
     assert findings["columns that give a label away"].verdict == "ok"
 
 
+def test_a_label_as_its_table_wrote_it_is_no_measurement(tmp_path: Path) -> None:
+    """An empty cell is an unlabelled row there, which is no number to repair."""
+
+    class Table(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            written = {"material": "" if item % 16 == 9 else str(sample.columns["label_material"])}
+            return [replace(sample, columns={**sample.columns, **written})]
+
+    findings = {f.item: f for f in examine(build(Table(), tmp_path / "p", size=SIDE, quiet=True))}
+    assert findings["numbers"].verdict == "ok"
+
+
 def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
     @dataclass
     class Untested(Presses):

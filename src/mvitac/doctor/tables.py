@@ -292,12 +292,15 @@ def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
 
 
 def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, names of groups, labels and
-    sums."""
+    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, names of groups, labels (also
+    as a table wrote them, with gaps where a row has none) and sums."""
+    other = {"id", *(task.name for task in pack.spec.tasks)}
     names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
     for name in pack.table.column_names:
         values = pack.column(name)
-        if name == "id" or name.startswith(("label_", "crc_")) or any((values.astype(str) == n).all() for n in names):
+        if name in other or name.startswith(("label_", "crc_", "bytes_")):
+            continue
+        if any((values.astype(str) == one).all() for one in names):
             continue
         values = _parsed(values) if values.dtype.kind == "O" else values
         if values is not None and values.dtype.kind in "fiub":
