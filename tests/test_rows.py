@@ -197,7 +197,7 @@ def test_a_row_may_lack_a_modality(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cells", "says"),
     [
-        ({"left": ""}, r"row 1 has no left path"),
+        ({"left": ""}, r"row 1 has no left path: .*; stacked sensors need both images$"),
         ({"vision": "", "left": "", "right": ""}, r"row 1 has neither image"),
     ],
 )

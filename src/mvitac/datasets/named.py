@@ -104,9 +104,11 @@ def check_present(
         for number, gap in zip(numbers, gaps, strict=True):
             if any(gap) and not (allow_missing and all(gap)):
                 column = columns[gap.index(True)]
+                hint = (
+                    "allow_missing accepts rows without a modality" if all(gap) else "stacked sensors need both images"
+                )
                 raise ValueError(
-                    f"{manifest.file} row {number} has no {column} path: fill it, leave the row out (only), or"
-                    " allow_missing accepts rows without a modality"
+                    f"{manifest.file} row {number} has no {column} path: fill it, or leave the row out (only); {hint}"
                 )
         lacking = [bool(gap) and all(gap) for gap in gaps]
         if all(lacking) and columns:
