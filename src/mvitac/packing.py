@@ -310,7 +310,7 @@ def _finish(
         )
         raise ValueError(
             f"{what} cannot be read, first {named[0][0]}: {named[0][1]}"
-            " (repair it, or allow a fraction with --max-damaged)"
+            " (repair it, or leave a share of them out: mvitac data pack --max-damaged SHARE)"
         )
     if not columns:
         raise ValueError("every item is damaged: nothing to pack")
