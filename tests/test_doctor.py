@@ -266,6 +266,11 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
     command += ["--quiet", "--workers", "1"]
     assert main(command) == 2
     assert "row 6: " in capsys.readouterr().out
+    (tmp_path / "m.csv").write_text("\n".join([*rows, "30.png,a,g0,train"]))  # g0 is in test
+    assert main([*command, "--json", str(tmp_path / "leak.json")]) == 2
+    told = {f["item"]: f for f in json.loads((tmp_path / "leak.json").read_text())["findings"]}
+    assert told["groups across splits"]["verdict"] == told["unreadable items"]["verdict"] == "broken"
+    assert "group (group): 1 of 20 on two sides, e.g. 'g0'" in told["groups across splits"]["evidence"]
     assert main([*command, "--sheet", "sheet.jpg"]) == 2
     assert "ends in .png" in capsys.readouterr().err
     assert main(["data", "check", str(tmp_path / "nothing")]) == 2
