@@ -149,6 +149,10 @@ def test_misspelt_names_are_pointed_out() -> None:
     counts = Counter({"plastic_duck": 90, "plastic_duk": 3, "ogx_shampoo": 40, "ogx_sham": 2, "lime": 50, "line": 1})
     assert doubtful(counts) == [("plastic_duk", "plastic_duck"), ("ogx_sham", "ogx_shampoo")]
     assert not doubtful(Counter([*AUTHORS_TRAIN, *AUTHORS_TEST]))
+    # A published name is right however rare it is; of two that are as rare the longer one is.
+    assert doubtful(Counter({"lemo": 3, "lemon": 1})) == []  # too short to tell
+    assert doubtful(Counter({"plastic_duk": 9, "plastic_duck": 1})) == [("plastic_duk", "plastic_duck")]
+    assert doubtful(Counter({"tea_bo": 1, "tea_box": 1})) == [("tea_bo", "tea_box")]
 
 
 def test_outcome_as_pytables_stores_it(tmp_path: Path) -> None:

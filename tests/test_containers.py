@@ -189,6 +189,8 @@ def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.
     for name in ("group", "split"):
         assert (back.column(name) == toy.column(name)[at]).all()
     assert (back.column("label_label_bright") == toy.column("label_bright")[at]).all()
+    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    assert "crc_touch" in toy.table.column_names and not {"crc_vision", "crc_touch"} & set(features)
     times = back.column("timestamp").astype(float)
     assert np.allclose(times * 25, back.column("frame").astype(int), atol=1e-4)
     episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
@@ -305,6 +307,19 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
         assert pack.column("group")[row] == f"t{i // 2}"
         assert pack.column("split")[row] == ("test" if i >= 20 else "train")
     assert len({level(image) for image in pack.images["touch"]}) == 30
+
+
+def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
+    rows = [{"touch": b"no picture" if i == 3 else png(i), "kind": i % 2} for i in range(20)]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "bad.parquet")
+    source = HubConfig(path=tmp_path / "bad.parquet", labels=("kind",), size=16).source()
+    with pytest.raises(
+        ValueError, match=r"1 of 20 samples cannot be read, first row 4: .*bad\.parquet row group 0 row 3"
+    ):
+        build(source, tmp_path / "none", size=16, quiet=True)
+    pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
+    assert [level(image) for image in pack.images["touch"]] == [i for i in range(20) if i != 3]
+    assert [name for name, _ in pack.meta["damaged"]] == ["row 4"]
 
 
 def test_hub_parquet_with_gaps_or_without_images(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,11 @@ import pytest
 from PIL import Image
 
 from mvitac.cli import main
+from mvitac.datasets.folder import FolderConfig
 from mvitac.doctor import Finding, examine, examine_pack, examine_source, exit_code
 from mvitac.doctor.looks import area_means, look_at
 from mvitac.doctor.pictures import MAX_LAG, motion_correlations
+from mvitac.doctor.sheet import MISSING, strips_of
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.source import Count, Sample, Source
@@ -195,9 +197,24 @@ def test_a_source_is_examined_as_it_came(tmp_path: Path) -> None:
     assert not strips
 
 
+def test_images_that_a_reader_shrinks_keep_their_size(tmp_path: Path) -> None:
+    """Readers of files hand over images as the pack will store them: the sizes told are those on the disk."""
+    rng = np.random.default_rng(0)
+    rows = ["touch,label,group"]
+    for i in range(16):
+        size = (48, 64, 3) if i < 4 else (24, 32, 3)
+        Image.fromarray(rng.integers(0, 256, size, np.uint8)).save(tmp_path / f"{i}.png")
+        rows.append(f"{i}.png,{'ab'[i % 2]},g{i // 2}")
+    (tmp_path / "m.csv").write_text("\n".join(rows))
+    source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), size=40).source()
+    findings, _ = examine_source(source, size=SIDE, quiet=True)
+    found = {f.item: f for f in findings}["sensors and resolutions"]
+    assert found.verdict == "look" and "touch_size: 32 x 24 75 %, 64 x 48 25 %" in found.evidence
+
+
 def test_a_part_of_a_source_is_spread_over_it() -> None:
     findings, _ = examine_source(Presses(), num=40, size=SIDE, quiet=True)
-    assert findings[0].evidence == "presses: 40 of 320 items read, kept at 32 px"
+    assert findings[0].evidence == "presses: 40 of 320 items examined, kept at 32 px"
     assert {f.item: f for f in findings}["classes of material"].verdict == "ok"
 
 
@@ -245,10 +262,15 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
         rows.append(f"{i}.png,{'ab'[i % 2]},g{i // 2},{'test' if i < 10 else 'train'}")
     (tmp_path / "5.png").write_bytes(b"not a picture")
     (tmp_path / "m.csv").write_text("\n".join(rows))
-    command = ["data", "check", "--data", "folder", "--path", str(tmp_path / "m.csv"), "--labels", "label", "--quiet"]
-    command += ["--workers", "1"]
+    command = ["data", "check", "--data", "folder", "--data.path", str(tmp_path / "m.csv"), "--labels", "label"]
+    command += ["--quiet", "--workers", "1"]
     assert main(command) == 2
     assert "row 6: " in capsys.readouterr().out
+    (tmp_path / "m.csv").write_text("\n".join([*rows, "30.png,a,g0,train"]))  # g0 is in test
+    assert main([*command, "--json", str(tmp_path / "leak.json")]) == 2
+    told = {f["item"]: f for f in json.loads((tmp_path / "leak.json").read_text())["findings"]}
+    assert told["groups across splits"]["verdict"] == told["unreadable items"]["verdict"] == "broken"
+    assert "group (group): 1 of 20 on two sides, e.g. 'g0'" in told["groups across splits"]["evidence"]
     assert main([*command, "--sheet", "sheet.jpg"]) == 2
     assert "ends in .png" in capsys.readouterr().err
     assert main(["data", "check", str(tmp_path / "nothing")]) == 2
@@ -324,6 +346,93 @@ def test_missing_images_are_no_faults_of_the_others(tmp_path: Path) -> None:
         assert wrong == ({"missing images"} if fault else set())
         assert f"{64 if fault else 107} of 320" in told["missing images"].evidence
     assert "no row of test has vision" in told["missing images"].evidence
+
+
+def test_a_gap_is_gray_on_the_sheet(tmp_path: Path) -> None:
+    """Black would say that the camera was covered."""
+
+    class Blind(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            columns = {**sample.columns, "has_vision": item != 3}
+            return [replace(sample, vision=sample.vision if item != 3 else None, columns=columns)]
+
+    pack = build(Blind("constant"), tmp_path / "p", size=SIDE, quiet=True)
+    ((_, first), *_), *_ = strips_of(pack, examine(pack)).values()
+    assert (first[:, :96] == MISSING).all() and (first[:, 96:] == 7).all()
+
+
+def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
+    """As Touch and Go's rough/smooth: its lists divide recordings otherwise than those of the categories, and of those
+    that they divide they may leave frames out."""
+
+    @dataclass
+    class Otherwise(Presses):
+        def spec(self) -> DataSpec:
+            spec = super().spec()
+            other = Task(name="rough", classes=("smooth", "rough"), split="split_rough")
+            return replace(spec, tasks=(*spec.tasks, other))
+
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            obj = item // NUM_FRAMES
+            # By ``split`` no object of class 1 is learned from; by its own column both classes are on both sides.
+            own = {"label_rough": int(obj in TEST), "split_rough": "test" if obj in (3, 8, 0, 1) else "train"}
+            if item % NUM_FRAMES == 9 and obj > 8:
+                own = {"label_rough": -1, "split_rough": "test"}
+            return [replace(sample, columns={**sample.columns, **own})]
+
+    findings = {f.item: f for f in examine(build(Otherwise(), tmp_path / "p", size=SIDE, quiet=True))}
+    assert findings["classes of rough"].verdict == "ok"
+    assert "always saying 'smooth' scores 50.0 % on test" in findings["classes of rough"].evidence
+    assert "rough: 11 of 75 (14.7 %) in test, first 09-09" in findings["missing labels"].evidence
+    assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {"missing labels"}
+    assert findings["groups across split columns"].evidence.startswith("split_rough: none of group")
+
+
+def test_names_of_groups_are_no_measurements(tmp_path: Path) -> None:
+    """20220319_002026 is a recording, though Python reads the number 20220319002026 in it."""
+
+    @dataclass
+    class Recordings(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            obj = item // NUM_FRAMES
+            day = obj % 3 * 100 + obj  # sorted by material
+            own = {"group": f"{day}", "touch_group": f"2022_{day:06d}", "take": f"{day}_0", "day": str(day)}
+            return [replace(sample, columns={**sample.columns, **own})]
+
+    findings = {f.item: f for f in examine(build(Recordings(), tmp_path / "p", size=SIDE, quiet=True))}
+    assert findings["columns that give a label away"].verdict == "ok"
+
+
+def test_a_label_as_its_table_wrote_it_is_no_measurement(tmp_path: Path) -> None:
+    """An empty cell is an unlabelled row there, which is no number to repair."""
+
+    class Table(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            written = {"material": "" if item % 16 == 9 else str(sample.columns["label_material"])}
+            return [replace(sample, columns={**sample.columns, **written})]
+
+    findings = {f.item: f for f in examine(build(Table(), tmp_path / "p", size=SIDE, quiet=True))}
+    assert findings["numbers"].verdict == "ok"
+
+
+def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
+    @dataclass
+    class Untested(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            colours = np.random.default_rng(item).integers(0, 256, (2, 1, 1, 3), np.uint8)
+            vision, touch = (np.full((SIDE, SIDE, 3), c, np.uint8) for c in colours)
+            vision[:4], touch[:4] = 0, 0
+            return [Sample(vision=vision, touch=touch, columns={**sample.columns, "split": "train"})]
+
+    findings = {f.item: f for f in examine(build(Untested(), tmp_path / "p", size=SIDE, quiet=True))}
+    near, colour = findings["near-copies across splits"], findings["red and blue swapped"]
+    assert (near.verdict, near.evidence) == ("not checkable", "vision: all on one side; touch: all on one side")
+    assert colour.verdict == "not checkable" and "colours vary too much to tell" in colour.evidence
 
 
 def test_other_keys_and_other_splits_are_looked_at_too(tmp_path: Path) -> None:

@@ -248,6 +248,16 @@ def free(monkeypatch: pytest.MonkeyPatch, num_bytes: int) -> None:
     monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, num_bytes))  # type: ignore[attr-defined]
 
 
+def test_disk_is_told_before_it_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    free(monkeypatch, 3 * 10**9)
+    build(Toy(), tmp_path / "p", size=32)
+    assert f"into {tmp_path / 'p'}: needs about 0.7 MB of disk, 3.0 GB are free" in capsys.readouterr().out
+    build(Toy(), tmp_path / "q", size=32, quiet=True)
+    assert "disk" not in capsys.readouterr().out
+
+
 def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """For one copy of the images, less what an interrupted build has written of it."""
     need = 2 * (128 + 120 * 32 * 32 * 3)

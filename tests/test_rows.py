@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.places import difference
 from mvitac.pack import Pack
 from mvitac.packing import build
+from mvitac.source import Sample
 
 Table = list[dict[str, Any]]
 
@@ -84,9 +86,9 @@ def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: p
     asked: list[tuple[str, list[int]]] = []
     real = video.frames
 
-    def frames(path: str, indices: Sequence[int]) -> Any:
+    def frames(path: str, indices: Sequence[int], **options: Any) -> Any:
         asked.append((path, list(indices)))
-        return real(path, indices)
+        return real(path, indices, **options)
 
     monkeypatch.setattr(video, "frames", frames)
     packed(table(films / "once.csv", film_rows()), tmp_path / "p", labels=("label",), group="take")
@@ -130,6 +132,34 @@ def test_bad_frames_are_named(films: Path, tmp_path: Path, cells: dict[str, Any]
     assert "\n" not in str(caught.value)
 
 
+def test_a_bad_frame_costs_its_own_row_only(films: Path, tmp_path: Path) -> None:
+    """And it is said that the number is wrong, not the file, though the decoder has run through all of it."""
+    rows = film_rows()
+    rows[1]["frame"] = 40
+    rows[30]["touch"] = "text.mp4"
+    (films / "text.mp4").write_text("no video")
+    config = FolderConfig(path=table(films / "few.csv", rows), size=16, labels=("label",), group="take")
+    with pytest.raises(ValueError, match=r"first row 31: .*text\.mp4 cannot be read as a video"):
+        build(config.source(), tmp_path / "none", size=16, quiet=True)
+    pack = build(config.source(), tmp_path / "pack", size=16, quiet=True, max_damaged=0.3)
+    assert pack.num == 46
+    (whole, _), (one, why) = pack.meta["damaged"]
+    assert (whole, one) == ("row 31", "row 2")
+    assert re.search(r"0/camera\.mp4: frame 40 is wanted, the video ends after frame 39", why)
+    for i, name in enumerate(pack.column("id")):
+        row = rows[int(name) - 1]
+        assert abs(level(pack.images["vision"][i]) - shade(row["frame"], row["take"])) < 6
+        assert abs(level(pack.images["touch"][i]) - shade(row["touch_frame"], row["take"] + 1)) < 6
+
+
+def test_a_sample_says_how_large_its_images_were(films: Path, tmp_path: Path) -> None:
+    file = table(films / "sizes.csv", film_rows())
+    source = FolderConfig(path=file, size=16, labels=("label",), group="take").source()
+    sample = source.read(0)[0]
+    assert isinstance(sample, Sample) and sample.touch is not None and sample.touch.shape == (16, 16, 3)
+    assert sample.sizes == {"vision": (48, 64), "touch": (64, 96)}
+
+
 # -- gaps -------------------------------------------------------------------------------------------------------------
 
 
@@ -167,7 +197,7 @@ def test_a_row_may_lack_a_modality(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cells", "says"),
     [
-        ({"left": ""}, r"row 1 has no left path"),
+        ({"left": ""}, r"row 1 has no left path: .*; stacked sensors need both images$"),
         ({"vision": "", "left": "", "right": ""}, r"row 1 has neither image"),
     ],
 )
@@ -274,19 +304,32 @@ def test_a_sensor_column_of_another_name(tmp_path: Path) -> None:
         ({"difference": True, "background": ("a",), "no_contact": ("phase=empty",)}, "the one or the other"),
         ({"difference": True, "background": ("a", "b")}, "need as many background columns"),
         ({"difference": True, "background": ("nowhere",)}, "unknown column 'nowhere'"),
+        (
+            {"difference": True},
+            r"no column 'background': difference images need background columns, or no_contact rows",
+        ),
         ({"difference": True, "no_contact": ("phase=none",)}, r"no row meets phase=none for its sensor 'digit'"),
         ({"difference": True, "no_contact": ("seq=none",)}, r"unknown column 'seq'"),
         ({"difference": True, "no_contact": ("value>=0",)}, r"every row meets value>=0"),
     ],
 )
 def test_backgrounds_that_cannot_be(tmp_path: Path, options: dict[str, Any], says: str) -> None:
-    file = table(tmp_path / "m.csv", pressed(tmp_path))
+    rows = pressed(tmp_path)
+    if options == {"difference": True}:
+        rows = [{k: v for k, v in row.items() if k != "background"} for row in rows]
+    file = table(tmp_path / "m.csv", rows)
     with pytest.raises(ValueError, match=says):
         packed(file, tmp_path / "p", labels=("label",), **options)
 
 
-def test_a_background_of_another_size(tmp_path: Path) -> None:
-    rows = pressed(tmp_path)
-    plain(tmp_path / "own4.png", 9, size=(9, 9))
-    with pytest.raises(ValueError, match=r"first row 5: .*4\.png is 20 x 16, its background 9 x 9"):
-        packed(table(tmp_path / "m.csv", rows), tmp_path / "p", labels=("label",), difference=True)
+def test_a_background_that_is_damaged_or_of_another_size(tmp_path: Path) -> None:
+    rows = {name: pressed(tmp_path / name) for name in ("size", "damage")}
+    plain(tmp_path / "size" / "own4.png", 9, size=(9, 9))
+    (tmp_path / "damage" / "own4.png").write_text("no picture")
+    for name, says in (
+        ("size", r"first row 5: .*4\.png is 20 x 16, its background 9 x 9"),
+        ("damage", r"first row 5: .*own4\.png cannot be read as an image"),
+    ):
+        file = table(tmp_path / name / "m.csv", rows[name])
+        with pytest.raises(ValueError, match=says):
+            packed(file, tmp_path / "p" / name, labels=("label",), difference=True)

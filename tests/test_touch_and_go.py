@@ -31,6 +31,7 @@ from mvitac.datasets.touch_and_go_recordings import Recording
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.probe import parts
+from mvitac.source import Sample
 from mvitac.video import frames
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -300,6 +301,20 @@ def test_frames_without_a_label_serve_pre_training(tree: Path, tmp_path: Path) -
     check_pairs(pack)
     between = [t for t, f in zip(pack.column("touch_group")[rows], pack.column("frame")[rows], strict=True) if f == 35]
     assert all(touch.endswith(("/0000000030", "/0000000000")) for touch in between)
+
+
+def test_frames_without_a_label_that_are_nowhere(tree: Path) -> None:
+    """The official split tests nearly every recording: an option that would do nothing is refused, not ignored."""
+    with pytest.raises(ValueError, match="unlabelled 7 adds no frame: recordings with test or val frames give none"):
+        TouchAndGoConfig(root=tree, split="official", unlabelled=7).source()
+
+
+@pytest.mark.parametrize("jpegs", [False, True])
+def test_a_sample_says_how_large_its_images_were(tmp_path: Path, jpegs: bool) -> None:
+    source = TouchAndGoConfig(root=write_tree(tmp_path, jpegs=jpegs), size=32).source()
+    sample = source.read(0)[0]
+    assert isinstance(sample, Sample) and sample.touch is not None and sample.touch.shape == (32, 32, 3)
+    assert sample.sizes == {"vision": (120, 160), "touch": (120, 160)}
 
 
 # -- what is missing or damaged ---------------------------------------------------------------------------------------

@@ -30,6 +30,11 @@ def parse(kind: Callable[..., T] | type[T], argv: Sequence[str], prog: str, *, d
         raise ValueError(_unboxed(boxed.getvalue(), prog)) from None
 
 
+def short(argv: Sequence[str]) -> list[str]:
+    """``argv`` with a dataset's options as its own commands have them (--root), where spelt as in pretrain (--data.root)."""
+    return [f"--{word.removeprefix('--data.')}" if word.startswith("--data.") else word for word in argv]
+
+
 @contextlib.contextmanager
 def _columns(width: str) -> Iterator[None]:
     old = os.environ.get("COLUMNS")

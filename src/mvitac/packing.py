@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mvitac.allocator import keep_freed_memory
@@ -89,7 +90,7 @@ def build(
     for modality in spec.modalities:
         path, shape = partial / "pack" / f"{modality}{SUFFIXES[store]}", (size, size, spec.channels(modality))
         files[modality] = RowFile(path, num, shape) if store == "raw" else JpegFile(path, num, shape, quality)
-    _check_disk(out, list(files.values()))
+    disk = _check_disk(out, list(files.values()))
     if (partial / "request.json").exists():
         if read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})") != json.loads(
             json.dumps(request)
@@ -97,6 +98,9 @@ def build(
             raise ValueError(f"{partial} is an unfinished pack of something else: delete it or choose another --out")
     else:
         write_json(partial / "request.json", request)
+    if not quiet:
+        text = f"packing {num} samples at {size} px into {out}: {disk}"
+        Console().print(text, soft_wrap=True, highlight=False, markup=False)
     for rows in files.values():
         rows.create()
 
@@ -136,12 +140,18 @@ def _progress(quiet: bool) -> Progress:
     return Progress(*columns, disable=quiet)
 
 
-def _check_disk(out: Path, files: Sequence[RowFile | JpegFile]) -> None:
+def _check_disk(out: Path, files: Sequence[RowFile | JpegFile]) -> str:
+    """What packing will take and what is free, in words; ValueError if that is too little."""
     need = sum(rows.need() for rows in files)  # less what an interrupted build has taken
     parent = next(p for p in [out.absolute().parent, *out.absolute().parents] if p.exists())
     free = shutil.disk_usage(parent).free
     if need > free:
-        raise ValueError(f"packing needs about {need / 1e9:.1f} GB, {parent} has {free / 1e9:.1f} GB free")
+        raise ValueError(f"packing needs about {_bytes(need)}, {parent} has {_bytes(free)} free")
+    return f"needs about {_bytes(need)} of disk, {_bytes(free)} are free"
+
+
+def _bytes(num: int) -> str:
+    return f"{num / 1e9:.1f} GB" if num >= 1e8 else f"{num / 1e6:.1f} MB"
 
 
 def _run(work: _Work, parts: Sequence[Part], workers: int) -> Iterator[int]:
@@ -300,7 +310,7 @@ def _finish(
         )
         raise ValueError(
             f"{what} cannot be read, first {named[0][0]}: {named[0][1]}"
-            " (repair it, or allow a fraction with --max-damaged)"
+            " (repair it, or leave a share of them out: mvitac data pack --max-damaged SHARE)"
         )
     if not columns:
         raise ValueError("every item is damaged: nothing to pack")

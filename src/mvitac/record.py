@@ -16,7 +16,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-LIBRARIES = ("mvitac", "torch", "torchvision", "timm", "numpy", "scikit-learn", "pyarrow", "mujoco-core")
+LIBRARIES = (
+    *("mvitac", "torch", "torchvision", "timm", "numpy", "scikit-learn", "pyarrow", "mujoco-core"),
+    *("pillow", "av", "h5py"),  # what decodes a pack's images
+)
 
 
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:

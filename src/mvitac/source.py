@@ -26,6 +26,8 @@ class Sample:
     touch: np.ndarray | None
     columns: dict[str, Any] = field(default_factory=dict)
     """At least id (str), group (str), split (one of SPLITS) and a label_<task> (int, -1 = none) per task."""
+    sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Height and width of a modality's image where it lies, if it comes at another size already."""
 
 
 @dataclass(frozen=True)

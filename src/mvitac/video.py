@@ -39,6 +39,8 @@ class Packets:
     """[P] int64 where they are in the file."""
     keys: np.ndarray
     """[K] int64 ascending numbers of the packets at which decoding can start."""
+    shape: tuple[int, int]
+    """Height and width of the frames, as the container says."""
 
     def start_of(self, frame: int) -> int:
         """Number in ``keys`` of the last key packet stored no later than place ``frame``."""
@@ -48,6 +50,11 @@ class Packets:
 def num_frames(path: str | Path) -> int:
     """How many frames the file promises; ValueError or OSError if it is no whole video."""
     return len(_packets(path).dts)
+
+
+def frame_shape(path: str | Path) -> tuple[int, int]:
+    """Height and width of the frames, as the file promises; ValueError or OSError if it is no whole video."""
+    return _packets(path).shape
 
 
 def frames(
@@ -63,8 +70,10 @@ def frames(
         raise ValueError(f"{path}: frame {pending[-1]} is wanted: frames are counted from 0")
     packets = _packets(path)
 
-    def lose(why: str) -> None:
+    def lose(why: str = "is beyond the end of what can be read: the file is cut off, fetch it again") -> None:
         frame = pending.pop()
+        if frame >= len(packets.dts):
+            why = f"is wanted, the video ends after frame {len(packets.dts) - 1}: is it the right one, and whole?"
         if lost is None:
             raise ValueError(f"{path}: frame {frame} {why}")
         lost[frame] = why
@@ -74,7 +83,7 @@ def frames(
         key = 0
         while pending:
             if pending[-1] >= len(packets.dts):
-                lose(f"is wanted, the video ends after frame {len(packets.dts) - 1}: is it the right one, and whole?")
+                lose()
                 continue
             key = max(key, packets.start_of(pending[-1]))
             run = _Run(container, stream, packets, key)
@@ -96,7 +105,7 @@ def frames(
                     break
             else:
                 while pending:
-                    lose("is beyond the end of what can be read: the file is cut off, fetch it again")
+                    lose()
 
 
 def _rgb(shrink: VideoReformatter, frame: VideoFrame, size: int | None) -> np.ndarray:
@@ -234,6 +243,7 @@ def _packets(path: str | Path) -> Packets:
 def _read_packets(path: str, size: int, changed: int) -> Packets:
     """The packet table: mp4 and a whole AVI carry one; of other files every packet is visited, none decoded."""
     with _opened(path) as (container, stream):
+        shape = (stream.codec_context.height, stream.codec_context.width)
         table = stream.index_entries
         if "mp4" in container.format.name or ("avi" in container.format.name and len(table) == stream.frames):
             found = [(e.timestamp, e.pos, e.is_keyframe) for e in table if e.size and not e.is_discard]
@@ -245,4 +255,4 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
     keys = np.flatnonzero([key for _, _, key in found])
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
-    return Packets(dts, places, keys)
+    return Packets(dts, places, keys, shape)

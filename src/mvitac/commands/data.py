@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mvitac.options import parse, selectors
+from mvitac.options import parse, selectors, short
 
 
 def simulate(argv: list[str]) -> None:
@@ -30,9 +30,7 @@ def pack(argv: list[str]) -> None:
         raise ValueError(
             f"say which dataset: mvitac data pack --data {'|'.join(datasets.DatasetConfig.choices)} --out DIR"
         )
-    # Spelt as in pretrain (--data.root) or short (--root).
-    rest = [f"--{word.removeprefix('--data.')}" if word.startswith("--data.") else word for word in rest]
-    _build(default(datasets.DatasetConfig, chosen["--data"]), rest, f"data pack --data {chosen['--data']}")
+    _build(default(datasets.DatasetConfig, chosen["--data"]), short(rest), f"data pack --data {chosen['--data']}")
 
 
 def _build(config: Any, argv: list[str], prog: str) -> None:

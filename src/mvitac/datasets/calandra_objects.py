@@ -55,8 +55,10 @@ def most_attempted(counts: Counter[str], num: int = 40) -> list[str]:
 
 
 def doubtful(counts: Counter[str]) -> list[tuple[str, str]]:
-    """Pairs (name, the name it may stand for): the rarer begins the other, or differs from it by one letter."""
-    names = sorted(counts, key=lambda name: (-counts[name], name))
+    """Pairs (name, the name it may stand for): the rarer begins the other, or differs from it by one letter. What the
+    authors list counts as right, and of names as rare as each other the longer one."""
+    listed = {*AUTHORS_TRAIN, *AUTHORS_TEST}
+    names = sorted(counts, key=lambda name: (name not in listed, -counts[name], -len(name), name))
     pairs = []
     for i, name in enumerate(names):
         for likely in names[:i]:

@@ -92,8 +92,10 @@ def _cameras(pack: Pack) -> dict[str, tuple[str, int]]:
 
 
 def _carried(pack: Pack) -> dict[str, str]:
-    """Table column -> lerobot's name for its type; a column's own name must not be one of lerobot's, nor hold a /."""
+    """Table column -> lerobot's name for its type; a column's own name must not be one of lerobot's, nor hold a /. What a
+    pack notes of its own image files stays behind."""
     own = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
+    own |= {f"{kind}_{modality}" for kind in ("crc", "bytes") for modality in pack.spec.modalities}
     kinds: dict[str, str] = {}
     for field in pack.table.schema:
         if field.name in own or "/" in field.name or field.name.startswith("has_"):

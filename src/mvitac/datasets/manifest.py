@@ -94,9 +94,9 @@ def text_of(value: Any) -> str:
 
 
 def number_of(text: str) -> float | None:
-    """``text`` as a finite number, or None."""
+    """``text`` as a finite number, or None; 1_2 is a name, though Python reads a number."""
     try:
-        value = float(text)
+        value = float("" if "_" in text else text)
     except ValueError:
         return None
     return value if math.isfinite(value) else None

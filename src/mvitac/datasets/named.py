@@ -50,6 +50,10 @@ def read_backgrounds(
     They stand in ``columns`` beside the touch, or are the first of the rows of its ``sensor`` that meet ``no_contact``.
     """
     if not no_contact:
+        if not columns and "background" not in (*manifest.columns, *manifest.found):
+            raise ValueError(
+                f"{manifest.file} has no column 'background': difference images need background columns, or no_contact rows"
+            )
         columns = columns or ("background",)
         if len(columns) != len(touch):
             raise ValueError(
@@ -100,9 +104,11 @@ def check_present(
         for number, gap in zip(numbers, gaps, strict=True):
             if any(gap) and not (allow_missing and all(gap)):
                 column = columns[gap.index(True)]
+                hint = (
+                    "allow_missing accepts rows without a modality" if all(gap) else "stacked sensors need both images"
+                )
                 raise ValueError(
-                    f"{manifest.file} row {number} has no {column} path: fill it, leave the row out (only), or"
-                    " allow_missing accepts rows without a modality"
+                    f"{manifest.file} row {number} has no {column} path: fill it, or leave the row out (only); {hint}"
                 )
         lacking = [bool(gap) and all(gap) for gap in gaps]
         if all(lacking) and columns:

@@ -8,9 +8,10 @@ from __future__ import annotations
 import functools
 import io
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +22,10 @@ from mvitac import video
 from mvitac.datasets.images import decode
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
+
+
+Damage = dict["Place", str]
+"""A place whose image is damaged -> what is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +40,11 @@ class Place(ABC):
 
     @staticmethod
     @abstractmethod
-    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
-        """``places`` as RGB, ascending and all of one kind and ``together``; ValueError names the damage."""
+    def read(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:
+        """``places``, ascending and all of one kind and ``together``, each with its image as RGB.
+
+        A damaged one is left out and put into ``lost``; ValueError or OSError if what holds them cannot be opened.
+        """
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -47,8 +55,8 @@ class File(Place):
         return self.path
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
-        return (decode(place.path) for place in places)
+    def read(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:
+        return _each(places, lambda place: decode(place.path), lost)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -64,9 +72,12 @@ class Frame(Place):
         return self.path
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
-        for _, image in video.frames(places[0].path, [place.index for place in places]):  # type: ignore[attr-defined]
-            yield Image.fromarray(image)
+    def read(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:
+        path, at = places[0].path, {place.index: place for place in places}  # type: ignore[attr-defined]
+        why: dict[int, str] = {}
+        for index, image in video.frames(path, list(at), lost=why):
+            yield at[index], Image.fromarray(image)
+        lost.update({at[index]: f"{path}: frame {index} {reason}" for index, reason in why.items()})
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -80,11 +91,13 @@ class Stretch(Place):
         return f"{self.path} byte {self.offset}"
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
-        for place in places:
+    def read(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:
+        def image(place: Any) -> Image.Image:
             with open(place.path, "rb") as file:
-                file.seek(place.offset)  # type: ignore[attr-defined]
-                yield decode(io.BytesIO(file.read(place.size)), str(place))  # type: ignore[attr-defined]
+                file.seek(place.offset)
+                return decode(io.BytesIO(file.read(place.size)), str(place))
+
+        return _each(places, image, lost)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -102,27 +115,43 @@ class Cell(Place):
         return (self.path, self.group)
 
     @staticmethod
-    def read(places: Sequence[Place]) -> Iterator[Image.Image]:
+    def read(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:
         first: Cell = places[0]  # type: ignore[assignment]
         try:
             values = pq.ParquetFile(first.path).read_row_group(first.group, columns=[first.column]).column(0)
         except (pa.ArrowException, OSError) as error:
             raise ValueError(f"{first.path} cannot be read ({' '.join(str(error).split())[:120]})") from None
-        for place in places:
-            value = values[place.row].as_py()  # type: ignore[attr-defined]
+
+        def image(place: Any) -> Image.Image:
+            value = values[place.row].as_py()
             if isinstance(value, dict):
                 beside = Path(first.path).parent / (value.get("path") or "")
                 value = value.get("bytes") or (beside.read_bytes() if beside.is_file() else None)
             if not value:
                 raise ValueError(f"{place} holds no image")
-            yield decode(io.BytesIO(value), str(place))
+            return decode(io.BytesIO(value), str(place))
+
+        yield from _each(places, image, lost)
 
 
-def read_all(places: Sequence[Place]) -> Iterator[tuple[Place, Image.Image]]:
-    """Every distinct one of ``places``, which lie together, with its image (RGB)."""
+def _each(
+    places: Sequence[Place], image: Callable[[Any], Image.Image], lost: Damage
+) -> Iterator[tuple[Place, Image.Image]]:
+    """``places`` one by one, each with its ``image``; the damaged ones go to ``lost``."""
+    for place in places:
+        try:
+            found = image(place)
+        except (ValueError, OSError) as error:
+            lost[place] = str(error)
+        else:
+            yield place, found
+
+
+def read_all(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:
+    """Every distinct one of ``places``, which lie together, with its image (RGB); the damaged ones go to ``lost``."""
     distinct = sorted(set(places))  # type: ignore[type-var]
     if distinct:
-        yield from zip(distinct, type(distinct[0]).read(distinct), strict=True)
+        yield from type(distinct[0]).read(distinct, lost)
 
 
 @functools.lru_cache(maxsize=64)
@@ -130,12 +159,15 @@ def mean_image(places: tuple[Place, ...]) -> np.ndarray:
     """The mean of several images of one size, uint8 [H, W, 3]: what a sensor sees without contact."""
     total, num = None, 0
     for place in places:
-        for _, read in read_all([place]):
+        lost: Damage = {}
+        for _, read in read_all([place], lost):
             image = np.asarray(read)
             if total is not None and image.shape != total.shape:
                 raise ValueError(f"{place} is {image.shape[1]} x {image.shape[0]}: backgrounds must be of one size")
             total = image.astype(np.float64) if total is None else total + image
             num += 1
+        if lost:
+            raise ValueError(lost[place])
     assert total is not None
     return np.rint(total / num).astype(np.uint8)
 

@@ -18,12 +18,12 @@ from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.columns import filled, read_controls, read_ids, read_task
 from mvitac.datasets.manifest import Condition, Manifest
 from mvitac.datasets.named import check_files, check_present, image_columns, read_backgrounds
-from mvitac.datasets.places import Place, difference, mean_image, read_all
+from mvitac.datasets.places import Damage, Place, difference, mean_image, read_all
 from mvitac.datasets.splits import BY_GROUP, check_leak, check_sides, check_split_names, deal
 from mvitac.pack import fit, shrink
 from mvitac.record import digest
 from mvitac.registry import to_json
-from mvitac.source import Sample, Source
+from mvitac.source import Lost, Sample, Source
 from mvitac.spec import DataSpec
 
 VERSION = 2
@@ -129,6 +129,10 @@ class RowsConfig(DatasetConfig, ABC):
 
     def source(self) -> Source:
         return Rows(self)
+
+
+Looked = dict[Place, tuple[tuple[int, int], np.ndarray]]
+"""Place -> height and width of its image where it lies, and the image at the stored size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,28 +262,47 @@ class Rows(Source):
             "options": self._options,
         }
 
-    def read(self, item: int) -> list[Sample]:
+    def read(self, item: int) -> list[Sample | Lost]:
         rows = [self._rows[i] for i in self._items[item]]
-        seen = self._look([row.vision for row in rows if row.vision])
-        felt = [self._look([row.touch[k] for row in rows if row.touch]) for k in range(self._spec.touch_channels // 3)]
-        samples = []
+        lost: Damage = {}
+        seen = self._look([row.vision for row in rows if row.vision], lost)
+        num_touch = self._spec.touch_channels // 3
+        felt = [self._look([row.touch[k] for row in rows if row.touch], lost) for k in range(num_touch)]
+        samples: list[Sample | Lost] = []
         for row in rows:
-            touches = [images[place] for images, place in zip(felt, row.touch, strict=False)]
-            if len({shape for shape, _ in touches}) > 1:
-                (h, w), (h2, w2) = (shape for shape, _ in touches)
-                raise ValueError(
-                    f"{row.touch[0]} is {w} x {h}, {row.touch[1]} is {w2} x {h2}: stacked sensors need one size"
-                )
-            pressed = [image for _, image in touches]
-            if row.background:
-                pressed = [self._minus(*both) for both in zip(touches, row.background, row.touch, strict=True)]
-            touch = np.concatenate(pressed, axis=2) if pressed else None
-            samples.append(Sample(vision=seen[row.vision][1] if row.vision else None, touch=touch, columns=row.columns))
+            try:
+                samples.append(self._sample(row, seen, felt, lost))
+            except (ValueError, OSError) as error:
+                if len(rows) == 1:
+                    raise
+                samples.append(Lost(f"row {row.number}", str(error)))  # the others of its video are still good
         return samples
 
-    def _look(self, places: Sequence[Place]) -> dict[Place, tuple[tuple[int, int], np.ndarray]]:
-        """Place -> its size (height, width) and its image, already at the stored size: a whole video would not fit."""
-        return {place: ((image.height, image.width), shrink(image, self._size)) for place, image in read_all(places)}
+    def _sample(self, row: Row, seen: Looked, felt: Sequence[Looked], lost: Damage) -> Sample:
+        """``row`` with its images among those that were read; ValueError says which of them is damaged."""
+        for place in (row.vision, *row.touch):
+            if place in lost:
+                raise ValueError(lost[place])
+        touches = [images[place] for images, place in zip(felt, row.touch, strict=False)]
+        if len({shape for shape, _ in touches}) > 1:
+            (h, w), (h2, w2) = (shape for shape, _ in touches)
+            raise ValueError(
+                f"{row.touch[0]} is {w} x {h}, {row.touch[1]} is {w2} x {h2}: stacked sensors need one size"
+            )
+        pressed = [image for _, image in touches]
+        if row.background:
+            pressed = [self._minus(*both) for both in zip(touches, row.background, row.touch, strict=True)]
+        sizes = {"touch": touches[0][0]} if touches else {}
+        vision = None
+        if row.vision:
+            sizes["vision"], vision = seen[row.vision]
+        touch = np.concatenate(pressed, axis=2) if pressed else None
+        return Sample(vision=vision, touch=touch, columns=row.columns, sizes=sizes)
+
+    def _look(self, places: Sequence[Place], lost: Damage) -> Looked:
+        """``places`` at the stored size, as a whole video would not fit otherwise; what is damaged goes to ``lost``."""
+        found = read_all(places, lost)
+        return {place: ((image.height, image.width), shrink(image, self._size)) for place, image in found}
 
     def _minus(
         self, touch: tuple[tuple[int, int], np.ndarray], background: tuple[Place, ...], place: Place

@@ -136,6 +136,11 @@ class TouchAndGo(Source):
         else:
             assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
         extra = _unlabelled(listed, recordings, config) if config.unlabelled else []
+        if config.unlabelled and not extra:
+            raise ValueError(
+                f"unlabelled {config.unlabelled} adds no frame: recordings with test or val frames give none, and"
+                f" split {config.split} leaves no other with frames to spare; leave it out"
+            )
 
         self._config = config
         self._missing, self._num_names = missing, len(names)
@@ -208,9 +213,10 @@ class TouchAndGo(Source):
             if frame.number in lost:
                 samples.append(Lost(f"{frame.recording}/{frame.number:010d}", lost[frame.number]))
             else:
-                own = {modality: found[frame.number] for modality, found in images.items()}
+                sizes = {modality: found[frame.number][0] for modality, found in images.items()}
+                own = {modality: found[frame.number][1] for modality, found in images.items()}
                 columns = _columns(frame, self._spec)
-                samples.append(Sample(vision=own.get("vision"), touch=own.get("touch"), columns=columns))
+                samples.append(Sample(vision=own.get("vision"), touch=own.get("touch"), columns=columns, sizes=sizes))
         return samples
 
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from mvitac.datasets.images import decode
 from mvitac.pack import shrink
+from mvitac.video import frame_shape, num_frames
 from mvitac.video import frames as video_frames
-from mvitac.video import num_frames
 
 HOMEPAGE = "https://touch-and-go.github.io"
 STEMS = {"vision": "video", "touch": "gelsight"}
@@ -96,17 +96,26 @@ def missing_report(missing: dict[str, str], num: int) -> str:
     return f"{len(missing)} of {num} listed recordings cannot be packed: {'; '.join(parts)}"
 
 
-def read_frames(place: Path, numbers: list[int], size: int, lost: dict[int, str]) -> dict[int, np.ndarray]:
-    """Images [size, size, 3] of one modality by frame number; what cannot be had goes to ``lost`` with its reason."""
+Shape = tuple[int, int]
+"""Height and width."""
+
+
+def read_frames(
+    place: Path, numbers: list[int], size: int, lost: dict[int, str]
+) -> dict[int, tuple[Shape, np.ndarray]]:
+    """By frame number the shape in which one modality lies there and its image [size, size, 3]; what cannot be had goes
+    to ``lost`` with its reason."""
     if place.suffix:
         why: dict[int, str] = {}
-        found = dict(video_frames(place, numbers, size, lost=why))
+        shape = frame_shape(place)
+        found = {number: (shape, image) for number, image in video_frames(place, numbers, size, lost=why)}
         lost.update({number: f"{place.name}: frame {reason}" for number, reason in why.items()})
         return found
     found = {}
     for number in numbers:
         try:
-            found[number] = shrink(decode(place / f"{number:010d}.jpg"), size)
+            image = decode(place / f"{number:010d}.jpg")
+            found[number] = (image.height, image.width), shrink(image, size)
         except (ValueError, OSError) as error:
             lost[number] = str(error)
     return found

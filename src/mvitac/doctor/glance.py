@@ -52,7 +52,8 @@ class Glance(Source):
                 samples.append(sample)
                 continue
             given = {"vision": sample.vision, "touch": sample.touch}
-            sizes = {f"{m}_size": f"{i.shape[1]} x {i.shape[0]}" for m, i in given.items() if i is not None}
+            shapes = {m: sample.sizes.get(m, i.shape[:2]) for m, i in given.items() if i is not None}
+            sizes = {f"{m}_size": f"{width} x {height}" for m, (height, width) in shapes.items()}
             samples.append(replace(sample, columns={**sample.columns, **sizes}))
         return samples
 
@@ -108,6 +109,6 @@ def examine_source(
         options: dict[str, Any] = {"size": size, "workers": workers, "quiet": quiet}
         pack = build(glance, Path(folder) / "pack", max_damaged=1.0, **options)
         findings = examine(pack, glance.expected())
-        read = f"{len(glance.items())} of {len(source.items())} items read, kept at {size} px"
+        read = f"{len(glance.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
         return findings, strips_of(pack, findings)

@@ -57,7 +57,7 @@ def red_and_blue(pack: Pack, looks: dict[str, Looks]) -> Finding:
     of d (not centred) a mix-up therefore is two heaps either side of zero that mirror each other, with nothing between.
     Where colours vary from scene to scene there is no gap, and nothing can be said; nor of a set that is BGR throughout.
     """
-    notes, rows = [], []
+    notes, rows, compared = [], [], False
     for name, one in looks.items():
         usable = np.flatnonzero(one.seen & ~one.gray)
         usable = (
@@ -78,6 +78,7 @@ def red_and_blue(pack: Pack, looks: dict[str, Looks]) -> Finding:
         if strength < 3 or between > 0.08:
             notes.append(f"{name}: colours vary too much to tell ({100 * between:.0f} % between the two orders)")
             continue
+        compared = True
         if not other.any():
             notes.append(f"{name}: all in one order")
             continue
@@ -93,7 +94,7 @@ def red_and_blue(pack: Pack, looks: dict[str, Looks]) -> Finding:
         notes.append(f"{name}: {share(int(other.sum()), len(usable))} have red and blue mirrored{_where(pack, mine)}")
     return Finding(
         item="red and blue swapped",
-        verdict="look" if rows else "ok",
+        verdict="look" if rows else "ok" if compared else "not checkable",
         evidence="; ".join(notes),
         advice="look at the sheet; if they are BGR (OpenCV's order), turn them round when reading" if rows else "",
         rows=tuple(rows),

@@ -12,6 +12,8 @@ from mvitac.doctor.finding import Finding
 from mvitac.pack import Pack, fit
 
 SIDE, NUM_SHOWN, LINE = 96, 8, 14
+MISSING = 225
+"""Gray level of an image that a row does not have."""
 Strips = dict[str, list[tuple[str, np.ndarray]]]
 """Finding -> (caption, uint8 [SIDE, width, 3]) of its first rows."""
 
@@ -28,7 +30,14 @@ def strips_of(pack: Pack, findings: Sequence[Finding]) -> Strips:
 
 
 def _row(pack: Pack, row: int) -> np.ndarray:
-    images = [fit(np.asarray(pack.images[m][row]), SIDE) for m in pack.spec.modalities]
+    images = [
+        fit(np.asarray(pack.images[m][row]), SIDE)
+        if pack.has(m)[row]
+        else np.full(
+            (SIDE, SIDE, pack.spec.channels(m)), MISSING, np.uint8
+        )  # the zeros in its place are no black image
+        for m in pack.spec.modalities
+    ]
     return np.concatenate([part for image in images for part in np.split(image, image.shape[2] // 3, axis=2)], axis=1)
 
 

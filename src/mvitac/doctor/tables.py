@@ -59,7 +59,7 @@ def missing_labels(pack: Pack) -> Finding:
     for task in pack.spec.tasks:
         labels = pack.column(f"label_{task.name}")
         for split in ("train", "val", "test"):
-            asked = pack.rows(split, only=task.only)
+            asked = pack.rows(split, only=task.only, by=task.split)
             empty = asked[labels[asked] < 0]
             if len(asked) == len(empty) and split != "val":
                 verdict = "broken"
@@ -87,7 +87,7 @@ def class_balance(pack: Pack) -> list[Finding]:
         labels = pack.column(f"label_{task.name}").astype(int)
         counts = {}
         for side, splits in (("train", ("train", "val")), ("test", ("test",))):
-            found = labels[pack.rows(*splits, only=task.only)]
+            found = labels[pack.rows(*splits, only=task.only, by=task.split)]
             counts[side] = np.bincount(found[found >= 0], minlength=len(task.classes))
         item = f"classes of {task.name}"
         if not counts["train"].sum() or not counts["test"].sum():
@@ -120,25 +120,28 @@ def sides_of(splits: np.ndarray) -> np.ndarray:
     return np.where(splits == "unlabelled", "train", splits)
 
 
-def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, sides [N]) of ``split`` and of every other column that holds nothing but split names (folds)."""
+def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """(name, rows that count, their sides) of ``split`` and of every other column that holds nothing but split names
+    (folds). In a task's own column the rows without its label are on no side: nobody learns from them or is asked."""
     for name in pack.table.column_names:
         values = pack.column(name)
         if values.dtype == object and set(np.unique(values.astype(str))) <= set(SPLITS):
-            sides = sides_of(values.astype(str))
+            own = [pack.column(f"label_{task.name}") >= 0 for task in pack.spec.tasks if task.split == name != "split"]
+            rows = np.flatnonzero(np.logical_or.reduce(own)) if own else np.arange(pack.num)
+            sides = sides_of(values.astype(str)[rows])
             if name == "split" or len(np.unique(sides)) > 1:
-                yield name, sides
+                yield name, rows, sides
 
 
 def leaks(pack: Pack) -> list[Finding]:
     """Groups, touch groups and other keys that lie on two sides, for every split column; sound folds are one finding."""
     findings, sound = [], []
     names = [n for n in ("group", "touch_group", *KEYS) if n in pack.table.column_names]
-    for split, sides in split_columns(pack):
+    for split, counted, sides in split_columns(pack):
         verdict: Verdict = "ok"
         notes, rows = [], []
         for name in names:
-            values = pack.column(name).astype(str)
+            values = pack.column(name).astype(str)[counted]
             on = {side: set(values[sides == side].tolist()) for side in np.unique(sides)}
             both = sorted({v for a in on for b in on if a < b for v in on[a] & on[b]})
             if both:
@@ -149,7 +152,7 @@ def leaks(pack: Pack) -> list[Finding]:
                 notes.append(f"{name}{kind}: {len(both)} of {len(set(values))} on two sides, e.g. {both[0]!r}{of}")
                 for one in both[:4]:  # a row from each side, next to each other on the sheet
                     mine = np.flatnonzero(values == one)
-                    rows += [int(mine[sides[mine] == side][0]) for side in np.unique(sides[mine])]
+                    rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
         if split != "split" and not notes:
             sound.append(split)
             continue
@@ -192,7 +195,7 @@ def mixture(pack: Pack) -> Finding:
             verdict = "look"
             notes.append(f"{column} {some(alone)} only in test")
         for task in pack.spec.tasks:
-            rows = pack.rows("train", "val", "test", only=task.only)
+            rows = pack.rows("train", "val", "test", only=task.only, by=task.split)
             labels = pack.column(f"label_{task.name}").astype(int)[rows]
             counted = (labels >= 0) & (values[rows] != "None")
             mine, labels = values[rows][counted], labels[counted]
@@ -255,7 +258,7 @@ def give_aways(pack: Pack) -> Finding:
     notes = []
     known = {column for columns in pack.spec.controls.values() for column in columns}
     for task in pack.spec.tasks:
-        rows = pack.rows("train", "val", only=task.only)
+        rows = pack.rows("train", "val", only=task.only, by=task.split)
         labels = pack.column(f"label_{task.name}").astype(int)[rows]
         rows, labels = rows[labels >= 0], labels[labels >= 0]
         if len(rows) < 64:
@@ -289,12 +292,18 @@ def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
 
 
 def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, labels and sums."""
+    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, names of groups, labels (also
+    as a table wrote them, with gaps where a row has none) and sums."""
+    other = {"id", *(task.name for task in pack.spec.tasks)}
+    names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
     for name in pack.table.column_names:
         values = pack.column(name)
+        if name in other or name.startswith(("label_", "crc_", "bytes_")):
+            continue
+        if any((values.astype(str) == one).all() for one in names):
+            continue
         values = _parsed(values) if values.dtype.kind == "O" else values
-        counted = name != "id" and not name.startswith(("label_", "crc_"))
-        if counted and values is not None and values.dtype.kind in "fiub":
+        if values is not None and values.dtype.kind in "fiub":
             yield name, values.astype(float)
 
 
@@ -304,7 +313,7 @@ def _parsed(values: np.ndarray) -> np.ndarray | None:
     known = 0
     for i, cell in enumerate(values):
         try:
-            out[i] = float(cell)
+            out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name, though Python reads a number
             known += 1
         except (TypeError, ValueError):
             continue
