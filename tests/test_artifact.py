@@ -6,6 +6,7 @@ import json
 import pickle
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,28 @@ def test_a_huge_header_is_refused_before_it_is_read(copy: Path) -> None:
     reseal(copy)
     with pytest.raises(ValueError, match="announces a header of 1099511627776 bytes"):
         mvitac.load(copy)
+
+
+def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A header of a few kilobytes may name one, with every digest in order."""
+    path = copy / "model.safetensors"
+    tensors, model = safetensors.torch.load_file(path), mvitac.load(copy)
+    monkeypatch.setattr(model, "run", replace(model.run, encoder=replace(model.run.encoder, trunk="resnetv2_152x4_bit")))
+    monkeypatch.setattr(model, "state_dict", lambda: tensors)
+    model.save(path)
+    reseal(copy)
+    made: list[str] = []
+    parameter = torch.nn.Parameter.__new__
+    monkeypatch.setattr(
+        torch.nn.Parameter,
+        "__new__",
+        lambda cls, data=None, requires_grad=True: made.append(data.device.type) or parameter(cls, data, requires_grad),
+    )
+    with pytest.raises(ValueError, match="holds other weights than its run describes"):
+        mvitac.load(copy)
+    assert set(made) == {"meta"}
 
 
 def test_a_huge_description_is_refused(copy: Path) -> None:
