@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -41,6 +42,14 @@ def test_features_are_the_models(model: Model, pack: Pack) -> None:
     history = {k: v[None].expand(4, -1, -1, -1, -1) for k, v in seen.items()}
     torch.testing.assert_close(encoder(history), wanted[None].expand(4, -1, -1), atol=1e-4, rtol=1e-4)
     assert encoder.out_features == wanted.shape[1]
+
+
+def test_images_are_seen_at_the_side_the_model_predicts_at(model: Model, pack: Pack) -> None:
+    """Which may be larger than that of the views it was trained on."""
+    model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
+    expected = model.embed(touch=pack.images["touch"][:4])["touch"]
+    found = ObservationEncoder(model, {"gel": "touch"})({"gel": observe(pack, [0, 1, 2, 3])["observation.images.gel"]})
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_a_policy_trains_its_head_and_leaves_the_encoders_alone(model: Model, pack: Pack) -> None:

@@ -46,7 +46,7 @@ class ObservationEncoder(nn.Module):
                     f" {', '.join(names)}"
                 )
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.keys})
-        self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.size, state, tune
+        self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.seen, state, tune
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         self.encoders.requires_grad_(tune)
