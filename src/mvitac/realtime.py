@@ -97,6 +97,8 @@ class Touch:
     end: float | None = None
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
+    known: list[str] = field(default_factory=list)
+    """The known touches it is most like, if there is an index."""
 
     def add(self, probabilities: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
@@ -150,7 +152,6 @@ class Live:
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
-        self.known: list[str] = []
         self.contact: bool | None = None
         self._seen = -1
         self._judged: dict[str, int] = {}
@@ -187,7 +188,7 @@ class Live:
             outputs = self.engine(**{m: x[None] for m, x in images.items()})
             self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
             if self.nearest:
-                self.known = self.nearest(outputs)
+                self.touch.known = self.nearest(outputs)
             age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
             self._ages[self.num_predictions % NUM_AGES] = age
             self.max_age = max(self.max_age, age)
@@ -198,6 +199,10 @@ class Live:
         if self.record:
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return made
+
+    def finish(self) -> None:
+        """End a touch that was still going on: no more frames will come."""
+        self._release(self.clock())
 
     @property
     def _leading_modality(self) -> str:
@@ -225,7 +230,7 @@ class Live:
     def _release(self, now: float) -> None:
         if self.touch is not None:
             self.touch.end = now
-            self.last, self.touch, self.known = self.touch, None, []
+            self.last, self.touch = self.touch, None
 
     def _heard(self, event: Event) -> None:
         self.counts[event.what] += 1
