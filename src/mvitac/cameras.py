@@ -72,7 +72,9 @@ class Camera(Source):
         given = [self.capture.get(name) for name, _ in asked]
         # A driver takes what it likes and says nothing; some report no rate at all.
         if any(value and has and abs(has - value) > 0.05 * value for has, (_, value) in zip(given, asked, strict=True)):
-            raise OSError(f"camera {self.which} has no such mode: it gives {given[0]:g}x{given[1]:g} at {given[2]:g} fps")
+            raise OSError(
+                f"camera {self.which} has no such mode: it gives {given[0]:g}x{given[1]:g} at {given[2]:g} fps"
+            )
         self.fps = given[2] or 30.0
 
     def read(self) -> np.ndarray:
@@ -182,8 +184,9 @@ MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d
 
 
 def source(text: str, modality: str) -> Source:
-    """A source from its name: a camera (``0``, ``/dev/video2``, ``serial:D20345``, with ``@320x240@60`` asked for that mode),
-    a video, a folder[@fps], or ``sim``[:seed]. ValueError if there is no such thing, or a file that cannot be read."""
+    """A source from its name: a camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` asks it for that mode), a
+    video, a folder[@fps], or ``sim``[:seed]. ValueError if there is no such thing, or a file that cannot be read.
+    """
     if text == "sim" or text.startswith("sim:"):
         seed = text.partition(":")[2] or "0"
         if not seed.isdigit():
