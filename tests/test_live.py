@@ -107,6 +107,17 @@ def test_old_frames_are_not_used(engine: Engine) -> None:
     assert world.live.num_predictions > before[0] + 30
 
 
+def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
+    """Rather than go on for as long as the sensor is silent."""
+    for fault in ("stalled", "unplugged"):
+        world = World(engine)
+        world.run(2.5)
+        assert world.live.touch is not None
+        world.rigs["touch"].fault = fault
+        world.run(1)
+        assert world.live.touch is None and world.live.last is not None
+
+
 def test_minutes_of_faults(engine: Engine) -> None:
     """Each kind of fault on each stream, one a minute. An hour: MVITAC_MINUTES=60 pytest -s -k minutes_of_faults."""
     minutes = int(os.environ.get("MVITAC_MINUTES", "10"))

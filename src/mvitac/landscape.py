@@ -118,6 +118,11 @@ class Landscape:
                 parts.append(text)
         return " · ".join(parts)
 
+    def name(self, i: int) -> str:
+        """The labels of row ``i``, or its id where it has none."""
+        said = [self.classes[task][labels[i]] for task, labels in self.labels.items() if labels[i] >= 0]
+        return ", ".join(said) or str(self.pack.table.column("id")[int(self.rows[i])])
+
     def picture(self, i: int, modality: str) -> np.ndarray:
         """uint8 [S, S, 3], or [S, 2 S, 3] for two sensors."""
         image = self.pack.images[modality][int(self.rows[i])]

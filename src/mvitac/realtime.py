@@ -148,7 +148,8 @@ class Live:
         self.contacts = {s.name: Contact(config) for s in streams.get("touch", ())}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
-        self.max_age = 0.0
+        self.age = self.max_age = 0.0
+        """Seconds from capture to answer of the latest prediction, and the most of any."""
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
@@ -164,6 +165,8 @@ class Live:
             stream.check()
         leading = self.leading.newest(take=False)
         if leading is None or leading.number == self._seen:
+            if any(stream.fault for stream in self.all):  # what cannot be seen is not known to go on
+                self._release(self.clock())
             return False
         frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
         self._seen = leading.number
@@ -189,9 +192,9 @@ class Live:
             self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
             if self.nearest:
                 self.touch.known = self.nearest(outputs)
-            age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
-            self._ages[self.num_predictions % NUM_AGES] = age
-            self.max_age = max(self.max_age, age)
+            self.age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
+            self._ages[self.num_predictions % NUM_AGES] = self.age
+            self.max_age = max(self.max_age, self.age)
             self.num_predictions += 1
             made = True
         else:
