@@ -91,6 +91,12 @@ def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
         encoder(seen)
     with pytest.raises(ValueError, match=r"expected images \[B, 3, H, W\]"):
         encoder({k: v[:, :1] for k, v in seen.items()})
+    for wrong in (
+        lambda x: x.float(),
+        lambda x: (x / 255 - 0.45) / 0.22,
+    ):  # not divided; normalised by the policy already
+        with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] or uint8"):
+            ObservationEncoder(model, KEYS)({k: wrong(v) for k, v in observe(pack, [0]).items()})
     with pytest.raises(ValueError, match=r"observation.state: expected \(1, 2\)"):
         encoder({**seen, "observation.state": torch.zeros(1, 3)})
 
