@@ -18,6 +18,7 @@ import torch
 import mvitac
 from mvitac.artifact import read_manifest, seal
 from mvitac.cli import main
+from mvitac.datasets.packed import PackConfig
 from mvitac.model import pack_features
 from mvitac.pack import Pack
 from mvitac.probe import parts
@@ -235,3 +236,28 @@ def test_what_the_hub_gives_is_checked_too(copy: Path, monkeypatch: pytest.Monke
     (copy / "run.json").write_text("{}")
     with pytest.raises(ValueError, match="does not match its digest"):
         mvitac.load("someone/touch")
+
+
+@pytest.mark.parametrize(
+    ("command", "advice"),
+    [("export {} --out x", "--on PACK"), ("explore {}", "--on PACK"), ("live {}", "give that folder")],
+)
+def test_without_its_data_a_command_says_what_to_do(
+    command: str,
+    advice: str,
+    artifact: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As on a robot, to which the artifact was copied."""
+
+    def gone(self: PackConfig) -> Pack:
+        raise ValueError("no pack at /somewhere/else")
+
+    monkeypatch.setattr(PackConfig, "open", gone)
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(command.format(artifact).split()) == 2
+    said = capsys.readouterr().err
+    assert "trained on is not here (no pack at /somewhere/else)" in said and advice in said
