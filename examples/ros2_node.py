@@ -2,9 +2,10 @@
 
     python examples/ros2_node.py exports/first --vision /camera/image_raw --touch /gel/image_raw
 
-Subscribes to sensor_msgs/Image (rgb8 or bgr8), publishes std_msgs/String (JSON: contact, class and confidence by task, age)
-on ~/prediction and std_msgs/Float32MultiArray on ~/embedding. Only ``main`` needs ROS: ``Node`` works on anything with the
-fields of an Image message, which is how it is tested.
+Subscribes to sensor_msgs/Image (rgb8 or bgr8), publishes std_msgs/String on ~/prediction and std_msgs/Float32MultiArray on
+~/embedding. A prediction is JSON: number of the touch, contact (true; false once, when it ends), age in ms, and the class
+and confidence of each task. Faults go to the node's log. Only ``main`` needs ROS: ``Node`` works on anything with the fields
+of an Image message, which is how it is tested.
 """
 
 from __future__ import annotations
@@ -67,17 +68,26 @@ class Node:
         }
         # Live needs no embedding; the node publishes it, so the engine's last outputs are kept.
         self.live = Live(Kept(engine, self.outputs), self.streams, clock=clock, tell=lambda event: warn(event.text))  # type: ignore[arg-type]
+        self.touched = False
 
     def image(self, modality: str, message: Any, which: int = 0) -> None:
         """Take one Image message; publishes if it completes an answer."""
         self.topics[modality][which].put(message)
         self.streams[modality][which].pump()
-        if not self.live.tick():
-            return
-        said = {task: {"class": c, "confidence": p} for task, (c, p) in self.live.answers(self.live.touch).items()}
-        self.publish("prediction", json.dumps({"touch": self.live.num_touches, "contact": True, **said}))
-        names = [n for n in self.outputs if n.startswith("embedding_")]
-        self.publish("embedding", np.concatenate([self.outputs[n][0] for n in names]).tolist())
+        self.tick()
+
+    def tick(self) -> None:
+        """Publish what is new; called now and then as well, for topics that have fallen silent say nothing of it."""
+        predicted, before = self.live.tick(), self.touched
+        self.touched = self.live.touch is not None
+        number = {"touch": self.live.num_touches, "contact": self.touched}
+        if predicted:
+            said = {task: {"class": c, "confidence": p} for task, (c, p) in self.live.answers(self.live.touch).items()}
+            self.publish("prediction", json.dumps({**number, "age_ms": 1000 * self.live.age, **said}))
+            names = [n for n in self.outputs if n.startswith("embedding_")]
+            self.publish("embedding", np.concatenate([self.outputs[n][0] for n in names]).tolist())
+        elif before and not self.touched:
+            self.publish("prediction", json.dumps(number))
 
 
 class Kept:
@@ -97,6 +107,11 @@ def main() -> None:
     parser.add_argument("--vision", action="append", default=[], help="image topic of the camera")
     parser.add_argument("--touch", action="append", default=[], help="image topic of a touch sensor; twice for two")
     options, rest = parser.parse_known_args()
+    engine = Engine(options.export)
+    for modality in ("vision", "touch"):
+        takes = engine.inputs.get(modality, (0, 0, 0))[2] // 3
+        if len(getattr(options, modality)) != takes:
+            parser.error(f"the model takes {takes} {modality} topic(s): give --{modality} TOPIC as many times")
 
     import rclpy  # pyright: ignore[reportMissingImports]
     from rclpy.qos import qos_profile_sensor_data  # pyright: ignore[reportMissingImports]
@@ -114,13 +129,14 @@ def main() -> None:
         publisher, message = publishers[kind]
         publisher.publish(message(data=value))
 
-    node = Node(Engine(options.export), publish, warn=ros.get_logger().warning)
+    node = Node(engine, publish, warn=ros.get_logger().warning)
     for modality, topics in (("vision", options.vision), ("touch", options.touch)):
         for which, topic in enumerate(topics):
             # Sensor data QoS: best effort, newest first; an old frame is of no use to us.
             ros.create_subscription(
                 Image, topic, lambda m, k=modality, i=which: node.image(k, m, i), qos_profile_sensor_data
             )
+    ros.create_timer(0.1, node.tick)
     try:
         rclpy.spin(ros)
     finally:

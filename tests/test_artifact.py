@@ -6,6 +6,7 @@ import json
 import pickle
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import torch
 import mvitac
 from mvitac.artifact import read_manifest, seal
 from mvitac.cli import main
+from mvitac.datasets.packed import PackConfig
 from mvitac.model import pack_features
 from mvitac.pack import Pack
 from mvitac.probe import parts
@@ -130,6 +132,30 @@ def test_a_huge_header_is_refused_before_it_is_read(copy: Path) -> None:
         mvitac.load(copy)
 
 
+def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A header of a few kilobytes may name one, with every digest in order."""
+    path = copy / "model.safetensors"
+    tensors, model = safetensors.torch.load_file(path), mvitac.load(copy)
+    monkeypatch.setattr(
+        model, "run", replace(model.run, encoder=replace(model.run.encoder, trunk="resnetv2_152x4_bit"))
+    )
+    monkeypatch.setattr(model, "state_dict", lambda: tensors)
+    model.save(path)
+    reseal(copy)
+    made: list[str] = []
+    parameter = torch.nn.Parameter.__new__
+    monkeypatch.setattr(
+        torch.nn.Parameter,
+        "__new__",
+        lambda cls, data=None, requires_grad=True: made.append(data.device.type) or parameter(cls, data, requires_grad),
+    )
+    with pytest.raises(ValueError, match="holds other weights than its run describes"):
+        mvitac.load(copy)
+    assert set(made) == {"meta"}
+
+
 def test_a_huge_description_is_refused(copy: Path) -> None:
     (copy / "artifact.json").write_text("[" * (2 << 20))
     with pytest.raises(ValueError, match="no artifact needs more"):
@@ -210,3 +236,28 @@ def test_what_the_hub_gives_is_checked_too(copy: Path, monkeypatch: pytest.Monke
     (copy / "run.json").write_text("{}")
     with pytest.raises(ValueError, match="does not match its digest"):
         mvitac.load("someone/touch")
+
+
+@pytest.mark.parametrize(
+    ("command", "advice"),
+    [("export {} --out x", "--on PACK"), ("explore {}", "--on PACK"), ("live {}", "give that folder")],
+)
+def test_without_its_data_a_command_says_what_to_do(
+    command: str,
+    advice: str,
+    artifact: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As on a robot, to which the artifact was copied."""
+
+    def gone(self: PackConfig) -> Pack:
+        raise ValueError("no pack at /somewhere/else")
+
+    monkeypatch.setattr(PackConfig, "open", gone)
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(command.format(artifact).split()) == 2
+    said = capsys.readouterr().err
+    assert "trained on is not here (no pack at /somewhere/else)" in said and advice in said

@@ -175,6 +175,7 @@ def test_the_page_in_a_browser(
             "document.querySelectorAll('.grid-wrap img, .gallery-item img').length >= 12",
             lambda: browser.click(*centre_of_a_point(browser, land, row)),
         )
+        check_zoom(browser, land, row)
         browser.run(CLICK_BOX)
         wrong = len(land.shown("test", "pattern", mistakes=True))
         browser.wait(f"{POINTS} == {wrong}")
@@ -187,17 +188,57 @@ def test_the_page_in_a_browser(
         assert browser.problems == []
 
 
-def test_a_page_with_nothing_to_show_says_so(browser: Browser, artifact: Path, pack: Pack) -> None:
-    """A run in which every answer is right, filtered to its mistakes."""
+def check_zoom(browser: Browser, land: Landscape, row: int) -> None:
+    """By wheel and by two fingers: the map changes, and what was under pointer or fingers is still there."""
+    x, y = centre_of_a_point(browser, land, row)
+    name = str(land.pack.column("id")[row])
+
+    def pinch() -> None:
+        for kind, apart in (("touchStart", 20), ("touchMove", 40), ("touchMove", 60)):
+            points = [{"x": x - apart, "y": y, "id": 0}, {"x": x + apart, "y": y, "id": 1}]
+            browser.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def hover() -> None:
+        browser.mouse("mouseMoved", 1, 1)
+        browser.mouse("mouseMoved", x, y)
+
+    for act in (lambda: browser.mouse("mouseWheel", x, y, deltaX=0, deltaY=-400), pinch):
+        browser.mouse("mouseMoved", 1, 1)
+        browser.run("window.before = document.querySelector('.map canvas').toDataURL()")
+        act()
+        browser.wait("document.querySelector('.map canvas').toDataURL() != window.before")
+        browser.until(f"document.querySelector('.tip').textContent.startsWith({name!r})", hover)
+
+
+def test_a_page_of_very_many_and_of_none(browser: Browser, artifact: Path, pack: Pack) -> None:
+    """100,000 rows, in which every answer is right: filtered to its mistakes, there is nothing to show."""
     port = free_port()
     code = (
-        "import mvitac; from mvitac.explorer import page, serve; from mvitac.landscape import Landscape;"
+        "import mvitac, numpy as np; from mvitac.explorer import page, serve; from mvitac.landscape import Landscape;"
         f"land = Landscape(mvitac.load({str(artifact)!r}), mvitac.Pack({str(pack.path)!r}));"
-        f"land.guess = dict(land.labels); serve(page({{'run': land}}), port={port})"
+        "i = np.arange(100_000) % len(land.rows); land.rows = land.rows[i]; land.split = np.full(len(i), 'test');"
+        "noise = np.random.default_rng(0).normal(0, 0.05, (len(i), 64)).astype('f4');"
+        "land.x = {m: x[i] + noise for m, x in land.x.items()};"
+        "land.labels = {t: x[i] for t, x in land.labels.items()}; land.guess = dict(land.labels);"
+        f"serve(page({{'run': land}}), port={port})"
     )
     with serving(["-c", code], port):
+        browser.resize(1200, 900)
         browser.open(f"http://127.0.0.1:{port}")
-        browser.wait(f"{POINTS} > 0")
+        browser.wait(f"{POINTS} == 100000")
+        middle = browser.run(
+            "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
+            " return [b.left + b.width / 2, b.top + b.height / 2] })()"
+        )
+
+        def hover() -> None:
+            browser.mouse("mouseMoved", 1, 1)
+            browser.mouse("mouseMoved", *middle)
+
+        browser.until("document.querySelectorAll('.tip img').length == 2", hover)
+        browser.until("document.querySelectorAll('.gallery-item img').length >= 12", lambda: browser.click(*middle))
         browser.run(CLICK_BOX)
         browser.wait(f"{POINTS} == 0")
         assert "nothing to show" in browser.run("document.querySelector('.count').textContent")
+        assert browser.problems == []

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
+import shutil
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +27,7 @@ from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.publish import with_readouts
 from mvitac.recipes import recipe
+from mvitac.record import digest, digest_file, write_json
 from mvitac.runtime import Engine, cosines
 from mvitac.train import train
 
@@ -208,6 +213,39 @@ def test_a_changed_byte_of_an_export_is_found(onnx: Path, tmp_path: Path, name: 
     (copy / name).write_bytes(data)
     with pytest.raises(ValueError, match=r"does not match its digest|not valid JSON"):
         Engine(copy)
+
+
+def test_a_pickle_or_a_library_in_a_torch_export_is_never_run(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+    """Even with every digest in order; torch itself would fall back to unpickling it."""
+
+    class Payload:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (Path.touch, (tmp_path / "owned",))
+
+    buffer = io.BytesIO()
+    torch.save({"a": Payload()}, buffer)
+    good = tmp_path / "good"
+    export(mvitac.load(smoke_run), pack, good, kind="torch", modalities=("touch",))
+    with zipfile.ZipFile(good / "model.pt2") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    inputs = next(name for name in members if "sample_inputs" in name)
+    root = inputs.partition("/")[0]
+    for name, message in (
+        (inputs, "cannot be opened"),
+        (f"{root}/data/constants/opaque_obj_0", "may be a program: refused"),
+        (f"{root}/data/aotinductor/model/a.wrapper.so", "may be a program: refused"),
+    ):
+        folder = shutil.copytree(good, tmp_path / "bad", dirs_exist_ok=True)
+        with zipfile.ZipFile(folder / "model.pt2", "w") as archive:
+            for member, content in {**members, name: buffer.getvalue()}.items():
+                archive.writestr(member, content)
+        meta = json.loads((folder / "export.json").read_text())
+        meta["files"]["model.pt2"] = digest_file(folder / "model.pt2")
+        del meta["digest"]
+        write_json(folder / "export.json", {**meta, "digest": digest(meta)})
+        with pytest.raises(ValueError, match=message):
+            Engine(folder)
+    assert not (tmp_path / "owned").exists()
 
 
 def test_an_engine_that_computes_otherwise_is_refused_on_the_spot(onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import pytest
 from faults import Clock, Rig, World, faulty
 from PIL import Image
 
-from mvitac.cameras import Folder, Simulated, source
+from mvitac.cameras import Camera, Folder, Simulated, source
 from mvitac.capture import CaptureThread, Stream
 from mvitac.cli import main
 from mvitac.datasets.lerobot import LeRobotConfig
@@ -107,6 +107,17 @@ def test_old_frames_are_not_used(engine: Engine) -> None:
     assert world.live.num_predictions > before[0] + 30
 
 
+def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
+    """Rather than go on for as long as the sensor is silent."""
+    for fault in ("stalled", "unplugged"):
+        world = World(engine)
+        world.run(2.5)
+        assert world.live.touch is not None
+        world.rigs["touch"].fault = fault
+        world.run(1)
+        assert world.live.touch is None and world.live.last is not None
+
+
 def test_minutes_of_faults(engine: Engine) -> None:
     """Each kind of fault on each stream, one a minute. An hour: MVITAC_MINUTES=60 pytest -s -k minutes_of_faults."""
     minutes = int(os.environ.get("MVITAC_MINUTES", "10"))
@@ -190,6 +201,75 @@ def test_sources_by_name(tmp_path: Path) -> None:
     assert missing.fault == "unplugged"
 
 
+def test_files_that_cannot_be_read_are_named_at_once(tmp_path: Path) -> None:
+    """Not taken for an unplugged camera, which may come back."""
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "no.mp4").write_text("no video")
+    for name, message in (("empty", "holds no pictures"), ("no.mp4", "cannot be read as a video"), ("empty@0", "rate")):
+        with pytest.raises(ValueError, match=message):
+            source(str(tmp_path / name), "touch")
+
+
+def test_opencv_is_asked_for_where_it_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").touch()
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    for text in ("0", "serial:D20345", str(tmp_path / "a.mp4")):
+        with pytest.raises(ValueError, match=r"needs OpenCV: pip install 'mvitac\[live\]'"):
+            source(text, "touch")
+
+
+def test_a_camera_is_asked_for_a_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    import cv2
+
+    width, height, fps = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS
+    rates = {(640, 480): 30.0, (320, 240): 60.0}
+
+    class Device:
+        """A camera of two modes, as a DIGIT is."""
+
+        def __init__(self, target: int | str) -> None:
+            self.mode: dict[int, float] = {width: 640, height: 480, fps: 30}
+
+        def set(self, name: int, value: float) -> None:
+            if name in (width, height):
+                self.mode[name] = value if value in (640, 480, 320, 240) else self.mode[name]
+            elif name == fps and value == rates[self.mode[width], self.mode[height]]:  # type: ignore[index]
+                self.mode[fps] = value
+
+        def get(self, name: int) -> float:
+            return self.mode[name]
+
+        def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
+            return True
+
+    monkeypatch.setattr(cv2, "VideoCapture", Device)
+    fast = source("3@320x240@60", "touch")
+    fast.open()
+    assert fast.fps == 60 and isinstance(fast, Camera) and fast.capture.mode == {width: 320, height: 240, fps: 60}
+    usual = source("/dev/video2", "touch")
+    usual.open()
+    assert usual.fps == 30 and isinstance(usual, Camera) and usual.which == "/dev/video2"
+    for text in ("3@60", "3@333x240"):
+        with pytest.raises(OSError, match="no such mode: it gives 640x"):
+            source(text, "touch").open()
+
+
+def test_no_error_of_a_driver_ends_a_stream() -> None:
+    class Broken(Rig):
+        def read(self) -> np.ndarray:
+            if self.fault:
+                raise RuntimeError("a driver's own kind of error")
+            return super().read()
+
+    clock = Clock()
+    rig, heard = Broken(clock, 0), []
+    stream = Stream("touch", rig, clock=clock, tell=heard.append)
+    for rig.fault in ("", "broken", ""):
+        clock.now += 2
+        stream.pump()
+    assert [e.what for e in heard] == ["unplugged", "back"] and "own kind of error" in heard[0].text
+
+
 def test_a_video_is_read_as_rgb(tmp_path: Path) -> None:
     import cv2
 
@@ -208,9 +288,19 @@ def test_a_video_is_read_as_rgb(tmp_path: Path) -> None:
 def test_the_simulated_sensor_rests_and_touches() -> None:
     sensor = Simulated("touch", 0, fps=2, size=32)
     sensor.open()
-    frames = np.stack([sensor.read() for _ in range(6)]).astype(float)
-    assert np.abs(frames[1] - frames[0]).mean() < 8  # at rest
-    assert np.abs(frames[3] - frames[0]).mean() > 2 * np.abs(frames[1] - frames[0]).mean()
+    frames = np.stack([sensor.read() for _ in range(18)]).astype(float)
+    change = np.abs(frames - frames[0]).mean((1, 2, 3))
+    assert (change[1:6] < 8).all()  # at rest: time to calibrate
+    for held, free in ((slice(6, 10), slice(10, 12)), (slice(12, 16), slice(16, 18))):
+        assert change[held].min() > 2 * change[1:6].max() and change[free].max() < 8
+
+
+def test_the_simulated_sensor_is_calibrated_while_free() -> None:
+    """Even where a third of the frames is dropped; else contact would be found the wrong way round."""
+    sensor, contact = Simulated("touch", 0, fps=30, size=32), Contact(LiveConfig())
+    sensor.open()
+    found = [contact(image) for image in [sensor.read() for _ in range(180)][::3]]
+    assert found == [None] * 29 + [False] + [True] * 20 + [False] * 10
 
 
 def test_a_thread_pumps_until_the_end(tmp_path: Path) -> None:
@@ -387,3 +477,6 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     assert summary["streams"]["touch"]["frames"] == 24 and summary["events"]["ended"] == 2
     shown = capsys.readouterr().out
     assert "has no more frames" in shown and "touch: 24 frames" in shown
+    assert summary["touches"] >= 1 and "touch 1 (" in shown  # also of a touch that the end of the files cut short
+    for wrong in (["--stale", "0"], ["--seconds", "-1"]):
+        assert main([*command, *wrong]) == 2 and "more than 0" in capsys.readouterr().err

@@ -12,11 +12,18 @@ from toy import Toy
 
 from mvitac import batches as batches_module
 from mvitac import probe as probe_module
+from mvitac import retrieval
 from mvitac.batches import partners
+from mvitac.cli import main
 from mvitac.datasets.packed import PackConfig
+from mvitac.export import _examples, export
+from mvitac.graph import Graph
+from mvitac.landscape import Landscape
+from mvitac.model import Model, load
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.probe import parts
+from mvitac.publish import fit_readouts
 from mvitac.recipes import recipe
 from mvitac.session import Session, probe_runs
 from mvitac.source import Sample
@@ -100,3 +107,36 @@ def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch:
     num = {r["modality"]: r["num_test"] for r in result["records"] if r["source"] == "mvitac"}
     assert num == {m: len(parts(holes, task, m).test) for m in ("vision", "touch", "both")}
     assert num["both"] < min(num["vision"], num["touch"])
+
+
+@pytest.fixture(scope="module")
+def model(holes: Pack, tmp_path_factory: pytest.TempPathFactory) -> Model:
+    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
+    return load(train(run, tmp_path_factory.mktemp("holes") / "run", quiet=True))
+
+
+def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> None:
+    found = fit_readouts(model, holes)
+    for task in holes.spec.tasks:
+        for modality in ("vision", "touch", "both"):
+            assert found[f"{task.name}.{modality}"].question.num_test == len(parts(holes, task, modality).test)
+
+
+def test_an_export_is_checked_and_calibrated_on_what_is_there(holes: Pack, model: Model, tmp_path: Path) -> None:
+    report = export(model, holes, tmp_path / "x", kind="torch", modalities=("touch",))
+    assert report["num_rows"] == len(holes.rows("test", having=("touch",))) < len(holes.rows("test"))
+    examples = _examples(Graph(model, ("touch",)), holes)
+    assert len(examples) == len(holes.rows("train", "unlabelled", having=("touch",)))
+    assert all(x.any() for (x,) in examples)
+
+
+def test_what_is_not_there_is_not_searched_embedded_or_shown(holes: Pack, model: Model, tmp_path: Path) -> None:
+    whole = np.flatnonzero(holes.has("vision") & holes.has("touch"))
+    index = retrieval.build(model, holes, tmp_path / "index")
+    assert index.table.column("row").to_pylist() == whole.tolist() == Landscape(model, holes).rows.tolist()
+    model.save(tmp_path / "model.safetensors")
+    arguments = ["embed", str(holes.path), "--model", str(tmp_path), "--out", str(tmp_path / "e.npz")]
+    assert main(arguments) == 0
+    found = np.load(tmp_path / "e.npz")
+    for m in ("vision", "touch"):
+        assert (np.isnan(found[m]).all(1) == ~holes.has(m)).all() and (np.isnan(found[m]).any(1) == ~holes.has(m)).all()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -41,6 +43,14 @@ def test_features_are_the_models(model: Model, pack: Pack) -> None:
     history = {k: v[None].expand(4, -1, -1, -1, -1) for k, v in seen.items()}
     torch.testing.assert_close(encoder(history), wanted[None].expand(4, -1, -1), atol=1e-4, rtol=1e-4)
     assert encoder.out_features == wanted.shape[1]
+
+
+def test_images_are_seen_at_the_side_the_model_predicts_at(model: Model, pack: Pack) -> None:
+    """Which may be larger than that of the views it was trained on."""
+    model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
+    expected = model.embed(touch=pack.images["touch"][:4])["touch"]
+    found = ObservationEncoder(model, {"gel": "touch"})({"gel": observe(pack, [0, 1, 2, 3])["observation.images.gel"]})
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_a_policy_trains_its_head_and_leaves_the_encoders_alone(model: Model, pack: Pack) -> None:
@@ -81,6 +91,12 @@ def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
         encoder(seen)
     with pytest.raises(ValueError, match=r"expected images \[B, 3, H, W\]"):
         encoder({k: v[:, :1] for k, v in seen.items()})
+    for wrong in (
+        lambda x: x.float(),
+        lambda x: (x / 255 - 0.45) / 0.22,
+    ):  # not divided; normalised by the policy already
+        with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] or uint8"):
+            ObservationEncoder(model, KEYS)({k: wrong(v) for k, v in observe(pack, [0]).items()})
     with pytest.raises(ValueError, match=r"observation.state: expected \(1, 2\)"):
         encoder({**seen, "observation.state": torch.zeros(1, 3)})
 
@@ -116,10 +132,75 @@ def test_the_ros_node_on_a_fake_publisher(onnx: Path) -> None:
     kinds = [kind for kind, _ in sent]
     assert kinds.count("prediction") == kinds.count("embedding") == pytest.approx(30, abs=2)
     said = json.loads(sent[0][1])
-    assert said["touch"] == 1 and said["pattern"]["class"] in engine.classes["pattern"]
+    assert said["touch"] == 1 and said["contact"] and said["pattern"]["class"] in engine.classes["pattern"]
+    assert said["age_ms"] == 0  # the fake clock stands still meanwhile
     assert len(sent[1][1]) == 128
+    clock.now += 5
+    node.tick()
+    assert sorted(warned[1:]) == ["touch 0 gives no frames since 5.0 s", "vision 0 gives no frames since 5.0 s"]
+    assert json.loads(sent[-1][1]) == {"touch": 1, "contact": False} and sent[-1][0] == "prediction"
     node.image("touch", SimpleNamespace(encoding="mono8"))
     assert "publish rgb8 or bgr8" in warned[-1]
+
+
+class FakeRos:
+    """rclpy and its messages, as far as the node uses them; ``spin`` sends what a camera and a gel would."""
+
+    def __init__(self, topics: dict[str, Rig], clock: Clock) -> None:
+        self.rigs, self.clock, self.sent, self.said = topics, clock, [], []
+        self.callbacks: dict[str, Any] = {}
+        self.timers: list[Any] = []
+
+    def modules(self) -> dict[str, Any]:
+        message = type("Message", (SimpleNamespace,), {})
+        return {
+            "rclpy": SimpleNamespace(
+                init=lambda args: None, create_node=lambda name: self, spin=self.spin, shutdown=lambda: None
+            ),
+            "rclpy.qos": SimpleNamespace(qos_profile_sensor_data="best effort"),
+            "sensor_msgs.msg": SimpleNamespace(Image=message),
+            "std_msgs.msg": SimpleNamespace(Float32MultiArray=message, String=message),
+        }
+
+    def create_publisher(self, kind: Any, topic: str, depth: int) -> Any:
+        return SimpleNamespace(publish=lambda m: self.sent.append((topic, m.data)))
+
+    def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
+        self.callbacks[topic] = callback
+
+    def create_timer(self, period: float, callback: Any) -> None:
+        self.timers.append(callback)
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(warning=self.said.append)
+
+    def destroy_node(self) -> None: ...
+
+    def spin(self, node: Any) -> None:
+        for tick in range(80):
+            self.clock.now = 99 + tick / 50
+            for topic, rig in self.rigs.items():
+                self.callbacks[topic](message(rig.read(), "bgr8"))
+            for timer in self.timers:
+                timer()
+
+
+def test_the_ros_node_itself(onnx: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its topics, messages and log, on a fake rclpy."""
+    ros2_node = load_example("ros2_node")
+    clock = Clock()
+    ros = FakeRos({"/camera": Rig(clock, 1), "/gel": Rig(clock, 2)}, clock)
+    for name, module in ros.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(ros2_node.Node.__init__, "__kwdefaults__", {"warn": print, "clock": clock})
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera", "--touch", "/gel"])
+    ros2_node.main()
+    assert {topic for topic, _ in ros.sent} == {"~/prediction", "~/embedding"} and len(ros.sent) >= 50
+    assert ros.said == ["touch 0 is calibrated without contact"]
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera"])
+    with pytest.raises(SystemExit):
+        ros2_node.main()
+    assert "the model takes 1 touch topic(s): give --touch TOPIC" in capsys.readouterr().err
 
 
 def test_a_message_is_read_as_rgb() -> None:

@@ -5,6 +5,8 @@ A ``Source`` opens, reads and closes; clocks, threads and faults are ``capture.p
 
 from __future__ import annotations
 
+import importlib.util
+import re
 from abc import ABC, abstractmethod
 from collections import deque
 from pathlib import Path
@@ -42,8 +44,9 @@ class Source(ABC):
 class Camera(Source):
     """A UVC camera by index, device path or USB serial number; DIGIT and GelSight Mini are such cameras."""
 
-    def __init__(self, which: str) -> None:
-        self.which = which
+    def __init__(self, which: str, size: tuple[int, int] | None = None, fps: float | None = None) -> None:
+        """``size`` (width, height) and ``fps`` to ask the camera for; None leaves it as it is."""
+        self.which, self.size, self.asked = which, size, fps
 
     def open(self) -> None:
         import cv2
@@ -58,7 +61,21 @@ class Camera(Source):
         self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame in a queue is worse than none
         if not self.capture.isOpened():
             raise OSError(f"camera {self.which} cannot be opened")
-        self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
+        asked = (
+            (cv2.CAP_PROP_FRAME_WIDTH, self.size and self.size[0]),
+            (cv2.CAP_PROP_FRAME_HEIGHT, self.size and self.size[1]),
+            (cv2.CAP_PROP_FPS, self.asked),
+        )
+        for name, value in asked:
+            if value:
+                self.capture.set(name, value)
+        given = [self.capture.get(name) for name, _ in asked]
+        # A driver takes what it likes and says nothing; some report no rate at all.
+        if any(value and has and abs(has - value) > 0.05 * value for has, (_, value) in zip(given, asked, strict=True)):
+            raise OSError(
+                f"camera {self.which} has no such mode: it gives {given[0]:g}x{given[1]:g} at {given[2]:g} fps"
+            )
+        self.fps = given[2] or 30.0
 
     def read(self) -> np.ndarray:
         good, image = self.capture.read()
@@ -120,15 +137,18 @@ class Folder(Source):
         try:
             with Image.open(path) as image:
                 return np.array(image.convert("RGB"))
-        except (OSError, SyntaxError) as error:  # Pillow's kinds for a damaged file
+        except Exception as error:  # Pillow has a kind for each damage
             raise ValueError(f"{path.name}: {brief(error)}") from None
 
 
 class Simulated(Source):
-    """A simulated sensor: one second of nothing, two of a touch of a new material, and so on; camera and gel agree."""
+    """A simulated sensor: one second of nothing, two of a touch of a new material, and so on; camera and gel agree.
+
+    Nothing for longer at first: live input learns the free gel from its first second, on a slow machine from later ones.
+    """
 
     paced = False
-    rest, hold = 1.0, 2.0
+    first, rest, hold = 3.0, 1.0, 2.0
 
     def __init__(self, modality: str, seed: int = 0, fps: float = 30.0, size: int = 72) -> None:
         self.modality, self.seed, self.fps, self.size = modality, seed, fps, size
@@ -140,7 +160,7 @@ class Simulated(Source):
     def read(self) -> np.ndarray:
         from mvitac.sim import gel, materials
 
-        when = self.number / self.fps
+        when = max(0.0, self.number / self.fps - self.first + self.rest)
         touch, phase = divmod(when, self.rest + self.hold)
         if int(touch) != self.touch:
             self.touch = int(touch)
@@ -160,27 +180,51 @@ class Simulated(Source):
         return np.clip(image + 0.5, 0, 255).astype(np.uint8)
 
 
+MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d+(\.\d+)?))?")
+
+
 def source(text: str, modality: str) -> Source:
-    """A source from its name: ``0``, ``/dev/video2``, ``serial:D20345``, a video, a folder[@fps], or ``sim``[:seed]."""
+    """A source from its name: a camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` asks it for that mode), a
+    video, a folder[@fps], or ``sim``[:seed]. ValueError if there is no such thing, or a file that cannot be read.
+    """
     if text == "sim" or text.startswith("sim:"):
         seed = text.partition(":")[2] or "0"
         if not seed.isdigit():
             raise ValueError(f"source {text!r}: give sim or sim:NUMBER")
         return Simulated(modality, int(seed))
-    if text.isdigit() or text.startswith("/dev/"):
-        return Camera(text)
-    if text.startswith("serial:"):
-        return Camera(text.removeprefix("serial:"))
+    mode = MODE.fullmatch(text)
+    if mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
+        _need_opencv(text)
+        size = (int(mode["width"]), int(mode["height"])) if mode["width"] else None
+        return Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
     name, at, rate = text.rpartition("@")
     path, fps = (Path(name), rate) if at and not Path(text).exists() else (Path(text), "30")
     if path.is_dir():
         try:
-            return Folder(path, float(fps))
+            if not 0 < float(fps) < float("inf"):
+                raise ValueError
         except ValueError:
             raise ValueError(f"source {text!r}: {fps!r} is no frame rate, give e.g. {path}@30") from None
+        return _readable(Folder(path, float(fps)), text)
     if path.is_file() and path.suffix.lower() in VIDEOS:
-        return Video(path)
+        _need_opencv(text)
+        return _readable(Video(path), text)
     raise ValueError(
         f"source {text!r}: give a camera number, /dev/videoN, serial:NAME, a video file ({', '.join(VIDEOS)}),"
         " a folder of pictures[@fps], or sim"
     )
+
+
+def _readable(files: Source, text: str) -> Source:
+    """``files`` again, if they can be opened: unlike a camera, they will not come back by waiting."""
+    try:
+        files.open()
+    except OSError as error:
+        raise ValueError(f"source {text!r}: {brief(error)}, give another") from None
+    files.close()
+    return files
+
+
+def _need_opencv(text: str) -> None:
+    if importlib.util.find_spec("cv2") is None:
+        raise ValueError(f"source {text!r} needs OpenCV: pip install 'mvitac[live]'")

@@ -87,7 +87,7 @@ class Stream:
             self.num_damaged += 1
             self._say("damaged frame", f"skipped a damaged frame ({brief(error)})")
             return
-        except OSError as error:
+        except Exception as error:  # OSError; OpenCV and the drivers under it have kinds of their own
             self._lost(error)
             return
         self._take(image)
@@ -143,7 +143,7 @@ class Stream:
             self.num_dropped += not self._taken
             self._newest, self._taken = Frame(image, now, self.num_frames), False
 
-    def _lost(self, error: OSError) -> None:
+    def _lost(self, error: Exception) -> None:
         self.origin.close()
         self._open, self._stalled = False, False
         self._retry_at = self.clock() + self.retry_every

@@ -35,6 +35,13 @@ canvas { width: 100%; height: 100%; border: 1px solid #ccc; background: #fff; to
 """
 
 
+CAPTIONS = """
+.caption-label { white-space: normal !important; max-width: 100% !important; line-height: 1.2 !important; }
+@media (max-width: 600px) { .caption-label { font-size: 10px !important; padding: 1px 3px !important; } }
+"""
+"""Of the galleries, whole: the label is what one looks for."""
+
+
 def tip(land: Landscape, i: int) -> str:
     """What hovering over a point shows: the pair's two pictures and a line of text."""
     pictures = []
@@ -56,7 +63,7 @@ def page(lands: dict[str, Landscape]) -> Any:
         return [land.points(modality, colour, split, task, mistakes=mistakes) for land in lands.values()]
 
     def found(land: Landscape, pairs: Sequence[tuple[int, float]], modality: str) -> list[tuple[np.ndarray, str]]:
-        return [(land.picture(i, modality), f"{score:.3f} · {land.describe(i)}") for i, score in pairs]
+        return [(land.picture(i, modality), f"{land.name(i)} · {score:.2f}") for i, score in pairs]
 
     with gr.Blocks(title="mvitac explorer") as blocks:
         gr.Markdown(f"### {' | '.join(lands)} on {first.pack.spec.name}")
@@ -91,7 +98,7 @@ def page(lands: dict[str, Landscape]) -> Any:
                         )
                     )
         chosen = gr.Markdown(
-            "Click a point for its nearest neighbours; scroll to zoom, drag to pan, double-click to reset."
+            "Click a point for its nearest neighbours; scroll or pinch to zoom, drag to pan, double-click to reset."
         )
         galleries = {
             m: gr.Gallery(label=f"nearest by {m}", columns=K, rows=1, height=220, object_fit="contain") for m in first.x
@@ -135,6 +142,12 @@ def serve(blocks: Any, *, host: str = "127.0.0.1", port: int | None = None, wait
     """Serve the page and return its address; fonts come from the machine, nothing from the network."""
     theme = Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])
     _, address, _ = blocks.launch(
-        server_name=host, server_port=port, share=False, quiet=True, prevent_thread_lock=not wait, theme=theme
+        server_name=host,
+        server_port=port,
+        share=False,
+        quiet=True,
+        prevent_thread_lock=not wait,
+        theme=theme,
+        css=CAPTIONS,
     )
     return address

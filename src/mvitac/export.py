@@ -76,6 +76,8 @@ def export(
         raise ValueError(f"{out} already exists: choose another --out, or delete it first")
     if int8 and kind == "torch":
         raise ValueError("--int8 is for onnx and openvino: give --format onnx or --format openvino")
+    if num_rows < 1:
+        raise ValueError(f"--rows {num_rows}: give at least 1")
     if precision == "bf16" and (kind != "openvino" or int8):
         raise ValueError("--precision bf16 is a mode of openvino without --int8: give --format openvino")
     check_place(out)
@@ -91,9 +93,10 @@ def export(
                 f" at {model.stored} px, as the training data has"
             )
     tolerance = tolerance or TOLERANCES["int8" if int8 else precision]
-    rows = pack.rows("test")[:: max(1, len(pack.rows("test")) // num_rows)][:num_rows]
+    rows = pack.rows("test", having=graph.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split test: an export is checked on rows nobody trained on")
+    rows = rows[:: max(1, len(rows) // num_rows)][:num_rows]
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -139,10 +142,10 @@ def export(
 
 def _examples(graph: Graph, pack: Pack) -> list[list[np.ndarray]]:
     """Single real inputs, spread over the train rows of ``pack``."""
-    rows = pack.rows("train", "unlabelled")
-    rows = rows[:: max(1, len(rows) // NUM_CALIBRATION)][:NUM_CALIBRATION]
+    rows = pack.rows("train", "unlabelled", having=graph.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split train: int8 takes its ranges from them")
+    rows = rows[:: max(1, len(rows) // NUM_CALIBRATION)][:NUM_CALIBRATION]
     return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in rows]
 
 
@@ -274,7 +277,8 @@ def parity(
         if before - after > tolerance.accuracy_loss:
             raise ValueError(
                 f"the export loses {before - after:.2f} points of accuracy on {task} ({before:.1f} to {after:.1f} %),"
-                f" at most {tolerance.accuracy_loss} is allowed: use another precision, or more calibration rows"
+                f" at most {tolerance.accuracy_loss} is allowed: use another precision, check on more --rows if the"
+                f" {len(rows)} here are few, or allow more, --accuracy-loss"
             )
     return report
 

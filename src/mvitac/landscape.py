@@ -18,7 +18,7 @@ from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.publish import with_readouts
 from mvitac.registry import unknown
-from mvitac.retrieval import nearest
+from mvitac.retrieval import check_pack, nearest
 
 COLOURS = (
     *("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#997700", "#004488", "#994455", "#117733"),
@@ -31,10 +31,16 @@ class Landscape:
     """One run's rows: ``rows`` [N] pack rows, ``x[modality]`` [N, D] unit features, ``guess[task]`` [N]."""
 
     def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
-        """At most ``limit`` rows are shown, evenly spread. The probes are fitted on the run's data if it has none."""
+        """At most ``limit`` rows are shown, evenly spread, of those that lack no image. The probes are fitted on the run's
+        data if it has none. ValueError if the pack's images do not fit the model.
+        """
+        names = check_pack(model, pack)
         self.model, self.pack = with_readouts(model, pack), pack
-        self.rows = np.arange(pack.num)[:: max(1, -(-pack.num // limit))]
-        raw = {m: features(model, pack, m, self.rows) for m in pack.spec.modalities if m in model.encoders}
+        whole = np.flatnonzero(np.all([pack.has(m) for m in names], axis=0))
+        if not len(whole):
+            raise ValueError(f"{pack.path} has no row with {' and '.join(names)}: there is nothing to show")
+        self.rows = whole[:: max(1, -(-len(whole) // limit))]
+        raw = {m: features(model, pack, m, self.rows) for m in names}
         self.x = {m: _unit(f) for m, f in raw.items()}
         self.modalities = (*raw, *(["both"] if len(raw) == 2 else []))
         self.split = pack.column("split")[self.rows].astype(str)
@@ -111,6 +117,11 @@ class Landscape:
                     text += f" (probe: {self.classes[task][self.guess[task][i]]})"
                 parts.append(text)
         return " · ".join(parts)
+
+    def name(self, i: int) -> str:
+        """The labels of row ``i``, or its id where it has none."""
+        said = [self.classes[task][labels[i]] for task, labels in self.labels.items() if labels[i] >= 0]
+        return ", ".join(said) or str(self.pack.table.column("id")[int(self.rows[i])])
 
     def picture(self, i: int, modality: str) -> np.ndarray:
         """uint8 [S, S, 3], or [S, 2 S, 3] for two sensors."""

@@ -186,9 +186,12 @@ def load(path: str | Path) -> Model:
     except (KeyError, ValueError) as error:
         raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
     # The file holds every weight, so the frame needs none of its own, and must not reach for the network.
-    model = fresh(replace(run, encoder=replace(run.encoder, weights=SCRATCH)), spec, stored)
+    frame = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
+    # Shapes before memory: a header of a few bytes may name a network that is larger than this machine.
+    with torch.device("meta"):
+        check_tensors(file, fresh(frame, spec, stored).state_dict(), tensors)
+    model = fresh(frame, spec, stored)
     model.run = run
-    check_tensors(file, model.state_dict(), tensors)
     model.load_state_dict(tensors)
     return model
 

@@ -46,9 +46,10 @@ class ObservationEncoder(nn.Module):
                     f" {', '.join(names)}"
                 )
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.keys})
-        self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.size, state, tune
+        self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.seen, state, tune
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+        self._looked: set[str] = set()
         self.encoders.requires_grad_(tune)
         self.encoders.eval()
         features = (int(e.num_features) for e in self.encoders.values())  # type: ignore[arg-type]
@@ -71,6 +72,7 @@ class ObservationEncoder(nn.Module):
                     raise ValueError(
                         f"{name}: expected images [B, 3, H, W] or [B, T, 3, H, W], got {tuple(image.shape)}"
                     )
+                self._check_range(name, image)
                 lead = image.shape[:-3]
                 views.append(self._view(image.flatten(0, -4)))
             with torch.set_grad_enabled(self.tune and torch.is_grad_enabled()):
@@ -87,6 +89,18 @@ class ObservationEncoder(nn.Module):
         if name not in observation:
             raise ValueError(f"the observation has no {name!r}: it has {', '.join(observation)}")
         return observation[name]
+
+    def _check_range(self, name: str, image: Tensor) -> None:
+        """The first images of a key only: looking at all would make a GPU wait for each."""
+        if name in self._looked:
+            return
+        low, high = (float(x) for x in image.aminmax())
+        if image.dtype != torch.uint8 and not (low >= -1e-3 and high <= 1 + 1e-3):
+            raise ValueError(
+                f"{name}: expected floats in [0, 1] or uint8, got {image.dtype} from {low:.3g} to {high:.3g}: the encoder"
+                " normalises images itself, give them as they come from the camera"
+            )
+        self._looked.add(name)
 
     def _view(self, image: Tensor) -> Tensor:
         """Normalised [N, 3, size, size], resized in the two steps that training took."""

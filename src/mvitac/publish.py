@@ -31,19 +31,18 @@ def fit_readouts(model: Model, pack: Pack) -> dict[str, Readout]:
     readouts = {}
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
     for task in pack.spec.tasks:
-        try:
-            rows = parts(pack, task)
-        except ValueError:
-            continue
-        everything = np.concatenate([rows.train, rows.val, rows.test])
         labels = pack.column(f"label_{task.name}").astype(int)
-        groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
-        seen = labels[np.concatenate([rows.train, rows.val])]
-        common = int(np.bincount(seen).argmax())
-        by_modality = {m: features(model, pack, m, everything) for m in modalities}
         for modality in [*modalities, *(["both"] if len(modalities) == 2 else [])]:
+            try:
+                rows = parts(pack, task, modality)
+            except ValueError:
+                continue
             names = modalities if modality == "both" else [modality]
-            x = np.concatenate([by_modality[m] for m in names], axis=1)
+            everything = np.concatenate([rows.train, rows.val, rows.test])
+            groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
+            seen = labels[np.concatenate([rows.train, rows.val])]
+            common = int(np.bincount(seen).argmax())
+            x = np.concatenate([features(model, pack, m, everything) for m in names], axis=1)
             learn, choose, test = np.split(x, np.cumsum([len(rows.train), len(rows.val)]))
             given: dict[str, Any] = {"task": task.name, "modality": modality, "classes": task.classes}
             given |= {"majority": float((labels[rows.test] == common).mean()), "num_test": len(rows.test)}
@@ -59,6 +58,14 @@ def fit_readouts(model: Model, pack: Pack) -> dict[str, Readout]:
                 readout = from_logistic(question, fitted.model, fitted.mean, fitted.std)
             readouts[readout.question.name] = readout
     return readouts
+
+
+def own_data(model: Model, instead: str) -> Pack:
+    """The data ``model`` was trained on; ValueError says what to do ``instead`` where it is not at hand."""
+    try:
+        return model.run.data.open()
+    except ValueError as error:
+        raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None
 
 
 def with_readouts(model: Model, pack: Pack | None = None) -> Model:
@@ -78,7 +85,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
     check_place(out)
     model = load(run)
     _, record = load_run(run)
-    pack = pack or model.run.data.open()
+    pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
     model = with_readouts(model, pack)
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)

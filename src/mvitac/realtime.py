@@ -97,6 +97,8 @@ class Touch:
     end: float | None = None
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
+    known: list[str] = field(default_factory=list)
+    """The known touches it is most like, if there is an index."""
 
     def add(self, probabilities: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
@@ -146,11 +148,11 @@ class Live:
         self.contacts = {s.name: Contact(config) for s in streams.get("touch", ())}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
-        self.max_age = 0.0
+        self.age = self.max_age = 0.0
+        """Seconds from capture to answer of the latest prediction, and the most of any."""
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
-        self.known: list[str] = []
         self.contact: bool | None = None
         self._seen = -1
         self._judged: dict[str, int] = {}
@@ -163,6 +165,8 @@ class Live:
             stream.check()
         leading = self.leading.newest(take=False)
         if leading is None or leading.number == self._seen:
+            if any(stream.fault for stream in self.all):  # what cannot be seen is not known to go on
+                self._release(self.clock())
             return False
         frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
         self._seen = leading.number
@@ -187,10 +191,10 @@ class Live:
             outputs = self.engine(**{m: x[None] for m, x in images.items()})
             self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
             if self.nearest:
-                self.known = self.nearest(outputs)
-            age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
-            self._ages[self.num_predictions % NUM_AGES] = age
-            self.max_age = max(self.max_age, age)
+                self.touch.known = self.nearest(outputs)
+            self.age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
+            self._ages[self.num_predictions % NUM_AGES] = self.age
+            self.max_age = max(self.max_age, self.age)
             self.num_predictions += 1
             made = True
         else:
@@ -198,6 +202,10 @@ class Live:
         if self.record:
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return made
+
+    def finish(self) -> None:
+        """End a touch that was still going on: no more frames will come."""
+        self._release(self.clock())
 
     @property
     def _leading_modality(self) -> str:
@@ -225,7 +233,7 @@ class Live:
     def _release(self, now: float) -> None:
         if self.touch is not None:
             self.touch.end = now
-            self.last, self.touch, self.known = self.touch, None, []
+            self.last, self.touch = self.touch, None
 
     def _heard(self, event: Event) -> None:
         self.counts[event.what] += 1

@@ -94,7 +94,7 @@ def describe(pack: Pack, rows: np.ndarray) -> pa.Table:
 
 
 def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> Index:
-    """Index the pairs of ``pack`` (of ``splits``; none = all) into the new folder ``out``.
+    """Index the whole pairs of ``pack`` (of ``splits``; none = all) into the new folder ``out``.
 
     In the space both modalities share if the model has one (touch finds vision and vision finds touch), else by features
     (each finds only its own kind).
@@ -103,9 +103,9 @@ def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> 
         raise ValueError(f"{out} already exists: choose another --out, or delete it first")
     check_place(out)
     modalities = check_pack(model, pack)
-    rows = pack.rows(*splits) if splits else np.arange(pack.num)
+    rows = pack.rows(*(splits or np.unique(pack.column("split"))), having=modalities)
     if not len(rows):
-        raise ValueError(f"{pack.path} has no rows in {', '.join(splits)}: nothing to index")
+        raise ValueError(f"{pack.path} has no whole pairs{' in ' * bool(splits)}{', '.join(splits)}: nothing to index")
     shared = all(m in model.projectors for m in modalities)
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)

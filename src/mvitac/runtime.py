@@ -5,11 +5,14 @@
              check.safetensors    a few real inputs and what the trained model made of them
 
 ``Engine(folder)`` verifies the digests and repeats those few inputs on this machine before the first prediction.
+Pickles in a torch export are refused; torch calls its format unsafe all the same, so open only those you trust.
 """
 
 from __future__ import annotations
 
 import os
+import re
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,11 @@ from mvitac.record import brief, digest, digest_file, read_json
 FORMAT, FORMAT_VERSION = "mvitac-export", 1
 MANIFEST, CHECK = "export.json", "check.safetensors"
 FILES = {"torch": ("model.pt2",), "onnx": ("model.onnx",), "openvino": ("model.xml", "model.bin")}
+TORCH_MEMBERS = re.compile(
+    r"data/weights/(weight_\d+|model_weights_config\.json)|data/constants/(tensor_\d+|model_constants_config\.json)"
+    r"|data/sample_inputs/model\.pt|models/model\.json|archive_format|archive_version|byteorder|\.data/\w+"
+)
+"""What torch.export writes of a model; compiled libraries and pickled objects, which it would run, are not among it."""
 Images = Mapping[str, np.ndarray]
 Call = Callable[[list[np.ndarray]], list[np.ndarray]]
 
@@ -118,7 +126,19 @@ def _openvino(path: Path, precision: str, threads: int) -> Call:
 def _torch(path: Path, precision: str, threads: int) -> Call:
     import torch
 
-    module = torch.export.load(path).module()
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            if not TORCH_MEMBERS.fullmatch(name.partition("/")[2]):
+                raise ValueError(f"it holds {name!r}, which mvitac does not write and which may be a program: refused")
+    # Else torch falls back to unpickling whatever it finds.
+    forced = os.environ.get("TORCH_FORCE_WEIGHTS_ONLY_LOAD")
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
+    try:
+        module = torch.export.load(path).module()
+    finally:
+        del os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"]
+        if forced is not None:
+            os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = forced
 
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
         with torch.inference_mode():

@@ -25,9 +25,8 @@ function load() {
 }
 
 function place(i) {  // canvas position of point i, in CSS pixels
-  const side = Math.min(canvas.clientWidth, canvas.clientHeight) * 0.92 * view.zoom;
-  return [canvas.clientWidth / 2 + (data.x[i] / 65535 - 0.5 + view.x) * side,
-          canvas.clientHeight / 2 + (data.y[i] / 65535 - 0.5 + view.y) * side];
+  return [canvas.clientWidth / 2 + (data.x[i] / 65535 - 0.5 + view.x) * side(),
+          canvas.clientHeight / 2 + (data.y[i] / 65535 - 0.5 + view.y) * side()];
 }
 
 function draw() {
@@ -49,6 +48,18 @@ function draw() {
     context.strokeRect(x - size, y - size, 2 * size, 2 * size);
   }
 }
+
+function side() { return Math.min(canvas.clientWidth, canvas.clientHeight) * 0.92 * view.zoom; }
+
+function zoom(factor, event) {  // what lies under the pointer stays there
+  const box = canvas.getBoundingClientRect(), before = side();
+  const px = event.clientX - box.left - canvas.clientWidth / 2, py = event.clientY - box.top - canvas.clientHeight / 2;
+  view.zoom = Math.max(0.5, Math.min(200, view.zoom * factor));
+  view.x += px / side() - px / before; view.y += py / side() - py / before;
+  hide();
+}
+
+function hide() { hovered = -1; tip.style.display = "none"; draw(); }
 
 function nearest(event) {
   const box = canvas.getBoundingClientRect(), px = event.clientX - box.left, py = event.clientY - box.top;
@@ -75,28 +86,42 @@ async function show(event) {
   tip.style.top = `${y > canvas.clientHeight / 2 ? y - tip.offsetHeight - 12 : y + 12}px`;
 }
 
-canvas.addEventListener("pointerdown", (e) => { drag = { x: e.clientX, y: e.clientY, moved: false }; canvas.setPointerCapture(e.pointerId); });
+// Pointers that are down: the mouse or a finger drags, two fingers zoom as well, about the point between them.
+const fingers = new Map();
+function grip() {
+  const all = [...fingers.values()], mean = (key) => all.reduce((sum, f) => sum + f[key], 0) / all.length;
+  const spread = all.length > 1 ? Math.hypot(all[0].clientX - all[1].clientX, all[0].clientY - all[1].clientY) : 0;
+  return { clientX: mean("clientX"), clientY: mean("clientY"), spread };
+}
+
+canvas.addEventListener("pointerdown", (e) => {
+  fingers.set(e.pointerId, { clientX: e.clientX, clientY: e.clientY });
+  drag = { at: grip(), moved: fingers.size > 1 };
+  canvas.setPointerCapture(e.pointerId);
+});
 canvas.addEventListener("pointermove", (e) => {
-  if (!drag) return show(e);
-  const side = Math.min(canvas.clientWidth, canvas.clientHeight) * 0.92 * view.zoom;
-  const dx = e.clientX - drag.x, dy = e.clientY - drag.y;
+  if (!fingers.has(e.pointerId)) return show(e);
+  fingers.set(e.pointerId, { clientX: e.clientX, clientY: e.clientY });
+  const now = grip(), dx = now.clientX - drag.at.clientX, dy = now.clientY - drag.at.clientY;
   if (drag.moved || Math.abs(dx) + Math.abs(dy) > 4) {
     drag.moved = true;
-    view.x += dx / side; view.y += dy / side; drag.x = e.clientX; drag.y = e.clientY;
-    tip.style.display = "none";
-    draw();
+    view.x += dx / side(); view.y += dy / side();
+    zoom(now.spread && drag.at.spread ? now.spread / drag.at.spread : 1, now);
+    drag.at = now;
   }
 });
+canvas.addEventListener("pointercancel", () => { fingers.clear(); drag = null; });
 canvas.addEventListener("pointerup", (e) => {
+  fingers.delete(e.pointerId);
+  if (fingers.size) { drag = { at: grip(), moved: true }; return; }
   const clicked = drag && !drag.moved ? nearest(e) : -1;
   drag = null;
   if (clicked >= 0) { show(e); trigger("click", { row: data.row[clicked] }); }
 });
-canvas.addEventListener("pointerleave", () => { if (!drag) { hovered = -1; tip.style.display = "none"; draw(); } });
+canvas.addEventListener("pointerleave", () => { if (!drag) hide(); });
 canvas.addEventListener("wheel", (e) => {
   e.preventDefault();
-  view.zoom = Math.max(0.5, Math.min(200, view.zoom * Math.exp(-e.deltaY / 400)));
-  draw();
+  zoom(Math.exp(-e.deltaY / 400), e);
 }, { passive: false });
 canvas.addEventListener("dblclick", () => { view = { x: 0, y: 0, zoom: 1 }; draw(); });
 new ResizeObserver(draw).observe(canvas);

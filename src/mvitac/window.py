@@ -24,7 +24,8 @@ TOUCHED, FAULT = (60, 170, 90), (200, 60, 50)
 def draw(loop: Live) -> np.ndarray:
     """uint8 RGB [H, W, 3] of fixed size: streams side by side (framed green in contact, red at fault), answers below."""
     width = SIDE * max(2, len(loop.all))
-    answers = loop.answers(loop.touch or loop.last)
+    touch = loop.touch or loop.last
+    answers = loop.answers(touch)
     picture = Image.new("RGB", (width, SIDE + LINE * (2 + len(loop.engine.classes))), BACK)
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(14)
     for i, stream in enumerate(loop.all):
@@ -42,8 +43,8 @@ def draw(loop: Live) -> np.ndarray:
         pen.rectangle((width // 2, top + 5, width // 2 + round(confidence * (width // 2 - 60)), top + LINE - 5), FAINT)
         pen.text((EDGE, top + 3), f"{task}: {name}{'' if sure else ' (unsure)'}", TEXT if sure else FAINT, font)
         pen.text((width - 50, top + 3), f"{100 * confidence:.0f} %", TEXT if sure else FAINT, font)
-    if loop.known:
-        pen.text((EDGE, picture.height - LINE + 3), "like: " + "; ".join(loop.known), TEXT, font)
+    if touch and touch.known:
+        pen.text((EDGE, picture.height - LINE + 3), "like: " + "; ".join(touch.known), TEXT, font)
     return np.asarray(picture)
 
 

@@ -13,6 +13,7 @@ def explore(argv: list[str]) -> None:
 
     from mvitac.artifact import load
     from mvitac.pack import Pack
+    from mvitac.publish import own_data
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -36,7 +37,7 @@ def explore(argv: list[str]) -> None:
     if options.rows < 3:
         raise ValueError(f"--rows {options.rows}: give at least 3")
     models = [load(run) for run in options.runs]
-    pack = Pack(options.on) if options.on else models[0].run.data.open()
+    pack = Pack(options.on) if options.on else own_data(models[0], "show another pack, --on PACK")
     try:
         from mvitac.explorer import page, serve
         from mvitac.landscape import Landscape

@@ -38,7 +38,8 @@ def live(argv: list[str]) -> None:
         """Predict from live frames: the newest always wins, old ones are never used, every fault is named. Ctrl-C ends it
         with a summary.
 
-        A SOURCE is a camera number, /dev/videoN, serial:NAME, a video file, a folder of pictures[@fps], or sim[:seed].
+        A SOURCE is a camera (its number, /dev/videoN or serial:NAME; with @WIDTHxHEIGHT and @FPS it is asked for that mode,
+        e.g. serial:D20345@320x240@60), a video file, a folder of pictures[@FPS], or sim[:SEED].
         A recording that a crash cut short: mvitac live --finish DIR
         """
 
@@ -69,6 +70,9 @@ def live(argv: list[str]) -> None:
         live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
     options = parse(Options, argv, "live")
+    for name, seconds in (("--seconds", options.seconds), ("--stale", options.stale)):
+        if seconds is not None and not seconds > 0:
+            raise ValueError(f"{name} {seconds:g}: give seconds, more than 0")
     if options.json:
         check_place(options.json)
     console = Console()
@@ -97,7 +101,7 @@ def live(argv: list[str]) -> None:
         options.live,
         nearest=nearest,
         record=recorder,
-        tell=lambda event: console.print(f"[yellow]{event.text}[/yellow]", highlight=False),
+        tell=lambda event: console.print(event.text, style="yellow", soft_wrap=True, highlight=False, markup=False),
     )
     news = threading.Event()
     threads = [CaptureThread(stream, news.set) for stream in loop.all]
@@ -127,6 +131,8 @@ def live(argv: list[str]) -> None:
             thread.join(2.0)  # a device that hangs must not hang us
         if window:
             window.close()
+    loop.finish()
+    _speak(loop, console, spoken)
     summary = loop.summary()
     if recorder:
         num = recorder.close()
@@ -140,7 +146,7 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     """An export as it is; anything else exported once, into the cache."""
     from mvitac.artifact import load
     from mvitac.export import export
-    from mvitac.publish import with_readouts
+    from mvitac.publish import own_data, with_readouts
     from mvitac.record import cache_dir
     from mvitac.runtime import MANIFEST, Engine
 
@@ -149,8 +155,8 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     loaded = load(model)
     folder = cache_dir() / "exports" / loaded.weights_digest()[:32]
     if not folder.exists():
-        console.print(f"exporting {model} for ONNX Runtime, once")
-        pack = loaded.run.data.open()
+        console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
+        pack = own_data(loaded, "`mvitac export` it where the data is, and give that folder")
         export(with_readouts(loaded, pack), pack, folder, kind="onnx")
     return Engine(folder, threads=threads)
 
@@ -161,7 +167,9 @@ def _speak(loop: "Live", console: Any, spoken: int) -> int:
     if touch is None or touch.number <= spoken or touch.end is None:
         return spoken
     said = ", ".join(_answer(loop, *item) for item in loop.answers(touch).items())
-    console.print(f"touch {touch.number} ({touch.end - touch.start:.1f} s): {said}", highlight=False)
+    like = f"; like: {'; '.join(touch.known)}" if touch.known else ""
+    text = f"touch {touch.number} ({touch.end - touch.start:.1f} s): {said}{like}"
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
     return touch.number
 
 
@@ -191,8 +199,8 @@ def view(loop: "Live") -> Any:
     for task, (name, confidence) in loop.answers(touch).items():
         sure = "" if confidence >= loop.config.min_confidence else "  unsure"
         lines.append(Text(f"{task:10} {name:18} {'#' * round(20 * confidence):20} {100 * confidence:3.0f} %{sure}"))
-    if loop.known:
-        lines.append(Text("like: " + "; ".join(loop.known)))
+    if touch and touch.known:
+        lines.append(Text("like: " + "; ".join(touch.known)))
     age = loop.summary()["age_ms"]
     if age["p50"] is not None:
         text = "age p50 {p50:.1f}  p99 {p99:.1f}  max {max:.1f} ms".format(**age)

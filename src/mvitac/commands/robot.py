@@ -56,7 +56,7 @@ def export(argv: list[str]) -> None:
     from mvitac import export as exports
     from mvitac.artifact import load
     from mvitac.pack import Pack
-    from mvitac.publish import with_readouts
+    from mvitac.publish import own_data, with_readouts
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -83,12 +83,14 @@ def export(argv: list[str]) -> None:
         """Least cosine allowed (default: .9999 for fp32, .99 for bf16, .95 for int8)."""
         accuracy_loss: float = 0.5
         """Points of accuracy that a task may lose."""
+        rows: int = 512
+        """Most test rows to check on."""
         threads: int = 0
         """CPU threads while measuring latency; 0 = all cores."""
 
     options = parse(Options, argv, "export")
     model = load(options.model)
-    pack = Pack(options.on) if options.on else model.run.data.open()
+    pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
     usual = exports.TOLERANCES["int8" if options.int8 else options.precision]
     report = exports.export(
         with_readouts(model, pack),
@@ -103,6 +105,7 @@ def export(argv: list[str]) -> None:
             min_cosine=usual.min_cosine if options.min_cosine is None else options.min_cosine,
             accuracy_loss=options.accuracy_loss,
         ),
+        num_rows=options.rows,
         threads=options.threads,
     )
     table = Table(title=f"{options.out}: checked on {report['num_rows']} test rows", title_justify="left")

@@ -30,7 +30,7 @@ def embed(argv: list[str]) -> None:
 
     @dataclass(frozen=True, kw_only=True)
     class Options(_Embedding):
-        """Embeddings of every row of a pack, with ids, groups, splits and labels."""
+        """Embeddings of every row of a pack, with ids, groups, splits and labels; NaN where a row lacks the image."""
 
         out: Path
         """The file: .npz (numpy) or .parquet."""
@@ -42,12 +42,13 @@ def embed(argv: list[str]) -> None:
         raise ValueError(f"--out {options.out}: give a name that ends in .npz or .parquet")
     check_place(options.out)
     model, pack = load(options.model), Pack(options.pack)
-    rows = np.arange(pack.num)
-    table = describe(pack, rows)
-    found = {
-        m: np.concatenate(list(embeddings(model, pack, m, rows, shared=options.shared)))
-        for m in check_pack(model, pack)
-    }
+    table = describe(pack, np.arange(pack.num))
+    found = {}
+    for m in check_pack(model, pack):
+        rows = np.flatnonzero(pack.has(m))
+        x = np.concatenate(list(embeddings(model, pack, m, rows, shared=options.shared)))
+        found[m] = np.full((pack.num, x.shape[1]), np.nan, np.float32)
+        found[m][rows] = x
     if options.out.suffix == ".npz":
         columns = {name: np.array(table.column(name).to_pylist()) for name in table.column_names}
         write_atomic(options.out, lambda file: np.savez(file, **columns, **found))  # type: ignore[arg-type]
