@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from mvitac.record import provenance
+
 OURS = "mvitac"
 ENGINES = {OURS: "mvitac.retrieval", "scikit-learn": "sklearn.neighbors", "faiss": "faiss", "usearch": "usearch.index"}
 """Engine -> the module it needs."""
@@ -153,6 +155,7 @@ def main() -> None:
     same = {n: float(np.mean([a == b for a, b in zip(found[OURS], found[n], strict=True)])) for n in names[1:]}
     result |= {"same_results": same, "num": options.num, "dim": options.dim, "threads": options.threads}
     result["load"] = os.getloadavg()[0]
+    result |= provenance()
     print(json.dumps(result, indent=1))
     if options.out:
         options.out.write_text(json.dumps(result, indent=1) + "\n")

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -218,6 +219,47 @@ def test_a_slip_in_a_local_path_does_not_ask_the_hub(
     (tmp_path / "runs").mkdir()
     with pytest.raises(ValueError, match="no trained model at"):
         mvitac.load("runs/frist")
+
+
+def test_the_hub_mixin_takes_the_artifact_there_and_back(
+    artifact: Path, tmp_path: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import huggingface_hub
+    from huggingface_hub import hub_mixin
+
+    hub, asked = tmp_path / "hub", {}
+
+    class Api:
+        def __init__(self, token: str | None = None) -> None:
+            pass
+
+        def create_repo(self, repo_id: str, *, private: bool, exist_ok: bool) -> Any:
+            asked.update(private=private)
+            return SimpleNamespace(repo_id=repo_id)
+
+        def upload_folder(self, *, repo_id: str, folder_path: Path, **options: Any) -> str:
+            shutil.copytree(folder_path, hub / repo_id)
+            return f"somewhere/{repo_id}"
+
+    def download(repo: str, **options: Any) -> str:
+        asked.update(options)
+        return str(hub / repo)
+
+    monkeypatch.setattr(hub_mixin, "HfApi", Api)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    assert push(artifact, "someone/touch", private=True) == "somewhere/someone/touch" and asked["private"]
+    files = {path.name: digest_file(path) for path in (hub / "someone/touch").iterdir()}
+    assert files == {path.name: digest_file(path) for path in artifact.iterdir()}
+
+    model = mvitac.PublishedModel.from_pretrained("someone/touch", revision="v2", local_files_only=True)
+    assert asked["revision"] == "v2" and asked["local_files_only"]
+    images = pack.images["touch"][:5]
+    assert torch.equal(model.embed(touch=images)["touch"], mvitac.load(artifact).embed(touch=images)["touch"])
+    model.save_pretrained(tmp_path / "again")
+    assert mvitac.PublishedModel.from_pretrained(tmp_path / "again").classes == model.classes
+    (hub / "someone/touch/run.json").write_text("{}")
+    with pytest.raises(ValueError, match="does not match its digest"):
+        model.from_pretrained("someone/touch")
 
 
 def test_what_the_hub_gives_is_checked_too(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

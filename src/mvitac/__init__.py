@@ -12,7 +12,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mvitac.artifact import load
+    from mvitac.artifact import PublishedModel, load
     from mvitac.model import Model
     from mvitac.pack import Pack
     from mvitac.recipes import recipe
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from mvitac.train import train
 
 __version__ = "0.1.0"
-__all__ = ["Model", "Pack", "Run", "load", "recipe", "train"]
+__all__ = ["Model", "Pack", "PublishedModel", "Run", "load", "recipe", "train"]
 
-_HOME = {"Model": "model", "Pack": "pack", "Run": "run", "load": "artifact", "recipe": "recipes", "train": "train"}
+_HOME = {"Model": "model", "Pack": "pack", "Run": "run", "recipe": "recipes", "train": "train"}
+_HOME |= {"load": "artifact", "PublishedModel": "artifact"}
 
 
 def __getattr__(name: str) -> Any:

@@ -13,10 +13,13 @@ checked against its digest before it is parsed; a file that artifact.json may no
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+from huggingface_hub import ModelHubMixin
+from torch import nn
 
 from mvitac import model as models
 from mvitac.encoders import IMAGENET_MEAN, IMAGENET_STD
@@ -36,6 +39,32 @@ MAX_HEADER, MAX_MANIFEST = 4 << 20, 1 << 20
 HUB_ID = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(@(?P<revision>[\w./-]+))?")
 
 
+class PublishedModel(Model, ModelHubMixin):
+    """A model from an artifact, with the Hub's usual ``from_pretrained``, ``save_pretrained`` and ``push_to_hub``.
+
+    What goes up is the artifact as it was published, file by file; what comes down is checked as a local one is.
+    """
+
+    def __init__(self, model: Model, folder: Path) -> None:
+        nn.Module.__init__(self)
+        self.__dict__.update(vars(model))
+        self.folder = folder
+        self._hub_mixin_config = None  # run.json and artifact.json say it all: no config.json beside them
+
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_model_name_or_path: str | Path, *, revision: str | None = None, **options: Any
+    ) -> PublishedModel:
+        """The artifact in a folder, or of "owner/name" on the Hub; ``options`` as ``snapshot_download`` has them (token,
+        cache_dir, local_files_only, force_download)."""
+        local = Path(pretrained_model_name_or_path)
+        return read(local if local.is_dir() else pull(str(pretrained_model_name_or_path), revision, **options))
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        for name in (MANIFEST, *read_manifest(self.folder)["files"]):
+            shutil.copyfile(self.folder / name, save_directory / name)
+
+
 def load(path: str | Path) -> Model:
     """A trained model, in eval mode, from a run's folder, an artifact's folder, or "owner/name[@revision]" on the Hub.
 
@@ -50,12 +79,12 @@ def load(path: str | Path) -> Model:
     return read(local) if (local / MANIFEST).is_file() else models.load(local)
 
 
-def pull(repo: str, revision: str | None = None) -> Path:
+def pull(repo: str, revision: str | None = None, **options: Any) -> Path:
     """The artifact ``repo`` from the Hugging Face Hub, in its local cache; only an artifact's own files are fetched."""
     from huggingface_hub import snapshot_download
 
     try:
-        return Path(snapshot_download(repo, revision=revision, allow_patterns=[MANIFEST, *FILES]))
+        return Path(snapshot_download(repo, revision=revision, allow_patterns=[MANIFEST, *FILES], **options))
     except Exception as error:  # offline, not found, no access: the client has a kind for each
         raise ValueError(
             f"there is no folder {repo} here, and it could not be had from the Hugging Face Hub ({brief(error)}):"
@@ -79,7 +108,7 @@ def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]
     }
 
 
-def read(folder: Path) -> Model:
+def read(folder: Path) -> PublishedModel:
     """The model in the artifact ``folder``, with its probes; ValueError if anything is not as it was published."""
     manifest = read_manifest(folder)
     model = models.load(folder / "model.safetensors")
@@ -91,7 +120,7 @@ def read(folder: Path) -> Model:
                 " predictions would be wrong, publish it again"
             )
     model.readouts = read_probes(folder, manifest, model)
-    return model.eval()
+    return PublishedModel(model, folder).eval()
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 
-from mvitac.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, read_manifest, seal
+from mvitac.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.features import features
 from mvitac.heads import fit_linear, spread_out
 from mvitac.model import Model, load, load_run
@@ -174,15 +174,11 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
 
 def push(artifact: Path, repo: str, *, private: bool = False) -> str:
     """Upload a checked ``artifact`` to the Hugging Face Hub as ``repo`` ("owner/name") and return its address."""
-    from huggingface_hub import HfApi
-
     if not HUB_ID.fullmatch(repo) or "@" in repo:
         raise ValueError(f"{repo!r} is no name on the Hub: give owner/name")
-    files = read_manifest(artifact)["files"]
+    model = read(artifact)
     try:
-        api = HfApi()
-        address = api.create_repo(repo, private=private, exist_ok=True)
-        api.upload_folder(repo_id=repo, folder_path=artifact, allow_patterns=[MANIFEST, *files])
+        address = model.push_to_hub(repo, private=private, commit_message=f"{model.run.method.name} by mvitac publish")
     except Exception as error:  # offline, no login, no right to write: the client has a kind for each
         raise ValueError(
             f"{repo} could not be written on the Hugging Face Hub ({brief(error)}): check the network and the login"
