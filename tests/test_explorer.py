@@ -19,7 +19,7 @@ from PIL import Image
 
 import mvitac
 from mvitac.cli import main
-from mvitac.landscape import Landscape
+from mvitac.landscape import COLOURS, Landscape
 from mvitac.pack import Pack
 
 
@@ -43,6 +43,27 @@ def test_points_carry_place_colour_and_row(land: Landscape, pack: Pack) -> None:
     names = [value["legend"][c][0] for c in value["colour"]]
     assert names == [pack.spec.tasks[0].classes[i] for i in pack.column("label_pattern")[rows]]
     np.testing.assert_allclose(value["xy"].T / 65535, land.plane("both")[rows], atol=1e-4)
+
+
+def test_twenty_colours_are_told_apart() -> None:
+    """On white and on black, too. Distances are OKLab's (Ottosson 2020); .02 is about the least that an eye sees."""
+    srgb = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in COLOURS])
+    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    cones = [
+        [0.41222147, 0.53633254, 0.05144599],
+        [0.2119035, 0.6806995, 0.10739696],
+        [0.08830246, 0.28171884, 0.62997870],
+    ]
+    opponent = [
+        [0.21045426, 0.79361779, -0.00407205],
+        [1.97799850, -2.42859221, 0.45059371],
+        [0.02590404, 0.78277177, -0.80867577],
+    ]
+    lab = np.cbrt(light @ np.array(cones).T) @ np.array(opponent).T
+    apart = np.linalg.norm(lab[:, None] - lab, axis=2) + 9 * np.eye(len(lab))
+    assert len(COLOURS) == 20 and apart.min() > 0.16
+    luminance = light @ [0.2126, 0.7152, 0.0722]
+    assert (1.05 / (luminance + 0.05)).min() > 1.5 and ((luminance + 0.05) / 0.05).min() > 1.9
 
 
 def test_the_plane_holds_the_most_variance(land: Landscape) -> None:

@@ -25,9 +25,10 @@ MAP = (
 )
 STYLE = """
 .map { position: relative; width: 100%; height: min(70vh, 560px, 110vw); }
-canvas { width: 100%; height: 100%; border: 1px solid #ccc; background: #fff; touch-action: none; cursor: crosshair; }
-.tip { position: absolute; display: none; max-width: 260px; padding: 6px; font-size: 12px; color: #111;
-       background: #fff; border: 1px solid #888; pointer-events: none; z-index: 5; }
+canvas { width: 100%; height: 100%; border: 1px solid var(--border-color-primary); touch-action: none; cursor: crosshair;
+         background: var(--background-fill-primary); color: var(--body-text-color); }
+.tip { position: absolute; display: none; max-width: 260px; padding: 6px; font-size: 12px; pointer-events: none;
+       background: var(--background-fill-primary); color: var(--body-text-color); border: 1px solid #888; z-index: 5; }
 .tip img { width: 112px; height: 112px; object-fit: contain; image-rendering: pixelated; display: inline; }
 .legend span { display: inline-block; margin: 2px 10px 2px 0; font-size: 12px; }
 .legend i { display: inline-block; width: 10px; height: 10px; margin-right: 4px; }

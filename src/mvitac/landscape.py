@@ -21,10 +21,11 @@ from mvitac.registry import unknown
 from mvitac.retrieval import check_pack, nearest
 
 COLOURS = (
-    *("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#997700", "#004488", "#994455", "#117733"),
-    *("#ddaa33", "#bb5566", "#44aa99", "#882255", "#88ccee", "#332288", "#cc6677", "#999933", "#aa4499", "#6699cc"),
+    *("#2490fc", "#fc783c", "#008400", "#a80048", "#fc54fc", "#604800", "#00f000", "#6c00a8", "#e4cc90", "#0c8490"),
+    *("#0000f0", "#fc0c78", "#54c078", "#9c7830", "#6cccfc", "#c000c0", "#004878", "#fcb4fc", "#7848fc", "#b484b4"),
 )
-"""Paul Tol's colour-blind safe sets; classes beyond the twentieth begin again."""
+"""Twenty hues and lightnesses as far apart in OKLab as a search found (least distance .165, and .067 as seen without
+green cones), legible on white and on black; classes beyond the twentieth begin again."""
 
 
 class Landscape:

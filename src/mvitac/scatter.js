@@ -44,7 +44,7 @@ function draw() {
   });
   if (hovered >= 0) {
     const [x, y] = place(hovered);
-    context.strokeStyle = "#000"; context.lineWidth = 2;
+    context.strokeStyle = getComputedStyle(canvas).color; context.lineWidth = 2;
     context.strokeRect(x - size, y - size, 2 * size, 2 * size);
   }
 }
