@@ -51,8 +51,8 @@ def modern(data: DatasetConfig) -> Run:
     - keys end-to-end: gradients through both views instead of a momentum tower, as in SimCLR. At equal steps and images
       ahead of every other self-supervised method on category, at equal time by 3 points of the paper's way, for steps
       that take half as much again (docs/results/materials.md).
-    - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away; from scratch, too, it is
-      worth 8 points of category (one seed).
+    - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away. From scratch,
+      too, 8 points of category (one seed).
     - BatchNorm in the heads (SimCLR v2, MoCo v3): keeps the embeddings from collapsing early at small batches.
       Level (three seeds: without it +1.2, p .57).
     - momentum .99 rising to 1 (BYOL, MoCo v3) for the methods that have one: the keys settle as the queries do.
@@ -60,9 +60,9 @@ def modern(data: DatasetConfig) -> Run:
     - one-per-touch batches: consecutive frames of one touch are near-duplicates, and as negatives they teach nonsense.
       Level on simulated touches, which have no consecutive frames (one seed).
     - same-touch positives: two views of one image share lamp, background and sensor, which solves L_vv and L_tt without
-      looking at the material (docs/simulator.md has the figures); another row of the touch shares only the thing: 5 points
-      of category and of soft, 9 of rough (one seed). Not for
-      grasps: rows of one differ by before, during and after, and what tells these apart is the contact itself.
+      looking at the material (docs/simulator.md has the figures); another row of the touch shares only the thing. 5
+      points of category and of soft, 9 of rough (one seed). Not for grasps: rows of one differ by before, during and
+      after, and what tells these apart is the contact itself.
     """
     base = paper(data)
     phased = isinstance(data, (GraspsConfig, CalandraConfig))
