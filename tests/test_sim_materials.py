@@ -85,7 +85,8 @@ def test_difference_images_are_of_the_same_sensor_before_contact():
         assert np.array_equal(drawn["touch"], a.touch), "drawing the background changes no other picture"
         assert np.abs(2.0 * b.touch - 256 + drawn["background"] - a.touch).max() <= 1
         reached.append([np.abs(a.touch - np.median(a.touch)).mean(), np.abs(b.touch - 128.0).mean()])
-    assert np.mean(reached, axis=0)[1] < np.mean(reached, axis=0)[0] / 2  # lamps, dots and dirt are gone
+    whole, differing_only = np.mean(reached, axis=0)
+    assert 4 < differing_only < whole / 2  # the imprint is there; lamps, dots and dirt are gone
 
 
 def test_labels_are_balanced_and_not_the_category_again():
