@@ -133,8 +133,8 @@ def synchronise_norms(module: nn.Module, world: World) -> nn.Module:
 class SyncedBatchNorm(nn.BatchNorm2d):
     """BatchNorm over the batches of all processes, for backends that torch's SyncBatchNorm does not serve (gloo).
 
-    Takes [B, C] and [B, C, H, W]; every process must have the same B. Statistics in fp32, differentiable through the
-    all-reduce.
+    Takes [B, C] and [B, C, H, W]; every process must have the same B. Statistics in fp32. One message per pass; the
+    arithmetic is that of torch's own kernels, with everyone's statistics.
     """
 
     def _check_input_dim(self, input: Tensor) -> None:
@@ -146,22 +146,45 @@ class SyncedBatchNorm(nn.BatchNorm2d):
         if not self.training:
             return super().forward(input)
         assert self.running_mean is not None and self.running_var is not None and self.momentum is not None
-        x = input.float()
-        axes = [0] if x.ndim == 2 else [0, 2, 3]
-        size = dist.get_world_size()
-        mean = _sum_over_processes(x.mean(axes)) / size
-        centred = x - mean.view(1, -1, *[1] * (x.ndim - 2))  # two passes: no cancellation
-        variance = _sum_over_processes(centred.square().mean(axes)) / size
-        num = size * x.numel() // x.shape[1]
+        scratch = torch.zeros_like(self.running_mean)
         with torch.no_grad():
+            own = torch.stack(torch.batch_norm_update_stats(input, scratch, scratch.clone(), 0.0)).float()
+            means, variances = _everyones(own).unbind(1)  # each [N, C]
+            mean = means.mean(0)
+            variance = (variances + (means - mean).square()).mean(0)  # no cancellation
+            num = len(means) * input.numel() // len(mean)
             self.running_mean.lerp_(mean, self.momentum)
-            self.running_var.lerp_(variance * num / max(1, num - 1), self.momentum)
+            self.running_var.lerp_(variance * (num / max(1, num - 1)), self.momentum)
             if self.num_batches_tracked is not None:
                 self.num_batches_tracked.add_(1)
-        shape = (1, -1, *[1] * (x.ndim - 2))
-        scale = (self.weight if self.affine else 1) * (variance + self.eps).rsqrt()
-        out = centred * scale.view(shape)
-        return (out + self.bias.view(shape) if self.affine else out).to(input.dtype)
+        weight, bias = (self.weight, self.bias) if self.affine else (scratch + 1, scratch)
+        return _Normalise.apply(input, weight, bias, mean, variance, self.eps)  # type: ignore[return-value]
+
+
+class _Normalise(torch.autograd.Function):
+    """(x - mean) / sqrt(variance + eps) * weight + bias, where mean and variance are those of all processes' x.
+
+    Gradient of x: with s = weight / sqrt(variance + eps), n the number of values of all processes per channel, y the
+    normalised x and sums over all processes, s g - s (sum(g) + y sum(g y)) / n. Both terms are kernels of BatchNorm with
+    fixed statistics: its backward, and itself with another weight and bias.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mean: Tensor, variance: Tensor, eps: float) -> Tensor:
+        ctx.save_for_backward(x, weight, mean, variance)
+        ctx.eps = eps
+        return torch.native_batch_norm(x, weight, bias, mean, variance, False, 0.0, eps)[0]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, mean, variance = ctx.saved_tensors
+        g, weight_gradient, bias_gradient = torch.ops.aten.native_batch_norm_backward(
+            gradients[0], x, weight, mean, variance, None, None, False, ctx.eps, [True, True, True]
+        )
+        sums = _all_reduced(torch.stack([weight_gradient, bias_gradient]).float())
+        scale = weight * (variance + ctx.eps).rsqrt() / (dist.get_world_size() * x.numel() // len(mean))
+        other = torch.native_batch_norm(x, -scale * sums[0], -scale * sums[1], mean, variance, False, 0.0, ctx.eps)[0]
+        return g + other, weight_gradient, bias_gradient, None, None, None
 
 
 class _Sum(torch.autograd.Function):
@@ -183,5 +206,8 @@ def _all_reduced(value: Tensor) -> Tensor:
     return total
 
 
-def _sum_over_processes(value: Tensor) -> Tensor:
-    return _Sum.apply(value, True, True)  # type: ignore[return-value]
+def _everyones(own: Tensor) -> Tensor:
+    """[size, ...]: ``own`` of every process."""
+    found = [torch.empty_like(own) for _ in range(dist.get_world_size())]
+    dist.all_gather(found, own)
+    return torch.stack(found)
