@@ -92,14 +92,45 @@ class Jpegs(Source):
 
 
 def interleave(variants: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, float]:
-    """Median seconds per call of each variant, called in turn so that a busy moment of the machine hits all alike."""
-    for run in variants.values():
-        clock(run, device)  # once for caches, kernels and compilation
+    """Median seconds per call of each variant, called in turn so that a busy moment of the machine hits all alike.
+
+    NaN for one that a GPU has not the memory for, or that torch cannot compile; what it said is printed.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in variants}
-    for _ in range(rounds):
+    lost: dict[str, str] = {}
+    for turn in range(1 + rounds):  # once for caches, kernels and compilation
         for name, run in variants.items():
-            seconds[name].append(clock(run, device))
-    return {name: median(values) for name, values in seconds.items()}
+            if name in lost:
+                continue
+            try:
+                value = clock(run, device)
+            except (torch.OutOfMemoryError, torch._dynamo.exc.TorchDynamoException) as error:
+                lost[name] = str(error).split(". ")[0].splitlines()[0]
+                print(f"{name}: {lost[name]}")
+                torch.cuda.empty_cache()
+                continue
+            if turn:
+                seconds[name].append(value)
+    return {name: float("nan") if name in lost else median(values) for name, values in seconds.items()}
+
+
+def peak_memory(run: Callable[[], object], device: torch.device) -> dict[str, float]:
+    """GiB of a GPU that one call takes over what lies there before it; {} on a CPU or where it does not fit."""
+    if device.type != "cuda":
+        return {}
+    torch.cuda.synchronize(device)
+    before = torch.cuda.memory_allocated(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    try:
+        run()
+    except torch.OutOfMemoryError:
+        return {}
+    return {"peak_gib": (torch.cuda.max_memory_allocated(device) - before) / 2**30}
+
+
+def known(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """``rows`` without what could not be measured."""
+    return {name: {key: value for key, value in row.items() if value == value} for name, row in rows.items()}
 
 
 def our_run(scale: Scale, precision: str, **changes: Any) -> Run:
@@ -126,8 +157,10 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
     close = [image.contiguous(memory_format=torch.channels_last) for image in images]
     small = [image.bfloat16() for image in close]
 
-    def ours(precision: str, **changes: Any) -> Callable[[], object]:
+    def ours(precision: str, mode: str | None = None, **changes: Any) -> Callable[[], object]:
         step = our_step(scale, precision, spec, device, **changes)
+        if mode:
+            step.forward = torch.compile(step.method, fullgraph=True, mode=mode)
         given = small if precision == "bf16" else close
         views = {"vision": [given[0], given[2]], "touch": [given[1], given[3]]}
         batch = Views(images=views, labels={}, rows=torch.arange(scale.batch))
@@ -147,8 +180,9 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
         variants["lightly's parts, fp32"] = lambda: moco((images[0], images[2]), (images[1], images[3]))
     if scale.compile:
         variants["ours bf16 compiled"] = ours("bf16", compile=True)
+        variants["ours bf16 compiled, CUDA graphs"] = ours("bf16", mode="reduce-overhead")
     seconds = interleave(variants, scale.rounds, device)
-    flop = floors["fp32"].flop(close)
+    flop = floors["fp32"].flop([image[:8] for image in close]) * scale.batch // 8
     peaks = {p: peak(device, p) for p in ("fp32", "bf16")}
     rows = {}
     for name, value in seconds.items():
@@ -160,8 +194,9 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
             "of_matmul_peak": flop / value / peaks[precision]["matmul"],
             "of_conv_peak": flop / value / peaks[precision]["conv"],
             "over_typical": seconds["typical fp32"] / value,
+            **peak_memory(variants[name], device),
         }
-    return {"flop_per_pair": flop / scale.batch, "peak_flop_per_s": peaks, "variants": rows}
+    return {"flop_per_pair": flop / scale.batch, "peak_flop_per_s": peaks, "variants": known(rows)}
 
 
 def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
@@ -180,7 +215,7 @@ def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
         variants |= ours
     seconds = interleave(variants, scale.rounds, device)
     speeds = {n: (1 if "alone" in n else 4) * scale.batch / s for n, s in seconds.items()}  # four images per pair
-    return {n: {"images_per_s": v, "over_typical": v / speeds["typical, JPEG files"]} for n, v in speeds.items()}
+    return known({n: {"images_per_s": v, "over_typical": v / speeds["typical, JPEG files"]} for n, v in speeds.items()})
 
 
 def in_torch(call: Callable[[], object]) -> Callable[[], object]:
@@ -219,6 +254,7 @@ def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
         n: {"pairs_per_s": scale.batch / s, "over_typical": first / s, "of_step_alone": only / s}
         for n, s in seconds.items()
     }
+    rows = known(rows)
     hours = PAPER_PAIRS * PAPER_EPOCHS * seconds["ours bf16, pack to weights"] / scale.batch / 3600
     return {"variants": rows, "hours_for_the_papers_pretraining": hours}
 
@@ -271,13 +307,17 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--batch", type=int, nargs="+", help="default 32 on a CPU, 256 and 1024 on a GPU")
     parser.add_argument("--rounds", type=int)
-    parser.add_argument("--workers", type=int, default=0, help="of the typical DataLoader")
+    parser.add_argument(
+        "--workers", type=int, help="of the typical DataLoader; default none on a CPU, up to 8 on a GPU"
+    )
     parser.add_argument("--sections", nargs="+", default=["step", "input", "whole", "probe", "caching"])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     device, console = torch.device(options.device), Console()
     cuda = device.type == "cuda"
-    scale = Scale(compile=cuda, rounds=20 if cuda else 5, num_pairs=2048 if cuda else 128)
+    scale = Scale(compile=cuda, rounds=10 if cuda else 5, num_pairs=1024 if cuda else 128)
+    workers = min(8, os.cpu_count() or 1) if cuda else 0
+    workers = workers if options.workers is None else options.workers
     if options.quick:
         scale = Scale(trunk="resnet10t", size=64, batch=16, rounds=3, num_pairs=32)
     scale = replace(scale, rounds=options.rounds or scale.rounds)
@@ -301,10 +341,10 @@ def main() -> None:
                 part["step"] = measure_steps(at, pack.spec, device)
                 show(console, f"step, batch {batch}, {scale.size} px, {scale.trunk}", part["step"]["variants"])
             if "input" in options.sections:
-                part["input"] = measure_input(at, folder / "jpegs", pack, device, options.workers)
+                part["input"] = measure_input(at, folder / "jpegs", pack, device, workers)
                 show(console, "input", part["input"])
             if "whole" in options.sections:
-                part["whole"] = measure_whole(at, folder / "jpegs", pack, device, options.workers)
+                part["whole"] = measure_whole(at, folder / "jpegs", pack, device, workers)
                 show(console, "end to end", part["whole"]["variants"])
                 hours = part["whole"]["hours_for_the_papers_pretraining"]
                 console.print(f"the paper's pre-training (92k pairs x 240 epochs) at this speed: {hours:.1f} h")

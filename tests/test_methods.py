@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from test_train import assert_equal_weights, power_cut, smoke
+from torch._subclasses.fake_tensor import FakeTensorMode
 from toy import Toy
 
 from mvitac.batch import Views
@@ -73,6 +74,36 @@ def test_every_trained_weight_gets_a_gradient_and_no_other(name: str, touch: int
     for parameter_name, parameter in method.named_parameters():
         assert (parameter.grad is not None) == (id(parameter) in trained), parameter_name
     assert {id(p) for trunk in method.encoders().values() for p in trunk.parameters()} <= trained
+
+
+@pytest.mark.skipif(not torch.backends.cuda.is_built(), reason="torch without CUDA knows no CUDA tensors")
+@pytest.mark.filterwarnings("ignore:CUDA is not available")
+@pytest.mark.parametrize("name", NAMES)
+def test_on_a_gpu_nothing_stays_behind_and_nothing_is_waited_for(name: str) -> None:
+    """Losses, update and after_step on torch's fake CUDA tensors, which have a device but no values: an operation over two
+    devices raises, and so does whatever would wait for a value."""
+    method, batch = build(name).train(), views(build(name))
+    cuda = torch.device("cuda")
+    with FakeTensorMode():
+
+        def fake(real: torch.Tensor) -> torch.Tensor:
+            return torch.empty(real.shape, dtype=real.dtype, device=cuda)
+
+        moved: dict[int, torch.nn.Parameter] = {}
+        for module in method.modules():
+            for key, weight in module._parameters.items():
+                if weight is not None:
+                    moved.setdefault(id(weight), torch.nn.Parameter(fake(weight), weight.requires_grad))
+                    module._parameters[key] = moved[id(weight)]
+            module._buffers.update({key: None if b is None else fake(b) for key, b in module._buffers.items()})
+        images = {m: [fake(view) for view in seen] for m, seen in batch.images.items()}
+        labels = {task: fake(label) for task, label in batch.labels.items()}
+        losses = method(Views(images=images, labels=labels, rows=fake(batch.rows)))
+        assert {value.device.type for value in losses.values()} == {"cuda"}
+        for parameter in method.parameters():
+            parameter.grad = fake(parameter) if parameter.requires_grad else None
+        build_optimiser(Optim(name="adamw"), method).step()
+        method.after_step(0.5)
 
 
 @pytest.mark.parametrize("name", NAMES)

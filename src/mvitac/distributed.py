@@ -170,7 +170,9 @@ class _Normalise(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mean: Tensor, variance: Tensor, eps: float) -> Tensor:
+    def forward(
+        ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mean: Tensor, variance: Tensor, eps: float
+    ) -> Tensor:
         ctx.save_for_backward(x, weight, mean, variance)
         ctx.eps = eps
         return torch.native_batch_norm(x, weight, bias, mean, variance, False, 0.0, eps)[0]
