@@ -1,55 +1,35 @@
 #!/usr/bin/env bash
-# Everything behind docs/results/real.md: manifests, pre-training, probes, tables. CPU only.
-#   examples/real.sh ../shared/data runs/real 0 1 2          (data, output, seeds; stops and resumes at any point)
-#   SETS="vt60 physiclear" examples/real.sh ...              (only these sets: several calls may run side by side)
+# Everything behind docs/results/real.md: manifests, then all methods of Tables I and II on every set. CPU only.
+#   examples/real.sh ../shared/data runs/real --jobs 2       (data, output, options of mvitac compare; resumes anywhere)
+#   STEPS=300 SETS="vt60 physiclear" examples/real.sh ...    (more training; only these sets)
 set -euo pipefail
 data=$1 out=$2
 shift 2
-seeds=("$@")
-here=$(dirname "$0")
-mvitac=(python -m mvitac)
-[ -d "$out/manifests" ] || python "$here/real_manifests.py" "$data" "$out/manifests"
+options=("$@")
+[ -d "$out/manifests" ] || python "$(dirname "$0")/real_manifests.py" "$data" "$out/manifests"
 
-# pretrain NAME SPLIT SEED OPTIONS...: one run of the recipe demo cut to 300 steps (the sets are small); a finished one
-# is left alone
-pretrain() {
-  local name=$1 split=$2 seed=$3 run="$out/$1/$2-seed$3"
+# methods NAME PLAN BATCH OPTIONS...: one table. Batch: the power of two nearest to the grasps or recordings in train, at most 64.
+methods() {
+  local name=$1 plan=$2 batch=$3
   shift 3
-  [ -f "$run/model.safetensors" ] || "${mvitac[@]}" pretrain --data folder --recipe demo --steps 300 "$@" --data.title "$name" \
-    --data.path "$out/manifests/$name.csv" --data.group object --data.split "$split" --data.size 72 \
-    --eval-every 0 --seed "$seed" --quiet --resume --out "$run"
-}
-
-# probe NAME SPLIT: all seeds of one split beside the controls; repeated when a run is newer
-probe() {
-  local json="$out/$1/$2.json" run stale=
-  for run in "$out/$1/$2"-seed*; do [ "$json" -nt "$run/model.safetensors" ] || stale=yes; done
-  [ -z "$stale" ] || "${mvitac[@]}" probe "$out/$1/$2"-seed* --json "$json"
-}
-
-# road NAME "SPLITS" OPTIONS...: all runs of a set, their probes, and one table
-road() {
-  local name=$1 splits=$2 split seed
   [[ " ${SETS:-$name} " == *" $name "* ]] || return 0
-  shift 2
-  for seed in "${seeds[@]}"; do
-    for split in $splits; do pretrain "$name" "$split" "$seed" "$@"; done
-  done
-  for split in $splits; do probe "$name" "$split"; done
-  if [ -f "$out/$name/fold1.json" ]; then
-    python "$here/pool_folds.py" "$out/$name"/fold*.json > "$out/$name.md"
-  else
-    for split in $splits; do python "$here/pool_folds.py" "$out/$name/$split.json" > "$out/$name-$split.md"; done
-  fi
+  python -m mvitac compare --plan "$plan" --data folder --recipe demo --out "$out/$name" \
+    --set steps="${STEPS:-100}" batch_size="$batch" eval_every=0 \
+    --data.title "$name" --data.group object --data.size 72 "$@" "${options[@]}"
 }
 
-road slip_grasp "fold1 fold2 fold3 fold4 fold5 fold6" --batch-size 32 --data.labels success --data.touch-group grasp \
+methods slip_grasp table2 32 --data.path "$out/manifests/slip_grasp.csv" --data.labels success --data.touch-group grasp \
   --data.label-only "seq<=4" --data.controls "width=width_mm" "width in sweep=width_in_sweep" \
+  --folds split=fold1 split=fold2 split=fold3 split=fold4 split=fold5 split=fold6 \
   --data.licence MIT --data.source-url github.com/wkoa/slip_detection
-road slip_gsmini "fold1 fold2 fold3" --batch-size 64 --data.labels slip --data.touch-group experiment \
+methods vt60 table1 32 --data.path "$out/manifests/vt60.csv" --data.labels category --data.controls "pose=x,y,z" \
+  --folds split=fold1 split=fold2 split=fold3 --data.source-url github.com/Exhor/deep_visuotactile_classification
+methods slip_gsmini table2 64 --data.path "$out/manifests/slip_gsmini.csv" --data.labels slip --data.touch-group experiment \
   --data.controls "motion=motion_left,motion_right" "recording length=n_frames" \
+  --folds split=fold1 split=fold2 split=fold3 \
   --data.licence BSD-2-Clause --data.source-url github.com/amitparag/Incipient-Slip-Detection
-road physiclear "by-group owners_split" --batch-size 64 --data.labels material hardness roughness bumpiness \
-  --data.touch-group video --data.controls "contact energy=contact_energy" --data.source-url github.com/clear-nus/octopi
-road vt60 "fold1 fold2 fold3" --batch-size 32 --data.labels category --data.controls "pose=x,y,z" \
-  --data.source-url github.com/Exhor/deep_visuotactile_classification
+for split in by-group owners_split; do
+  methods "physiclear-$split" table1 64 --data.path "$out/manifests/physiclear.csv" --data.split "$split" \
+    --data.labels material hardness roughness bumpiness --data.touch-group video \
+    --data.controls "contact energy=contact_energy" --data.source-url github.com/clear-nus/octopi
+done

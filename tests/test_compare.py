@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from toy import Toy, toy_pack
 
 from mvitac import compare as module
@@ -433,3 +434,84 @@ def test_slurm_without_submitit_is_one_line(
     plan = write_plan(tmp_path / "plan.json", 1, 1, 2)
     assert main([*command(pack, plan, tmp_path / "out")[3:], "--slurm", "slurm_partition=gpu"]) == 2
     assert "pip install 'mvitac[slurm]'" in capsys.readouterr().err
+
+
+# -- folds ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A plan over 40 pairs of 8 objects: fold1 tests objects 0 to 3, fold2 the rest, and in ``same`` fold1 again."""
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
+    lines = ["vision,touch,label,object,fold1,fold2,same"]
+    rng = np.random.default_rng(0)
+    for i in range(40):
+        thing = i % 8
+        for name in ("v", "t"):
+            pixels = np.full((32, 32, 3), 60 + 90 * (thing % 2), np.uint8) + rng.integers(0, 40, (32, 32, 3), np.uint8)
+            Image.fromarray(pixels).save(tmp_path / f"{name}{i}.png")
+        first = "test" if thing < 4 else "train"
+        second = {"test": "train", "train": "test"}[first]
+        lines.append(f"v{i}.png,t{i}.png,{'ab'[thing % 2]},{thing},{first},{second},{first}")
+    (tmp_path / "pairs.csv").write_text("\n".join(lines))
+    (tmp_path / "plan.toml").write_text(
+        f"""
+        recipe = "smoke"
+        seeds = 2
+        set = {{ steps = 2, eval_every = 0 }}
+        data = {{ name = "folder", path = "{tmp_path / "pairs.csv"}", labels = ["label"], group = "object", size = 32 }}
+        folds = ["split=fold1", "split=fold2"]
+        [[rows]]
+        label = "MViTac"
+        [[rows]]
+        label = "SimCLR"
+        method = "simclr"
+        """
+    )
+    return tmp_path / "plan.toml"
+
+
+def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    main(["compare", "--plan", str(two_folds), "--out", str(out)])
+    assert "2 rows x 2 seeds x 2 folds = 8 runs" in capsys.readouterr().out
+    assert "2 folds: every test object is scored once" in (out / "table.md").read_text()
+    result = json.loads((out / "result.json").read_text())
+    keys = ("source", "seed", "task", "modality", "probe")
+    assert len({tuple(r[k] for k in keys) for r in result["records"]}) == len(result["records"])
+    one = next(r for r in result["records"] if (r["source"], r["seed"], r["modality"]) == ("SimCLR", 1, "both"))
+    apart = [
+        next(
+            r
+            for r in json.loads((out / fold / "runs/simclr/seed1/scores.json").read_text())["records"]
+            if r["modality"] == "both"
+        )
+        for fold in ("fold1", "fold2")
+    ]
+    assert one["group_sizes"] == [5] * 8 and one["num_test"] == 40
+    assert one["group_correct"] == apart[0]["group_correct"] + apart[1]["group_correct"]
+    assert one["accuracy"] == pytest.approx((apart[0]["accuracy"] + apart[1]["accuracy"]) / 2)
+    assert one["auroc"] == pytest.approx((apart[0]["auroc"] + apart[1]["auroc"]) / 2)
+    assert "| AUROC | modality | label |" in (out / "table.md").read_text()
+    (out / "fold2/runs/simclr/seed1/scores.json").unlink()
+    (out / "fold2/runs/simclr/seed1/model.safetensors").unlink()
+    main(["compare", "--plan", str(two_folds), "--out", str(out), "--tables-only"])
+    assert "**Not finished: SimCLR, fold2, seed 1.**" in (out / "table.md").read_text()
+    left = json.loads((out / "result.json").read_text())["records"]
+    assert {r["seed"] for r in left if r["source"] == "SimCLR"} == {0}
+
+
+@pytest.mark.parametrize(
+    ("folds", "message"),
+    [
+        (["split=fold1", "split=same"], "folds 'fold1' and 'same' both test object '0'"),
+        (["split=fold1", "split=fold1"], "fold 'split=fold1' is there twice"),
+        (["fold1"], "fold fold1: give field=value, e.g. split=fold1"),
+        (["splits=fold1"], "unknown field of a run 'data.splits'"),
+    ],
+)
+def test_folds_that_cannot_be(
+    two_folds: Path, tmp_path: Path, folds: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compare", "--plan", str(two_folds), "--folds", *folds, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err

@@ -5,6 +5,8 @@
           controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet where asked
           result.json  table.*           the tables (``paper_tables``)
 
+With folds, runs and controls lie in a folder per fold, and the tables are of all folds' test groups pooled.
+
 A run whose loss stops being a number is a result too: it is kept as failed.json and told in the table.
 """
 
@@ -31,6 +33,7 @@ from mvitac.plans import Plan, Row, slug
 from mvitac.record import digest, provenance, read_json, write_json
 from mvitac.registry import to_json
 from mvitac.run import Run
+from mvitac.scores import pool
 from mvitac.session import Session, chosen, probe_runs
 from mvitac.stress import stress
 from mvitac.train import Diverged, train
@@ -46,6 +49,12 @@ class Job:
     out: Path
     session: Session
     stress: bool = False
+    fold: str = ""
+
+    @property
+    def name(self) -> str:
+        """Its row and seed, and its fold where there are several."""
+        return f"{self.label}, {f'{self.fold}, ' if self.fold else ''}seed {self.run.seed}"
 
     @property
     def done(self) -> bool:
@@ -55,7 +64,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Work:
-    """A plan on one dataset: the jobs to do, and the rows that cannot be part of it, with the reason."""
+    """A plan on one dataset (one fold of it): the jobs to do, and the rows that cannot be part of it, with the reason."""
 
     plan: Plan
     pack: Pack
@@ -114,6 +123,32 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
     return own
 
 
+def lay_out_folds(plan: Plan, out: Path, session: Session, device: str = "auto") -> list[Work]:
+    """The work of every fold of ``plan``, or of the plan; ValueError if two folds test the same group."""
+    works: list[Work] = []
+    tested: dict[str, str] = {}
+    for fold, part in plan.in_folds():
+        assert part.data is not None
+        pack = part.data.open()
+        for group in np.unique(pack.column("group").astype(str)[pack.rows("test")]).tolist() if fold else ():
+            if group in tested:
+                raise ValueError(
+                    f"folds {tested[group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}: each group must be"
+                    " tested once"
+                )
+            tested[group] = fold
+        work = lay_out(part, pack, out / fold, session, device)
+        works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
+    return works
+
+
+def together(works: Sequence[Work]) -> Work:
+    """The jobs of all folds as one work, seeds outermost."""
+    jobs = sorted((job for work in works for job in work.jobs), key=lambda job: job.run.seed)
+    left_out = {label: reason for work in works for label, reason in work.left_out.items()}
+    return replace(works[0], jobs=jobs, left_out=left_out)
+
+
 # -- doing it ---------------------------------------------------------------------------------------------------------
 
 
@@ -146,16 +181,16 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
     total = len(work.jobs)
     if num_jobs == 1 or len(todo) < 2:
         for job in todo:
-            say(f"{job.label}, seed {job.run.seed} ...")
+            say(f"{job.name} ...")
             line = do(job, work.pack if job.run.data == work.plan.data else None)
-            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.label}, seed {job.run.seed}: {line}")
+            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.name}: {line}")
         return
     gpus = torch.cuda.device_count()
     with side_by_side(num_jobs, [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()) as pool:
         futures = {pool.submit(_do_here, job): job for job in todo}
         for done in as_completed(futures):
             job = futures[done]
-            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.label}, seed {job.run.seed}: {done.result()}")
+            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.name}: {done.result()}")
 
 
 def _do_here(job: Job) -> str:
@@ -219,14 +254,34 @@ def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
         "rows": [label for label in rows if label not in work.left_out],
         "left_out": work.left_out,
         "failed": {
-            f"{job.label}, seed {job.run.seed}": read_json(job.out / "failed.json", "a failure")["error"]
+            job.name: read_json(job.out / "failed.json", "a failure")["error"]
             for job in work.jobs
             if (job.out / "failed.json").exists()
         },
-        "unfinished": [f"{job.label}, seed {job.run.seed}" for job in work.jobs if not job.done],
+        "unfinished": [job.name for job in work.jobs if not job.done],
         "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
         "device": describe(pick_device(work.jobs[0].run.device)),
         **provenance(),
+    }
+
+
+def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: Session) -> dict[str, Any]:
+    """``gather`` of every fold as one result: test groups pooled (``scores.pool``), cost that of the first fold."""
+    results = [gather(work, out / fold, session) for work, (fold, _) in zip(works, plan.in_folds(), strict=True)]
+    if len(results) == 1:
+        return {**results[0], "plan": to_json(plan)}
+    # Retrieval among less than ten things says nothing: any answer is a hit.
+    retrieval = [r for result in results for r in result["retrieval"] if r["chance R@5"] < 0.5]
+    return {
+        **results[0],
+        "plan": to_json(plan),
+        "records": pool([result["records"] for result in results]),
+        "retrieval": retrieval,
+        "rows": [label for label in results[0]["rows"] if all(label in result["rows"] for result in results)],
+        "left_out": {label: reason for result in results for label, reason in result["left_out"].items()},
+        "failed": {name: error for result in results for name, error in result["failed"].items()},
+        "unfinished": [name for result in results for name in result["unfinished"]],
+        "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),
     }
 
 
@@ -293,7 +348,9 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
 def forecast(work: Work) -> list[str]:
     """The plan in words: runs, what is finished, steps and pairs, and the time left where finished runs tell it."""
     rows = {label: next(job for job in work.jobs if job.label == label) for label in _labels(work.jobs)}
-    lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds = {len(work.jobs)} runs"]
+    num = len({job.fold for job in work.jobs})
+    folds = f" x {num} folds" if num > 1 else ""
+    lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
     known = [seconds_of(job.out) for job in work.jobs if (job.out / "scores.json").exists()]
     for label, job in rows.items():
         num = len(training_rows(job.run, work.pack))

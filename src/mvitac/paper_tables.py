@@ -135,7 +135,7 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     text += _table(lines, plan.reference, shown)
     for kind, worse in stresses_of(result).items():
         text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
-    text += [*_retrieval(result), *_cost(result)]
+    text += [*_auroc(result, plan), *_retrieval(result), *_cost(result)]
     return "\n".join(text).rstrip() + "\n"
 
 
@@ -174,6 +174,11 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
         f"95 % intervals and p: bootstrap over test {result['group_by']}s and seeds; p of the difference to {plan.reference}"
         " on the same test rows, not corrected for the number of rows. Controls in italics.",
     ]
+    if plan.folds:
+        text.append(
+            f"{len(plan.folds)} folds: every test {result['group_by']} is scored once, by encoders and probes that never"
+            " saw it."
+        )
     if shown:
         text.append(
             f'"printed" is the paper\'s number on {plan.printed_on}'
@@ -206,6 +211,23 @@ def _gap(cell: Cell | None) -> str:
         return ""
     mean, _, _, p = cell.difference
     return f"{100 * mean:+.1f} (p {p:.3f})" if p >= 0.0015 else f"{100 * mean:+.1f} (p .001)"
+
+
+def _auroc(result: dict[str, Any], plan: Plan) -> list[str]:
+    """Area under the ROC curve of tasks with two classes, mean over seeds (and folds), with the least and the most."""
+    found: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for (task, modality, source), records in _by_cell(result["records"], plan.probes[0]).items():
+        values = [record["auroc"] for record in records if record["auroc"] is not None]
+        if values and source != "majority":
+            found.setdefault((source, modality), {})[task] = values
+    if not found:
+        return []
+    tasks = list(dict.fromkeys(task for row in found.values() for task in row))
+    text = [f"| AUROC | modality | {' | '.join(tasks)} |", f"|---|---{'|---:' * len(tasks)}|"]
+    for (source, modality), row in found.items():
+        cells = [f"{sum(v) / len(v):.2f} ({min(v):.2f}-{max(v):.2f})" if (v := row.get(t)) else "" for t in tasks]
+        text.append(f"| {source} | {'' if modality == 'none' else modality} | {' | '.join(cells)} |")
+    return [*text, ""]
 
 
 def _retrieval(result: dict[str, Any]) -> list[str]:

@@ -59,6 +59,9 @@ class Plan:
     """Fields to change in every row; a row's own come after them."""
     data: DatasetConfig | None = None
     """The dataset, with its name; --data overrules it."""
+    folds: tuple[str, ...] = ()
+    """Cross-validation: fields of the data that make each fold, e.g. ("split=fold1", "split=fold2"); every row runs on all
+    folds, and their test groups, which must differ, are pooled."""
     probes: tuple[Probe, ...] = ("linear",)
     """How features are scored; the table shows the first."""
     tasks: tuple[str, ...] = ()
@@ -83,8 +86,28 @@ class Plan:
                 raise ValueError(f"row {label!r} is there twice: give each row its own label")
         if len({slug(label) for label in labels}) < len(labels):
             raise ValueError(f"plan {self.name!r}: labels differ only in signs that a folder's name cannot hold")
+        for fold in self.folds:
+            if self.folds.count(fold) > 1:
+                raise ValueError(f"fold {fold!r} is there twice: its test groups would count twice")
+            for pair in fold.split(","):
+                setting(pair, "fold")
         if self.reference not in labels:
             raise unknown("reference row", self.reference, labels)
+
+    def in_folds(self) -> list[tuple[str, Plan]]:
+        """A plan for each fold, with its name; the plan itself, without a name, where there are none."""
+        if not self.folds:
+            return [("", self)]
+        assert self.data is not None
+        whole = self.run(self.rows[0], self.data, 0)
+        parts = [
+            {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
+        ]
+        names = [slug(" ".join(str(value) for value in part.values())) for part in parts]
+        if len(set(names)) < len(names):
+            names = [slug(fold) for fold in self.folds]
+        datas = [changed(whole, part).data for part in parts]
+        return [(name, replace(self, data=data, folds=())) for name, data in zip(names, datas, strict=True)]
 
     def run(self, row: Row, data: DatasetConfig, seed: int) -> Run:
         """The whole run of one row and seed; ValueError names a field that does not exist or fit."""
@@ -119,11 +142,12 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
     return Run.load(value)
 
 
-def setting(text: str) -> tuple[str, Any]:
+def setting(text: str, what: str = "--set") -> tuple[str, Any]:
     """``field=value`` as a pair; the value is JSON where it can be, else text."""
     name, equals, value = text.partition("=")
     if not equals or not name:
-        raise ValueError(f"--set {text}: give field=value, e.g. steps=100 or method.temperature=0.2")
+        example = "split=fold1" if what == "fold" else "steps=100 or method.temperature=0.2"
+        raise ValueError(f"{what} {text}: give field=value, e.g. {example}")
     try:
         return name, json.loads(value)
     except ValueError:

@@ -37,6 +37,37 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
     }
 
 
+def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Records of cross-validation folds, whose test groups differ, as records of all groups together.
+
+    Only what every fold has scored. Accuracy is that of all rows; AUROC, F1 and balanced accuracy, which cannot be taken
+    over probes fitted apart, are means over the folds that have them.
+    """
+    keys = ("source", "seed", "task", "modality", "probe")
+    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for records in folds:
+        for record in records:
+            found.setdefault(tuple(record[key] for key in keys), []).append(record)
+    pooled = []
+    for parts in found.values():
+        if len(parts) < len(folds):
+            continue
+        sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
+        means = {}
+        for key in ("balanced_accuracy", "macro_f1", "auroc"):
+            values = [part[key] for part in parts if part[key] is not None]
+            means[key] = float(np.mean(values)) if values else None
+        whole = {
+            "accuracy": sum(correct) / sum(sizes),
+            "confusion": np.sum([part["confusion"] for part in parts], axis=0).tolist(),
+            "num_test": sum(part["num_test"] for part in parts),
+            "group_sizes": sizes,
+            "group_correct": correct,
+        }
+        pooled.append({**parts[0], **means, **whole})
+    return pooled
+
+
 def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
     """Mean accuracy over runs and its 95 % interval, by a two-level bootstrap over test groups and over seeds.
 

@@ -14,7 +14,7 @@ def compare(argv: list[str]) -> None:
     import tyro
     from rich.console import Console
 
-    from mvitac.compare import do_all, forecast, gather, lay_out, submit
+    from mvitac.compare import do_all, forecast, gather_folds, lay_out_folds, submit, together
     from mvitac.datasets import DatasetConfig
     from mvitac.paper_tables import write_tables
     from mvitac.plans import PLANS, find_plan, setting
@@ -38,6 +38,9 @@ def compare(argv: list[str]) -> None:
         """Folder of the comparison: runs, controls, tables. The same command goes on where it stopped."""
         seeds: int = plan.seeds
         """Runs per row, seeds 0 .. seeds - 1."""
+        folds: tuple[str, ...] = plan.folds
+        """Cross-validation: the data's fields that make each fold, e.g. --folds split=fold1 split=fold2; test groups, which
+        must differ, are pooled."""
         set: tuple[str, ...] = ()
         """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own come after."""
         jobs: int | None = None
@@ -85,6 +88,7 @@ def compare(argv: list[str]) -> None:
         data=options.data,
         recipe=given.get("--recipe", plan.recipe),
         seeds=options.seeds,
+        folds=options.folds,
         stress=options.stress,
         set={**plan.set, **extra},
     )
@@ -93,8 +97,8 @@ def compare(argv: list[str]) -> None:
         check_place(options.out / "plan.json")
     console = Console()
     say = lambda text: console.print(text, soft_wrap=True, highlight=False, markup=False)  # noqa: E731
-    pack = options.data.open()
-    work = lay_out(plan, pack, options.out, session, options.device)
+    works = lay_out_folds(plan, options.out, session, options.device)
+    work = together(works)
     for line in forecast(work):
         say(line)
     if options.dry_run:
@@ -105,7 +109,7 @@ def compare(argv: list[str]) -> None:
         return
     if not options.tables_only:
         do_all(work, options.jobs or _num_gpus(), say)
-    written = write_tables(gather(work, options.out, session), options.out)
+    written = write_tables(gather_folds(plan, works, options.out, session), options.out)
     say(written[0].read_text())
     for path in written:
         say(f"written: {path}")
