@@ -113,6 +113,7 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
     work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path / "out", Session())
     assert "learns from pairs" in work.left_out["TAG (CMC)"]
     assert "unknown modality" in work.left_out["supervised, vision only"]
+    assert "the same run as 'supervised, touch only'" in work.left_out["supervised, both"]
     assert {job.label for job in work.jobs} >= {"MViTac", "MoCo per modality", "supervised, touch only"}
     with pytest.raises(ValueError, match="no row that this data allows"):
         lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", Session())

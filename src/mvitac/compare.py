@@ -97,7 +97,10 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
         except ValueError as error:
             left_out[row.label] = str(error)
             continue
-        if (key := replace(run, recipe="").digest()) in seen:
+        alike = replace(run, recipe="")
+        if set(getattr(run.method, "modalities", ())) == set(own.spec.modalities):  # all there are, named or not
+            alike = replace(alike, method=replace(run.method, modalities=()))  # type: ignore[call-arg]
+        if (key := alike.digest()) in seen:
             left_out[row.label] = f"the same run as {seen[key]!r} under recipe {plan.recipe!r}"
             continue
         seen[key] = row.label
