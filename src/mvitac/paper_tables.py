@@ -135,7 +135,7 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     text += _table(lines, plan.reference, shown)
     for kind, worse in stresses_of(result).items():
         text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
-    text += [*_auroc(result, plan), *_retrieval(result), *_cost(result)]
+    text += [*_auroc(result, plan, lines), *_retrieval(result), *_cost(result)]
     return "\n".join(text).rstrip() + "\n"
 
 
@@ -213,20 +213,23 @@ def _gap(cell: Cell | None) -> str:
     return f"{100 * mean:+.1f} (p {p:.3f})" if p >= 0.0015 else f"{100 * mean:+.1f} (p .001)"
 
 
-def _auroc(result: dict[str, Any], plan: Plan) -> list[str]:
+def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
     """Area under the ROC curve of tasks with two classes, mean over seeds (and folds), with the least and the most."""
-    found: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for (task, modality, source), records in _by_cell(result["records"], plan.probes[0]).items():
-        values = [record["auroc"] for record in records if record["auroc"] is not None]
-        if values and source != "majority":
-            found.setdefault((source, modality), {})[task] = values
+    records = _by_cell(result["records"], plan.probes[0])
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for line in lines:
+        for task in line.cells:
+            values = [r["auroc"] for r in records[task, line.modality, line.source] if r["auroc"] is not None]
+            if values and line.source != "majority":
+                spread = f" ({min(values):.2f}-{max(values):.2f})" if len(values) > 1 else ""
+                name = f"*{line.source}*" if line.control else line.source
+                row = found.setdefault((name, "" if line.modality == "none" else line.modality), {})
+                row[task] = f"{sum(values) / len(values):.2f}{spread}"
     if not found:
         return []
     tasks = list(dict.fromkeys(task for row in found.values() for task in row))
     text = [f"| AUROC | modality | {' | '.join(tasks)} |", f"|---|---{'|---:' * len(tasks)}|"]
-    for (source, modality), row in found.items():
-        cells = [f"{sum(v) / len(v):.2f} ({min(v):.2f}-{max(v):.2f})" if (v := row.get(t)) else "" for t in tasks]
-        text.append(f"| {source} | {'' if modality == 'none' else modality} | {' | '.join(cells)} |")
+    text += [f"| {' | '.join([*which, *(row.get(task, '') for task in tasks)])} |" for which, row in found.items()]
     return [*text, ""]
 
 
