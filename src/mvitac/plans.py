@@ -99,13 +99,18 @@ class Plan:
         if not self.folds:
             return [("", self)]
         assert self.data is not None
-        whole = self.run(self.rows[0], self.data, 0)
+        whole = recipe(self.recipe, self.data)  # not a row's run: what a row alone changes in its data stays its own
         parts = [
             {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
         ]
         names = [slug(" ".join(str(value) for value in part.values())) for part in parts]
         if len(set(names)) < len(names):
             names = [slug(fold) for fold in self.folds]
+        if "" in names or len(set(names)) < len(names):
+            raise ValueError(
+                f"folds {', '.join(self.folds)}: each needs a folder of its own, but letters and digits do not tell them"
+                " apart: give them other names"
+            )
         datas = [changed(whole, part).data for part in parts]
         return [(name, replace(self, data=data, folds=())) for name, data in zip(names, datas, strict=True)]
 
