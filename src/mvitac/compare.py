@@ -127,7 +127,10 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
 
 
 def lay_out_folds(plan: Plan, out: Path, session: Session, device: str = "auto") -> list[Work]:
-    """The work of every fold of ``plan``, or of the plan; ValueError if two folds test the same group."""
+    """The work of every fold of ``plan``, or of the plan; ValueError if two folds test the same group.
+
+    A row that one fold does not allow is left out of all: its other folds could not be pooled.
+    """
     works: list[Work] = []
     tested: dict[str, str] = {}
     for fold, part in plan.in_folds():
@@ -142,14 +145,19 @@ def lay_out_folds(plan: Plan, out: Path, session: Session, device: str = "auto")
             tested[group] = fold
         work = lay_out(part, pack, out / fold, session, device)
         works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
+    left_out = {label: reason for work in works for label, reason in work.left_out.items()}
+    works = [
+        replace(work, jobs=[job for job in work.jobs if job.label not in left_out], left_out=left_out) for work in works
+    ]
+    if not works[0].jobs:
+        raise ValueError(f"plan {plan.name!r} has no row that all folds allow: {next(iter(left_out.values()))}")
     return works
 
 
 def together(works: Sequence[Work]) -> Work:
     """The jobs of all folds as one work, seeds outermost."""
     jobs = sorted((job for work in works for job in work.jobs), key=lambda job: job.run.seed)
-    left_out = {label: reason for work in works for label, reason in work.left_out.items()}
-    return replace(works[0], jobs=jobs, left_out=left_out)
+    return replace(works[0], jobs=jobs)
 
 
 # -- doing it ---------------------------------------------------------------------------------------------------------
@@ -273,15 +281,13 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: Session)
     results = [gather(work, out / fold, session) for work, (fold, _) in zip(works, plan.in_folds(), strict=True)]
     if len(results) == 1:
         return {**results[0], "plan": to_json(plan)}
-    # Retrieval among less than ten things says nothing: any answer is a hit.
+    # Retrieval among ten things or fewer says nothing: half of all answers or more are hits by chance.
     retrieval = [r for result in results for r in result["retrieval"] if r["chance R@5"] < 0.5]
     return {
         **results[0],
         "plan": to_json(plan),
         "records": pool([result["records"] for result in results]),
         "retrieval": retrieval,
-        "rows": [label for label in results[0]["rows"] if all(label in result["rows"] for result in results)],
-        "left_out": {label: reason for result in results for label, reason in result["left_out"].items()},
         "failed": {name: error for result in results for name, error in result["failed"].items()},
         "unfinished": [name for result in results for name in result["unfinished"]],
         "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),
