@@ -175,10 +175,8 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
         " on the same test rows, not corrected for the number of rows. Controls in italics.",
     ]
     if plan.folds:
-        text.append(
-            f"{len(plan.folds)} folds: every test {result['group_by']} is scored once, by encoders and probes that never"
-            " saw it."
-        )
+        unseen = "" if result["leaks"] else ", by encoders and probes that never saw it"
+        text.append(f"{len(plan.folds)} folds: every test {result['group_by']} is scored once{unseen}.")
     if shown:
         text.append(
             f'"printed" is the paper\'s number on {plan.printed_on}'
