@@ -20,7 +20,7 @@ from toy import Toy, toy_pack
 
 from mvitac import compare as module
 from mvitac.cli import main
-from mvitac.compare import cost, do, do_all, gather, lay_out, leaks, seconds_of
+from mvitac.compare import cost, do, do_all, gather, lay_out, lay_out_folds, leaks, seconds_of
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.pack import Pack
@@ -442,9 +442,10 @@ def test_slurm_without_submitit_is_one_line(
 
 @pytest.fixture
 def two_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A plan over 40 pairs of 8 objects: fold1 tests objects 0 to 3, fold2 the rest, and in ``same`` fold1 again."""
+    """A plan over 40 pairs of 8 objects: fold1 tests objects 0 to 3, fold2 the rest, in ``same`` fold1 again, and ``few``
+    one of the rest."""
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
-    lines = ["vision,touch,label,object,fold1,fold2,same"]
+    lines = ["vision,touch,label,object,fold1,fold2,same,few"]
     rng = np.random.default_rng(0)
     for i in range(40):
         thing = i % 8
@@ -453,7 +454,9 @@ def two_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             Image.fromarray(pixels).save(tmp_path / f"{name}{i}.png")
         first = "test" if thing < 4 else "train"
         second = {"test": "train", "train": "test"}[first]
-        lines.append(f"v{i}.png,t{i}.png,{'ab'[thing % 2]},{thing},{first},{second},{first}")
+        lines.append(
+            f"v{i}.png,t{i}.png,{'ab'[thing % 2]},{thing},{first},{second},{first},{'test' if thing == 7 else 'train'}"
+        )
     (tmp_path / "pairs.csv").write_text("\n".join(lines))
     (tmp_path / "plan.toml").write_text(
         f"""
@@ -507,6 +510,9 @@ def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys:
     [
         (["split=fold1", "split=same"], "folds 'fold1' and 'same' both test object '0'"),
         (["split=fold1", "split=fold1"], "fold 'split=fold1' is there twice"),
+        (["split=my_fold", "split=my-fold"], "do not tell them apart"),
+        (["split=fold1", "split=Fold1"], "do not tell them apart"),
+        (["split=_"], "do not tell them apart"),
         (["fold1"], "fold fold1: give field=value, e.g. split=fold1"),
         (["splits=fold1"], "unknown field of a run 'data.splits'"),
     ],
@@ -516,3 +522,22 @@ def test_folds_that_cannot_be(
 ) -> None:
     assert main(["compare", "--plan", str(two_folds), "--folds", *folds, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_row_that_one_fold_does_not_allow_runs_on_none(two_folds: Path, tmp_path: Path) -> None:
+    plan = find_plan(str(two_folds))
+    big = Row(label="big", set={"batch_size": 32})  # few has 35 rows to train on, fold1 has 20
+    plan = replace(plan, rows=(*plan.rows, big), folds=("split=few", "split=fold1"))
+    works = lay_out_folds(plan, tmp_path / "out", Session())
+    assert [sorted({job.label for job in work.jobs}) for work in works] == [["MViTac", "SimCLR"]] * 2
+    assert all("20 rows to train on" in work.left_out["big"] for work in works)
+
+
+def test_what_the_first_row_changes_in_its_data_is_no_other_rows(two_folds: Path) -> None:
+    plan = find_plan(str(two_folds))
+    first = Row(label="difference images", set={"data.difference": True})
+    plan = replace(plan, rows=(first, *plan.rows))
+    assert [(name, vars(part.data)["difference"]) for name, part in plan.in_folds()] == [
+        ("fold1", False),
+        ("fold2", False),
+    ]
