@@ -229,7 +229,7 @@ def submit(work: Work, options: str) -> str:
     todo = [job for job in work.jobs if not job.done]
     if not todo:
         return "nothing to submit: all runs are finished"
-    executor = submitit.AutoExecutor(folder=work.jobs[0].out.parents[2] / "slurm")
+    executor = submitit.AutoExecutor(folder=work.jobs[0].out.parents[3 if work.jobs[0].fold else 2] / "slurm")
     executor.update_parameters(name=f"mvitac-{work.plan.name}", **parameters)
     handles = executor.map_array(do, todo)
     return f"{len(handles)} runs submitted as {handles[0].job_id.split('_')[0]}"
@@ -286,6 +286,7 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: Session)
     return {
         **results[0],
         "plan": to_json(plan),
+        "pack": digest([result["pack"] for result in results]),
         "records": pool([result["records"] for result in results]),
         "retrieval": retrieval,
         "failed": {name: error for result in results for name, error in result["failed"].items()},

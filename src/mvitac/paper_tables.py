@@ -176,7 +176,9 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     ]
     if plan.folds:
         unseen = "" if result["leaks"] else ", by encoders and probes that never saw it"
-        text.append(f"{len(plan.folds)} folds: every test {result['group_by']} is scored once{unseen}.")
+        text.append(
+            f"{len(plan.folds)} fold{'s' * (len(plan.folds) > 1)}: every test {result['group_by']} is scored once{unseen}."
+        )
     if shown:
         text.append(
             f'"printed" is the paper\'s number on {plan.printed_on}'
@@ -293,7 +295,9 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
             paper = f" [{100 * cell.printed:.1f}]" if cell.printed is not None else ""
             row.append(f"{number} $\\pm$ {half:.1f}{paper}")
         text.append(" & ".join(row) + r" \\")
-    note = f"% {plan.title or plan.name}; data {result['data']}; in brackets: printed in the paper on {plan.printed_on}"
+    note = f"% {plan.title or plan.name}; data {result['data']}"
+    if plan.printed_on:
+        note += f"; in brackets: printed in the paper on {plan.printed_on}"
     return "\n".join([note, *text, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 

@@ -64,7 +64,7 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
             "group_sizes": sizes,
             "group_correct": correct,
         }
-        pooled.append({**parts[0], **means, **whole})
+        pooled.append({**{key: parts[0][key] for key in keys}, **means, **whole})
     return pooled
 
 

@@ -72,6 +72,7 @@ def compare(argv: list[str]) -> None:
       reference = "MViTac"            # the row the others are tested against
       set = {{ steps = 300 }}           # fields of every run
       data = {{ name = "pack", path = "packs/materials" }}
+      # folds = ["split=fold1", "split=fold2"]  # cross-validation over columns of a folder's manifest
       [[rows]]
       label = "MViTac"
       [[rows]]
