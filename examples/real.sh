@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Everything behind docs/results/real.md: manifests, then all methods of Tables I and II on every set. CPU only.
 #   examples/real.sh ../shared/data runs/real --jobs 2       (data, output, options of mvitac compare; resumes anywhere)
-#   STEPS=300 SETS="vt60 physiclear" examples/real.sh ...    (more training; only these sets)
+#   STEPS=150 SETS="vt60 physiclear-by-group" examples/real.sh ...    (shorter runs; only these sets)
 set -euo pipefail
 data=$1 out=$2
 shift 2
@@ -14,7 +14,7 @@ methods() {
   shift 3
   [[ " ${SETS:-$name} " == *" $name "* ]] || return 0
   python -m mvitac compare --plan "$plan" --data folder --recipe demo --out "$out/$name" \
-    --set steps="${STEPS:-100}" batch_size="$batch" eval_every=0 \
+    --set steps="${STEPS:-300}" batch_size="$batch" eval_every=0 \
     --data.title "$name" --data.group object --data.size 72 "$@" "${options[@]}"
 }
 
