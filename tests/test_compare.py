@@ -20,9 +20,10 @@ from toy import Toy, toy_pack
 
 from mvitac import compare as module
 from mvitac.cli import main
-from mvitac.compare import cost, do, do_all, gather, lay_out, lay_out_folds, leaks, seconds_of
+from mvitac.compare import cost, do, do_all, gather, lay_out, leaks, seconds_of
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.folds import lay_out_folds
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.paper_tables import lines_of, write_tables

@@ -5,8 +5,6 @@
           controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet where asked
           result.json  table.*           the tables (``paper_tables``)
 
-With folds, runs and controls lie in a folder per fold, and the tables are of all folds' test groups pooled.
-
 A run whose loss stops being a number is a result too: it is kept as failed.json and told in the table.
 """
 
@@ -33,7 +31,6 @@ from mvitac.plans import Plan, Row, slug
 from mvitac.record import digest, provenance, read_json, write_json
 from mvitac.registry import to_json
 from mvitac.run import Run
-from mvitac.scores import pool
 from mvitac.session import Session, chosen, probe_runs
 from mvitac.stress import stress
 from mvitac.train import Diverged, train
@@ -124,40 +121,6 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
                 f"its data {own.path} has another column {name} than {pack.path}: compare the same samples"
             )
     return own
-
-
-def lay_out_folds(plan: Plan, out: Path, session: Session, device: str = "auto") -> list[Work]:
-    """The work of every fold of ``plan``, or of the plan; ValueError if two folds test the same group.
-
-    A row that one fold does not allow is left out of all: its other folds could not be pooled.
-    """
-    works: list[Work] = []
-    tested: dict[str, str] = {}
-    for fold, part in plan.in_folds():
-        assert part.data is not None
-        pack = part.data.open()
-        for group in np.unique(pack.column("group").astype(str)[pack.rows("test")]).tolist() if fold else ():
-            if group in tested:
-                raise ValueError(
-                    f"folds {tested[group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}: each group must be"
-                    " tested once"
-                )
-            tested[group] = fold
-        work = lay_out(part, pack, out / fold, session, device)
-        works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
-    left_out = {label: reason for work in works for label, reason in work.left_out.items()}
-    works = [
-        replace(work, jobs=[job for job in work.jobs if job.label not in left_out], left_out=left_out) for work in works
-    ]
-    if not works[0].jobs:
-        raise ValueError(f"plan {plan.name!r} has no row that all folds allow: {next(iter(left_out.values()))}")
-    return works
-
-
-def together(works: Sequence[Work]) -> Work:
-    """The jobs of all folds as one work, seeds outermost."""
-    jobs = sorted((job for work in works for job in work.jobs), key=lambda job: job.run.seed)
-    return replace(works[0], jobs=jobs)
 
 
 # -- doing it ---------------------------------------------------------------------------------------------------------
@@ -273,25 +236,6 @@ def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
         "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
         "device": describe(pick_device(work.jobs[0].run.device)),
         **provenance(),
-    }
-
-
-def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: Session) -> dict[str, Any]:
-    """``gather`` of every fold as one result: test groups pooled (``scores.pool``), cost that of the first fold."""
-    results = [gather(work, out / fold, session) for work, (fold, _) in zip(works, plan.in_folds(), strict=True)]
-    if len(results) == 1:
-        return {**results[0], "plan": to_json(plan)}
-    # Retrieval among ten things or fewer says nothing: half of all answers or more are hits by chance.
-    retrieval = [r for result in results for r in result["retrieval"] if r["chance R@5"] < 0.5]
-    return {
-        **results[0],
-        "plan": to_json(plan),
-        "pack": digest([result["pack"] for result in results]),
-        "records": pool([result["records"] for result in results]),
-        "retrieval": retrieval,
-        "failed": {name: error for result in results for name, error in result["failed"].items()},
-        "unfinished": [name for result in results for name in result["unfinished"]],
-        "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),
     }
 
 

@@ -14,8 +14,9 @@ def compare(argv: list[str]) -> None:
     import tyro
     from rich.console import Console
 
-    from mvitac.compare import do_all, forecast, gather_folds, lay_out_folds, submit, together
+    from mvitac.compare import do_all, forecast, submit
     from mvitac.datasets import DatasetConfig
+    from mvitac.folds import gather_folds, lay_out_folds, together
     from mvitac.paper_tables import write_tables
     from mvitac.plans import PLANS, find_plan, setting
     from mvitac.recipes import RECIPES
