@@ -242,6 +242,7 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
 
 def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     out, result = done
+    assert len(list(out.rglob("model.safetensors"))) == 6 and not list(out.rglob("checkpoint.pt"))
     monkeypatch.setattr(module, "train", None)  # calling it would raise
     monkeypatch.setattr(module, "controls_of", None)
     work = lay_out(small(pack), pack, out, Session())
@@ -257,6 +258,9 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
     assert "not finite" in result["failed"]["wild, seed 0"]
     assert "Diverged: wild, seed 0" in write_tables(result, tmp_path)[0].read_text()
     assert {record["source"] for record in result["records"]} == {"MViTac"}
+    lost = replace(work, jobs=[job for job in work.jobs if job.label == "wild"])
+    with pytest.raises(ValueError, match=r"no run of .* is finished: .*\(wild, seed 0: the loss is not finite"):
+        gather(lost, tmp_path, Session(controls=False))
 
 
 def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], pack: Pack, tmp_path: Path) -> None:

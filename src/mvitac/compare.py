@@ -1,7 +1,7 @@
 """``mvitac compare``: a plan -> runs -> one result. What is finished is skipped, what was cut is resumed.
 
     <out>/plan.json                      what was asked for
-          runs/<row>/seed<k>/            a run like any other, with scores.json beside it
+          runs/<row>/seed<k>/            a run like any other, with scores.json in place of its checkpoint
           controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet where asked
           result.json  table.*           the tables (``paper_tables``)
 
@@ -146,6 +146,7 @@ def do(job: Job, pack: Pack | None = None) -> str:
         own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
         write_json(job.out / "stress.json", {"records": [{**own, **record} for record in records]})
     write_json(job.out / "scores.json", {"records": result["records"], "retrieval": result["retrieval"]})
+    (job.out / "checkpoint.pt").unlink(missing_ok=True)  # four times its weights: hundreds of runs would fill a disk
     return f"{seconds_of(job.out):.0f} s of training"
 
 
@@ -204,8 +205,14 @@ def submit(work: Work, options: str) -> str:
 def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
     """Everything the tables are made of, from the finished runs; ValueError if there is none."""
     finished = [job for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
+    failed = {
+        job.name: read_json(job.out / "failed.json", "a failure")["error"]
+        for job in work.jobs
+        if (job.out / "failed.json").exists()
+    }
     if not finished:
-        raise ValueError(f"no run of {out} is finished: nothing to tell yet")
+        lost = "; ".join(f"{name}: {error}" for name, error in failed.items())
+        raise ValueError(f"no run of {out} is finished: nothing to tell yet{f' ({lost})' if lost else ''}")
     records: list[dict[str, Any]] = []
     retrieval: list[dict[str, Any]] = []
     for job in finished:
@@ -227,11 +234,7 @@ def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
         "retrieval": retrieval + found,
         "rows": [label for label in rows if label not in work.left_out],
         "left_out": work.left_out,
-        "failed": {
-            job.name: read_json(job.out / "failed.json", "a failure")["error"]
-            for job in work.jobs
-            if (job.out / "failed.json").exists()
-        },
+        "failed": failed,
         "unfinished": [job.name for job in work.jobs if not job.done],
         "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
         "device": describe(pick_device(work.jobs[0].run.device)),
