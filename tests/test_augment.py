@@ -197,3 +197,32 @@ def test_stacked_sensors_move_together_unless_told() -> None:
 def test_jitter_keeps_the_range() -> None:
     view = denormalise(random_view(images(), ViewAugment(jitter=0.9), 24, generator()))
     assert float(view.min()) >= -1e-5 and float(view.max()) <= 1 + 1e-5
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+def test_noise_is_as_strong_as_drawn_and_stays_in_range(channels: int) -> None:
+    gray = torch.full((400, channels, 32, 32), 128, dtype=torch.uint8)
+    config = ViewAugment(scale=(1.0, 1.0), flip=0, grayscale=0, noise=20)
+    levels = 255 * denormalise(random_view(gray, config, 32, generator())) - 128
+    spread = levels.flatten(1).std(1)  # of each image: uniform on [0, 20]
+    assert float(spread.min()) < 0.5 and 19 < float(spread.max()) < 20.5
+    assert float(spread.mean()) == pytest.approx(10, abs=0.9) and float(spread.std()) == pytest.approx(5.8, abs=0.5)
+    assert abs(float(levels.mean())) < 0.1
+    assert float((levels[:, 0] * levels[:, 1]).mean()) == pytest.approx(0, abs=1)  # each channel has its own
+    black = 255 * denormalise(random_view(torch.zeros_like(gray), config, 32, generator()))
+    assert float(black.min()) >= -1e-3 and float(black.max()) > 20
+    assert torch.equal(random_view(gray, config, 32, generator()), random_view(gray, config, 32, generator()))
+    assert random_view(gray, config, 32, generator()).is_contiguous(memory_format=torch.channels_last)
+    assert random_view(gray, config, 32, generator(), torch.bfloat16).dtype == torch.bfloat16
+
+
+def test_without_noise_a_view_is_what_it_was() -> None:
+    """No draw is taken for noise that is not there, so runs of before can be continued and repeated."""
+    after = []
+    for noise in (0.0, 5.0):
+        drawing = generator()
+        random_view(images(), ViewAugment(noise=noise), 24, drawing)
+        after.append(torch.rand(1, generator=drawing))
+    plain = generator()
+    augment.apply(images(), draw(ViewAugment(), 8, 40, plain), 24)
+    assert after[0] == torch.rand(1, generator=plain) and after[0] != after[1]

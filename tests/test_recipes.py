@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -57,8 +59,6 @@ def test_every_recipe_survives_its_record(name: str, data: MaterialsConfig) -> N
 
 
 def test_digest_is_of_the_outcome() -> None:
-    from dataclasses import replace
-
     run = recipe("demo")
     assert replace(run, log_every=3, device="cpu").digest() == run.digest()
     assert replace(run, data=replace(run.data, workers=7)).digest() == run.digest()
@@ -94,3 +94,14 @@ def test_a_grasps_phases_are_not_each_others_positives(name: str) -> None:
     """Alike before, during and after the grip would mean blind to the contact."""
     assert recipe(name, GraspsConfig()).positives == "same-image"
     assert recipe(name, MaterialsConfig()).positives == "same-touch"
+
+
+def test_choices_that_came_later_do_not_change_older_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that leaves them as they were has the digest it had before there was a choice, and can be continued."""
+    run = recipe("smoke")
+    noisy = replace(run, augment=replace(run.augment, touch=replace(run.augment.touch, noise=5.0)))
+    assert noisy.digest() != run.digest()
+    monkeypatch.setattr("mvitac.run.digest", lambda value: value)
+    before: Any = run.digest()
+    assert "gel_flip" not in before["augment"] and "store" not in before["data"]
+    assert not any("noise" in before["augment"][modality] for modality in ("vision", "touch"))

@@ -35,6 +35,9 @@ class ViewAugment:
     """Probability of grayscale (paper: .2 for materials, none for grasping)."""
     jitter: float = 0.0
     """Strength of brightness, contrast and per-channel gain jitter, each factor 1 +- jitter (paper: none)."""
+    noise: float = 0.0
+    """Gaussian noise on every pixel of a view, its standard deviation drawn between 0 and this many of 255 levels (paper:
+    none)."""
     independent_sensors: bool = False
     """Draw the two sensors of a stacked touch image apart (as the authors' code does) instead of alike."""
 
@@ -46,6 +49,8 @@ class ViewAugment:
                 raise ValueError(f"augment {name} {getattr(self, name)} is not a probability: give 0 to 1")
         if not 0 <= self.jitter < 1:
             raise ValueError(f"augment jitter {self.jitter}: give a strength in [0, 1)")
+        if not 0 <= self.noise <= 255:
+            raise ValueError(f"augment noise {self.noise}: give a standard deviation of 0 to 255 levels")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +275,21 @@ def random_view(
     if config.independent_sensors and channels > 3:
         apart = [apply(sensor, draw(config, num, side, generator), size, dtype) for sensor in images.split(3, dim=1)]
         return torch.cat(apart, dim=1).contiguous(memory_format=torch.channels_last)
-    return apply(images, draw(config, num, side, generator), size, dtype)
+    view = apply(images, draw(config, num, side, generator), size, dtype)
+    return _noisy(view, config.noise, generator) if config.noise else view
+
+
+def _noisy(view: Float[Tensor, "B C S S"], noise: float, generator: torch.Generator) -> Float[Tensor, "B C S S"]:
+    """``view`` with noise as in ``ViewAugment.noise``, no darker than black and no lighter than white.
+
+    The strengths come from ``generator``, the pixels from one of the view's device: they differ between kinds of devices.
+    """
+    num, channels, device = len(view), view.shape[1], view.device
+    strength = (noise * torch.rand(num, 1, 1, 1, generator=generator)).to(device, non_blocking=True)
+    here = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
+    scale, shift = (t.repeat(channels // 3).view(-1, 1, 1) for t in _normalisation(device))
+    pixels = torch.randn(view.shape, generator=here, device=device).to(memory_format=torch.channels_last)
+    return torch.addcmul(view.float(), pixels, strength * scale).clamp_(shift, shift + 255 * scale).to(view.dtype)
 
 
 def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B C S S"]:
