@@ -19,11 +19,11 @@ from mvitac.features import features
 from mvitac.model import Model, load
 from mvitac.pack import Pack
 from mvitac.paper_tables import write_tables
-from mvitac.probe import parts, probe_features
+from mvitac.probe import Parts, parts, probe_features
 from mvitac.recipes import recipe
 from mvitac.run import Optim
 from mvitac.session import Session, probe_runs
-from mvitac.stress import LEAK, MISSING, NOISE, STRESSES, stress
+from mvitac.stress import DROPOUT, LEAK, MISSING, NOISE, PREPARED, STRESSES, stress
 from mvitac.train import train
 
 
@@ -46,7 +46,8 @@ def records(trained: Path, pack: Pack) -> dict[tuple[str, str, str], dict]:
 def test_every_stress_of_every_modality(records: dict) -> None:
     tasks = ("pattern", "bright")
     anywhere = {(t, m, k) for t in tasks for m in ("touch", "vision", "both") for k in (*STRESSES[:3], *LEAK)}
-    assert set(records) == anywhere | {(t, "both", k) for t in tasks for k in MISSING.values()}
+    lost = (*MISSING.values(), DROPOUT, *PREPARED.values())
+    assert set(records) == anywhere | {(t, "both", k) for t in tasks for k in lost}
     sizes = {
         leak: {tuple(r["group_sizes"]) for r in records.values() if (r["probe"] in LEAK) == leak} for leak in (0, 1)
     }
@@ -64,6 +65,33 @@ def test_a_missing_modality_leaves_what_the_other_says(trained: Path, pack: Pack
     expected = probe_features(x, pack, task, rows, "linear", 0)
     assert records["pattern", "both", "vision missing"]["group_correct"] == expected["group_correct"]
     assert records["pattern", "both", "vision missing"]["accuracy"] > 0.5  # touch alone knows much of it
+
+
+def test_modality_dropout_learns_from_each_row_three_times(
+    trained: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned: list[tuple[np.ndarray, Parts]] = []
+    real = module.fit_probe
+    monkeypatch.setattr(
+        module,
+        "fit_probe",
+        lambda x, pack, task, rows, *rest: learned.append((x, rows)) or real(x, pack, task, rows, *rest),
+    )
+    task = pack.spec.tasks[0]
+    found = {r["probe"]: r for r in stress(load(trained), pack, [task], ["both"])}
+    (x, rows), (prepared, thrice) = learned
+    assert np.array_equal(thrice.train, np.tile(rows.train, 3)) and np.array_equal(thrice.val, np.tile(rows.val, 3))
+    assert np.array_equal(thrice.test, rows.test)
+    num, width = len(rows.train), x.shape[1] // 2
+    whole, no_vision, no_touch = prepared[: 3 * num].reshape(3, num, -1)
+    assert np.array_equal(whole, x[:num])
+    mean = x.mean(0)
+    assert np.array_equal(no_vision[:, width:], x[:num, width:]) and np.allclose(no_vision[:, :width], mean[:width])
+    assert np.array_equal(no_touch[:, :width], x[:num, :width]) and np.allclose(no_touch[:, width:], mean[width:])
+    assert np.array_equal(prepared[3 * num : 3 * num + len(rows.val)], x[num:])
+    lost = {kind: found[kind]["accuracy"] for kind in (DROPOUT, *PREPARED.values(), *MISSING.values())}
+    assert lost["modality dropout, vision missing"] >= lost["vision missing"] - 0.05
+    assert lost[DROPOUT] > 0.5
 
 
 def test_few_labels_take_their_share_and_one_of_each_class(pack: Pack) -> None:

@@ -6,7 +6,7 @@ Nothing is ever chosen on test: the regularisation is chosen on held-out groups 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -69,24 +69,30 @@ def probe_features(
     x: np.ndarray, pack: Pack, task: Task, rows: Parts, kind: str, seed: int, paper: Any = None
 ) -> dict[str, Any]:
     """One probe of ``kind`` on features ``x`` [train + val + test rows in this order, D]; ``paper`` is a trained one."""
+    num = len(rows.train) + len(rows.val)
+    predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
+    return {**score_rows(pack, task, rows.test, predict(x[num:])), **extra}
+
+
+def fit_probe(
+    x: np.ndarray, pack: Pack, task: Task, rows: Parts, kind: str, seed: int, paper: Any = None
+) -> tuple[Callable[[np.ndarray], np.ndarray], dict[str, Any]]:
+    """A function from features [N, D] to class probabilities [N, K], learned from ``x`` [train + val rows, D], and what
+    was chosen on the way (C of ``linear``)."""
     labels = pack.column(f"label_{task.name}").astype(int)
-    num_train, num_val, num = len(rows.train), len(rows.val), len(task.classes)
-    y, y_val = labels[rows.train], labels[rows.val]
-    learn, choose, test = x[:num_train], x[num_train : num_train + num_val], x[num_train + num_val :]
-    whole, y_whole = np.concatenate([learn, choose]), np.concatenate([y, y_val])
-    extra: dict[str, Any] = {}
+    y, y_val, num = labels[rows.train], labels[rows.val], len(task.classes)
+    learn, choose = x[: len(y)], x[len(y) :]
+    y_whole = np.concatenate([y, y_val])
     if len(np.unique(y)) < 2:
-        probabilities = np.eye(num)[np.full(len(test), y[0])]  # one class only: nothing to learn
-    elif kind == "linear":
-        predict, extra["C"] = fit_linear(learn, y, choose, y_val)
-        probabilities = spread_out(predict(test), np.unique(y_whole), num)
-    elif kind == "paper":
-        probabilities = (paper or fit_paper(whole, y_whole, num, seed))(test)
-    elif kind == "knn":
-        probabilities = fit_knn(whole, y_whole, num)(test)
-    else:
-        raise unknown("probe", kind, PROBES)
-    return {**score_rows(pack, task, rows.test, probabilities), **extra}
+        return lambda z: np.eye(num)[np.full(len(z), y[0])], {}  # one class only: nothing to learn
+    if kind == "linear":
+        fitted, c = fit_linear(learn, y, choose, y_val)
+        return lambda z: spread_out(fitted(z), np.unique(y_whole), num), {"C": c}
+    if kind == "paper":
+        return paper or fit_paper(x, y_whole, num, seed), {}
+    if kind == "knn":
+        return fit_knn(x, y_whole, num), {}
+    raise unknown("probe", kind, PROBES)
 
 
 def probe_model(

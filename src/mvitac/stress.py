@@ -16,7 +16,7 @@ import torch
 from mvitac.features import features
 from mvitac.model import Model
 from mvitac.pack import Pack
-from mvitac.probe import Parts, parts, probe_features
+from mvitac.probe import Parts, fit_probe, parts, probe_features, score_rows
 from mvitac.spec import Task
 
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}
@@ -26,10 +26,14 @@ NOISE_LEVELS = 20.0
 """Standard deviation of the noise on each 8-bit channel of test images."""
 MISSING = {"vision": "vision missing", "touch": "touch missing"}
 """modality -> name; a probe on both modalities meets test rows whose features of this one are train's mean."""
+DROPOUT = "modality dropout"
+"""A probe on both that learned from every row three times, whole and with each modality missing; its scores with both
+there, and under "modality dropout, vision missing" and the like."""
 LEAK = {"unseen groups": False, "groups seen in training": True}
 """name -> whether half of every test group's rows are learned from, in place of as many rows of train; scored is the other
 half both times, so that the same rows show what a split by frames or touches is worth in points."""
-STRESSES = (*SHARES, NOISE, *MISSING.values(), *LEAK)
+PREPARED = {lost: f"{DROPOUT}, {name}" for lost, name in MISSING.items()}
+STRESSES = (*SHARES, NOISE, *MISSING.values(), DROPOUT, *PREPARED.values(), *LEAK)
 
 
 def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]) -> list[dict[str, Any]]:
@@ -50,25 +54,41 @@ def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence
             if len(new):
                 known.update(zip(new.tolist(), _noisy_features(model, pack, m, new, seed), strict=True))
 
-        def score(kind: str, x: np.ndarray, rows: Parts = rows, task: Task = task, modality: str = modality) -> None:
-            result = probe_features(x, pack, task, rows, "linear", seed)
+        def add(kind: str, result: dict[str, Any], task: Task = task, modality: str = modality) -> None:
             records.append({"task": task.name, "modality": modality, "probe": kind, **result})
 
         x = np.concatenate([clean[m] for m in names], axis=1)
         for kind, share in SHARES.items():
             keep, few = _few(rows, pack.labels(task.name), share, seed)
-            score(kind, x[keep], few)
+            add(kind, probe_features(x[keep], pack, task, few, "linear", seed))
         for kind, leaks in LEAK.items():
             keep, halved = _halved(rows, pack.column("group"), leaks, seed)
             if len(halved.test):
-                score(kind, x[keep], halved)
+                add(kind, probe_features(x[keep], pack, task, halved, "linear", seed))
+
+        num = len(learned)
+        predict, extra = fit_probe(x[:num], pack, task, rows, "linear", seed)
         test = np.concatenate([np.stack([noisy[m][int(row)] for row in rows.test]) for m in names], axis=1)
-        score(NOISE, np.concatenate([x[: len(learned)], test]))
-        for lost, kind in MISSING.items() if modality == "both" else ():
-            blind = {m: z.copy() for m, z in clean.items()}
-            blind[lost][len(learned) :] = clean[lost][: len(learned)].mean(0)
-            score(kind, np.concatenate([blind[m] for m in names], axis=1))
+        add(NOISE, {**score_rows(pack, task, rows.test, predict(test)), **extra})
+        if modality != "both":
+            continue
+        blind = {lost: _without(lost, clean, num) for lost in MISSING}
+        for lost, kind in MISSING.items():
+            add(kind, {**score_rows(pack, task, rows.test, predict(blind[lost][num:])), **extra})
+        whole = [x, *blind.values()]
+        prepared = np.concatenate([z[: len(rows.train)] for z in whole] + [z[len(rows.train) : num] for z in whole])
+        thrice = Parts(np.tile(rows.train, 3), np.tile(rows.val, 3), rows.test)
+        predict, extra = fit_probe(prepared, pack, task, thrice, "linear", seed)
+        for kind, z in zip((DROPOUT, *PREPARED.values()), whole, strict=True):
+            add(kind, {**score_rows(pack, task, rows.test, predict(z[num:])), **extra})
     return records
+
+
+def _without(lost: str, clean: dict[str, np.ndarray], num: int) -> np.ndarray:
+    """Features of both modalities [N, D], those of ``lost`` everywhere the mean of the first ``num`` rows."""
+    return np.concatenate(
+        [np.broadcast_to(z[:num].mean(0), z.shape) if m == lost else z for m, z in clean.items()], axis=1
+    )
 
 
 def _few(rows: Parts, labels: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, Parts]:
