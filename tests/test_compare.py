@@ -9,12 +9,14 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from toy import Toy, toy_pack
 
@@ -32,6 +34,7 @@ from mvitac.recipes import RECIPES, recipe
 from mvitac.scores import paired_difference
 from mvitac.session import Session
 from mvitac.source import Sample
+from mvitac.train import Interrupted
 
 ROWS = (
     Row(label="MViTac", printed={"touch": {"pattern": 57.6}}),
@@ -261,6 +264,27 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
     lost = replace(work, jobs=[job for job in work.jobs if job.label == "wild"])
     with pytest.raises(ValueError, match=r"no run of .* is finished: .*\(wild, seed 0: the loss is not finite"):
         gather(lost, tmp_path, Session(controls=False))
+
+
+def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_path: Path) -> None:
+    work = lay_out(
+        small(pack, seeds=3, set={"steps": 30000, "log_every": 1, "eval_every": 0}),
+        pack,
+        tmp_path,
+        Session(controls=False),
+    )
+
+    def press() -> None:
+        while len(list(tmp_path.rglob("log.jsonl"))) < 2:
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=press, daemon=True).start()
+    with pytest.raises(Interrupted, match="stopped; the same command goes on from here"):
+        do_all(work, 2, lambda line: None)
+    assert not any((job.out / "model.safetensors").exists() for job in work.jobs)
+    steps = [torch.load(path, weights_only=True)["step"] for path in tmp_path.rglob("checkpoint.pt")]
+    assert 2 <= len(steps) <= 4 and 0 < min(steps) <= max(steps) < 30000
 
 
 def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], pack: Pack, tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import torch
 
 from mvitac.pack import Pack
 from mvitac.session import Session, probe_runs
-from mvitac.workers import in_threads
+from mvitac.workers import in_threads, side_by_side
 
 
 @pytest.fixture
@@ -66,3 +68,31 @@ def test_probes_do_not_depend_on_it(
         ]
 
     assert scores(2) == scores(1)
+
+
+def sleep_and_tell(path: Path) -> None:
+    path.with_suffix(".begun").touch()
+    time.sleep(300)
+    path.touch()
+
+
+def ctrl_c_answer() -> str:
+    return signal.getsignal(signal.SIGINT).name  # type: ignore[union-attr]
+
+
+def test_an_error_beside_them_cuts_off_what_is_under_way_and_begins_no_more(tmp_path: Path) -> None:
+    def work() -> None:
+        with side_by_side(2) as pool:
+            # From their first import on they leave Ctrl-C to the parent.
+            assert pool.submit(ctrl_c_answer).result() == "SIG_IGN"
+            assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+            for i in range(6):
+                pool.submit(sleep_and_tell, tmp_path / str(i))
+            while len(list(tmp_path.glob("*.begun"))) < 2:
+                time.sleep(0.02)
+            raise ValueError("enough")
+
+    with pytest.raises(ValueError, match="enough"):
+        work()
+    assert len(list(tmp_path.glob("*.begun"))) <= 4  # the executor has up to two more in its pipe
+    assert not [path for path in tmp_path.iterdir() if not path.suffix]

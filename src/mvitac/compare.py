@@ -33,7 +33,7 @@ from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.session import Session, chosen, probe_runs
 from mvitac.stress import stress
-from mvitac.train import Diverged, train
+from mvitac.train import Diverged, Interrupted, train
 from mvitac.workers import my_device, side_by_side
 
 
@@ -151,7 +151,17 @@ def do(job: Job, pack: Pack | None = None) -> str:
 
 
 def do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
-    """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several."""
+    """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several.
+
+    Interrupted after Ctrl-C, when the runs under way have saved their checkpoints.
+    """
+    try:
+        _do_all(work, num_jobs, say)
+    except (KeyboardInterrupt, Interrupted):
+        raise Interrupted("stopped; the same command goes on from here") from None
+
+
+def _do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
     todo = [job for job in work.jobs if not job.done]
     total = len(work.jobs)
     if num_jobs == 1 or len(todo) < 2:

@@ -176,21 +176,20 @@ def _try(method: Method, run: Run, pack: Pack) -> None:
 
 @contextmanager
 def _stop_signals() -> Iterator[Callable[[], bool]]:
-    """Turn the first SIGINT or SIGTERM into a request to stop after the step; a second Ctrl-C stops at once."""
-    asked = False
+    """Turn SIGINT and SIGTERM into a request to stop after the step; a second Ctrl-C stops at once."""
+    asked: set[int] = set()
 
     def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
+        if number == signal.SIGINT and number in asked:
             raise KeyboardInterrupt
-        asked = True
+        asked.add(number)
 
     try:
         old = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     except ValueError:  # not in the main thread: the caller's business
         old = {}
     try:
-        yield lambda: asked
+        yield lambda: bool(asked)
     finally:
         for number, handler in old.items():
             signal.signal(number, handler)

@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
 import torch
@@ -20,14 +24,42 @@ Result = TypeVar("Result")
 _device = "auto"
 
 
-def side_by_side(num: int, devices: Sequence[str] = ()) -> ProcessPoolExecutor:
-    """A pool of ``num`` spawned processes; each takes one of ``devices``, if given, for its life (``my_device``)."""
-    context = multiprocessing.get_context("spawn")
-    places = context.Queue()
+class _DeafProcess(SpawnProcess):
+    """Ctrl-C is for its parent to hear: while it imports, it would only answer with a traceback."""
+
+    def start(self) -> None:
+        here = threading.current_thread() is threading.main_thread()
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN) if here else None
+        try:
+            super().start()
+        finally:
+            if before is not None:
+                signal.signal(signal.SIGINT, before)
+
+
+class _Context(SpawnContext):
+    Process = _DeafProcess
+
+
+@contextmanager
+def side_by_side(num: int, devices: Sequence[str] = ()) -> Iterator[ProcessPoolExecutor]:
+    """A pool of ``num`` spawned processes; each takes one of ``devices``, if given, for its life (``my_device``).
+
+    On Ctrl-C, or any other error in the ``with``, nothing more is begun and what is under way gets SIGTERM: training saves
+    its checkpoint and stops after its step, anything else is cut off.
+    """
+    context = _Context()
+    places, stop = context.Queue(), context.Event()
     for i in range(num):
         places.put(devices[i % len(devices)] if devices else "auto")
     threads = max(1, (os.cpu_count() or 1) // num)
-    return ProcessPoolExecutor(num, context, initializer=_start, initargs=(places, threads))
+    with ProcessPoolExecutor(num, context, initializer=_start, initargs=(places, threads, stop)) as pool:
+        try:
+            yield pool
+        except BaseException:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def my_device() -> str:
@@ -54,7 +86,7 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
         torch.set_num_threads(threads)
 
 
-def _start(places: Any, threads: int) -> None:
+def _start(places: Any, threads: int, stop: Any) -> None:
     global _device
     _device = places.get()
     torch.set_num_threads(threads)
@@ -65,4 +97,11 @@ def _start(places: Any, threads: int) -> None:
         parent.join()
         os._exit(1)
 
+    def obey() -> None:
+        stop.wait()
+        while True:  # training answers by stopping, but a further task may lie ready
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1)
+
     threading.Thread(target=follow, daemon=True).start()
+    threading.Thread(target=obey, daemon=True).start()
