@@ -96,13 +96,15 @@ def probe(argv: list[str]) -> None:
             raise ValueError(f"--json {options.json} is a folder: give another name, of a file")
     pack = Pack(options.on) if options.on else None
     result = probe_runs(options.runs, options.session, pack)
-    worse = []
-    for path in options.runs if options.stress else ():
+    console, worse = Console(), []
+    for i, path in enumerate(options.runs if options.stress else (), start=1):
+        console.print(
+            f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)} ...", highlight=False
+        )
         model = load(path)
         where = pack or model.run.data.open()
         own = {"source": model.run.method.name, "seed": model.run.seed, "run": str(path)}
         worse += [{**own, **r} for r in stress(model, where, *chosen(where, options.session))]
-    console = Console()
     for kind in options.session.probes:
         print_summary({**result, "summary": summarise(result["records"], kind)}, console, probe=kind)
     for kind in STRESSES:
