@@ -194,6 +194,13 @@ def test_unknown_plans(given: str) -> None:
         find_plan(given)
 
 
+def test_some_rows_of_a_plan_stand_beside_its_reference() -> None:
+    assert [row.label for row in TABLE1.only(["SSVTP", "TAG (CMC)"]).rows] == ["TAG (CMC)", "SSVTP", "MViTac"]
+    assert TABLE1.only([]) == TABLE1
+    with pytest.raises(ValueError, match="unknown row 'ssvtp': choose from"):
+        TABLE1.only(["ssvtp"])
+
+
 def test_changed_fields_are_checked() -> None:
     run = recipe("smoke")
     assert changed(run, {"optim.lr": 1, "steps": 7}).optim.lr == 1.0
@@ -434,6 +441,9 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
     assert "[2/2] tau 1, seed 0" in shown and "| tau 0 | touch |" in shown
     assert main([*words, "--set", "steps=1", "--tables-only"]) == 0
     assert "all runs are finished" in capsys.readouterr().out
+    assert main([*words, "--set", "steps=1", "--tables-only", "--rows", "tau 0"]) == 0
+    shown = capsys.readouterr().out
+    assert "| tau 0 | touch |" in shown and "tau 1" not in shown
 
 
 @pytest.mark.parametrize(
@@ -444,6 +454,7 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
         (["--set", "steps"], "field=value"),
         (["--set", "stepz=3"], "unknown field of a run 'stepz'"),
         (["--jobs", "0"], "jobs 0"),
+        (["--rows", "SVTP"], "unknown row 'SVTP'"),
         (["--seeds", "0"], "seeds 0"),
     ],
 )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -93,6 +93,15 @@ class Plan:
                 setting(pair, "fold")
         if self.reference not in labels:
             raise unknown("reference row", self.reference, labels)
+
+    def only(self, labels: Sequence[str]) -> Plan:
+        """The plan with the rows of these labels and the reference; all rows if none is given."""
+        known = [row.label for row in self.rows]
+        for label in labels:
+            if label not in known:
+                raise unknown("row", label, known)
+        wanted = {*labels, self.reference} if labels else set(known)
+        return replace(self, rows=tuple(row for row in self.rows if row.label in wanted))
 
     def in_folds(self) -> list[tuple[str, Plan]]:
         """A plan for each fold, with its name; the plan itself, without a name, where there are none."""

@@ -37,6 +37,8 @@ def compare(argv: list[str]) -> None:
         data: Annotated[type(chosen), tyro.conf.arg(name="data", help=chosen.__doc__)] = chosen  # type: ignore[valid-type]
         out: Path = Path("runs") / f"compare-{plan.name}-{chosen.name}"
         """Folder of the comparison: runs, controls, tables. The same command goes on where it stopped."""
+        rows: tuple[str, ...] = ()
+        """Labels of the rows to run and to show beside the reference, e.g. --rows SSVTP "TAG (CMC)"; none = all."""
         seeds: int = plan.seeds
         """Runs per row, seeds 0 .. seeds - 1."""
         folds: tuple[str, ...] = plan.folds
@@ -86,7 +88,7 @@ def compare(argv: list[str]) -> None:
         raise ValueError(f"jobs {options.jobs}: give 1 to 1024 runs at a time")
     extra = dict(setting(text) for text in options.set)
     plan = replace(
-        plan,
+        plan.only(options.rows),
         data=options.data,
         recipe=given.get("--recipe", plan.recipe),
         seeds=options.seeds,
