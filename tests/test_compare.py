@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import re
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from rich.console import Console
 from toy import Toy, toy_pack
 
 from mvitac import compare as module
@@ -274,21 +276,18 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
 
 
 def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_path: Path) -> None:
-    work = lay_out(
-        small(pack, seeds=3, set={"steps": 30000, "log_every": 1, "eval_every": 0}),
-        pack,
-        tmp_path,
-        Session(controls=False),
-    )
+    work = lay_out(small(pack, seeds=3, set={"steps": 30000, "eval_every": 0}), pack, tmp_path, Session(controls=False))
+    terminal = Console(force_terminal=True, file=(screen := io.StringIO()), width=80)
 
     def press() -> None:
-        while len(list(tmp_path.rglob("log.jsonl"))) < 2:
+        shown = ("all runs", "MViTac, seed 0", "colder, seed 0", "loss")
+        while not all(words in screen.getvalue() for words in shown):
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press, daemon=True).start()
     with pytest.raises(Interrupted, match="stopped; the same command goes on from here"):
-        do_all(work, 2, lambda line: None)
+        do_all(work, 2, lambda line: None, terminal)
     assert not any((job.out / "model.safetensors").exists() for job in work.jobs)
     steps = [torch.load(path, weights_only=True)["step"] for path in tmp_path.rglob("checkpoint.pt")]
     assert 2 <= len(steps) <= 4 and 0 < min(steps) <= max(steps) < 30000

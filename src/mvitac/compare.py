@@ -13,18 +13,21 @@ from __future__ import annotations
 import json
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.progress import TaskID
 
 from mvitac.batches import gel_mirror, training_rows
 from mvitac.controls import controls_of
 from mvitac.device import describe, pick_device
 from mvitac.encoders import SCRATCH
+from mvitac.log import bars, last_line
 from mvitac.model import load
 from mvitac.pack import Pack
 from mvitac.plans import Plan, Row, slug
@@ -126,7 +129,7 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
 # -- doing it ---------------------------------------------------------------------------------------------------------
 
 
-def do(job: Job, pack: Pack | None = None) -> str:
+def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
     """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant."""
     if job.done:
         return "finished before"
@@ -134,7 +137,7 @@ def do(job: Job, pack: Pack | None = None) -> str:
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
     try:
-        train(job.run, job.out, resume=True, quiet=True, pack=pack)
+        train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
     except Diverged as error:
         write_json(job.out / "failed.json", {"error": str(error)})
         return f"diverged: {error}"
@@ -150,32 +153,57 @@ def do(job: Job, pack: Pack | None = None) -> str:
     return f"{seconds_of(job.out):.0f} s of training"
 
 
-def do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
+def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
     """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several.
 
-    Interrupted after Ctrl-C, when the runs under way have saved their checkpoints.
+    ``console``, if it is a terminal, shows how far they are. Interrupted after Ctrl-C, when the runs under way have saved
+    their checkpoints.
     """
+    todo = [job for job in work.jobs if not job.done]
+    shown = console if console and console.is_terminal else None
+
+    def told(job: Job, line: str) -> None:
+        say(f"[{sum(j.done for j in work.jobs)}/{len(work.jobs)}] {job.name}: {line}")
+
     try:
-        _do_all(work, num_jobs, say)
+        if num_jobs == 1 or len(todo) < 2:
+            for job in todo:
+                say(f"{job.name} ...")
+                told(job, do(job, work.pack if job.run.data == work.plan.data else None, quiet=not shown))
+        else:
+            _side_by_side(work, todo, num_jobs, told, shown)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("stopped; the same command goes on from here") from None
 
 
-def _do_all(work: Work, num_jobs: int, say: Callable[[str], None]) -> None:
-    todo = [job for job in work.jobs if not job.done]
-    total = len(work.jobs)
-    if num_jobs == 1 or len(todo) < 2:
-        for job in todo:
-            say(f"{job.name} ...")
-            line = do(job, work.pack if job.run.data == work.plan.data else None)
-            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.name}: {line}")
-        return
+def _side_by_side(
+    work: Work, todo: Sequence[Job], num_jobs: int, told: Callable[[Job, str], None], console: Console | None
+) -> None:
     gpus = torch.cuda.device_count()
-    with side_by_side(num_jobs, [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()) as pool:
-        futures = {pool.submit(_do_here, job): job for job in todo}
-        for done in as_completed(futures):
-            job = futures[done]
-            say(f"[{sum(j.done for j in work.jobs)}/{total}] {job.name}: {done.result()}")
+    devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
+    shown = bars(console or Console(), disable=console is None, transient=True, speed_estimate_period=600)
+    with shown as progress, side_by_side(num_jobs, devices) as pool:
+        overall = progress.add_task("all runs", total=len(todo), text="")
+        tasks: dict[Path, tuple[TaskID, int]] = {}  # of the runs under way, with their steps
+        jobs = {pool.submit(_do_here, job): job for job in todo}
+        waiting = set(jobs)
+        while waiting:
+            done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
+            for job, line in ((jobs[future], future.result()) for future in done):
+                told(job, line)
+                if job.out in tasks:
+                    progress.remove_task(tasks.pop(job.out)[0])
+            part = 0.0
+            for job in (jobs[future] for future in waiting if future.running()) if console else ():
+                step, text = last_line(job.out)
+                if step and job.out not in tasks:
+                    steps = job.run.num_steps(len(training_rows(job.run, work.pack)))
+                    tasks[job.out] = progress.add_task(job.name, total=steps, text=""), steps
+                if job.out in tasks:
+                    task, steps = tasks[job.out]
+                    progress.update(task, completed=step, text=text)
+                    part += step / steps
+            progress.update(overall, completed=len(todo) - len(waiting) + part)
 
 
 def _do_here(job: Job) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Sequence
@@ -11,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mvitac.device import pick_device
+from mvitac.log import bars, last_line
 from mvitac.record import write_json
 from mvitac.report import write_report
 from mvitac.run import Run
@@ -68,19 +67,18 @@ def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Co
     Where no one sees bars move (a file, a pipe) a line is printed for every tenth of the way.
     Interrupted after Ctrl-C, when every run has saved its checkpoint; the first run's error if one fails.
     """
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.fields[text]}"), console=console) as progress:
+    with bars(console) as progress:
         tenth = 0
-        bars = {path: progress.add_task(f"seed {run.seed}", total=num_steps, text="") for run, path in runs}
+        tasks = {path: progress.add_task(f"seed {run.seed}", total=num_steps, text="") for run, path in runs}
         with side_by_side(len(runs)) as pool:
             waiting = {pool.submit(train, run, path, resume=True, quiet=True) for run, path in runs}
             try:
                 while waiting:
                     done, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
-                    for path, bar in bars.items():
-                        step, text = _last_line(path / "log.jsonl")
+                    for path, task in tasks.items():
+                        step, text = last_line(path)
                         finished = (path / "model.safetensors").exists()
-                        progress.update(bar, completed=num_steps if finished else step, text=text)
+                        progress.update(task, completed=num_steps if finished else step, text=text)
                     slowest = min(progress.tasks, key=lambda task: task.completed)
                     if not console.is_terminal and 10 * slowest.completed // num_steps > tenth:
                         tenth = int(10 * slowest.completed // num_steps)
@@ -89,13 +87,3 @@ def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Co
                         future.result()
             except KeyboardInterrupt:  # the terminal sent it to the runs as well, which stop after their step
                 raise Interrupted("stopped; the same command goes on from here") from None
-
-
-def _last_line(log: Path) -> tuple[int, str]:
-    """The step that a run's log has come to, and what it says of it."""
-    try:
-        entries = [json.loads(line) for line in log.read_text().splitlines()[-2:]]
-    except (OSError, ValueError):  # not there yet, or a line being written
-        return 0, ""
-    told = [entry for entry in entries if "loss" in entry]
-    return (told[-1]["step"], f"loss {told[-1]['loss']:.2f}  {told[-1]['pairs_per_s']:.0f}/s") if told else (0, "")

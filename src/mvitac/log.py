@@ -1,4 +1,4 @@
-"""What a run says of itself while it trains: log.jsonl, the progress line, and the sinks one may add."""
+"""What a run says of itself while it trains: log.jsonl, the progress line, and the sinks one may add; and others of it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from mvitac.record import naming, write_atomic
@@ -71,3 +72,25 @@ class Log:
         flat = {k: v for k, v in {**entry, **entry.get("eval", {})}.items() if isinstance(v, float)}
         for sink in self.sinks:
             sink(entry["step"], flat)
+
+
+def bars(console: Console, **options: Any) -> Progress:
+    """Bars of runs in other processes; each task has a field ``text`` (``last_line``)."""
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, TextColumn("{task.fields[text]}"), console=console, **options)
+
+
+def last_line(run: Path) -> tuple[int, str]:
+    """The step that the run in a folder has come to, and what its log says of it."""
+    try:
+        lines = (run / "log.jsonl").read_text().splitlines()
+    except OSError:  # not there yet
+        return 0, ""
+    for line in reversed(lines):
+        try:
+            entry = json.loads(line)
+        except ValueError:  # being written
+            continue
+        if "loss" in entry:
+            return entry["step"], f"loss {entry['loss']:.2f}  {entry['pairs_per_s']:.0f}/s"
+    return 0, ""

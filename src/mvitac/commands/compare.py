@@ -112,7 +112,7 @@ def compare(argv: list[str]) -> None:
         say(submit(work, options.slurm))
         return
     if not options.tables_only:
-        do_all(work, options.jobs or _num_gpus(), say)
+        do_all(work, options.jobs or _num_gpus(), say, console)
     written = write_tables(gather_folds(plan, works, options.out, session), options.out)
     say(written[0].read_text())
     for path in written:
