@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before anything imports the hub's client, which reads it once: no test reaches the network.
@@ -31,6 +33,14 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pack(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     """120 striped pairs at 32 px: 3 classes x 20 instances x 2; split by instance."""
     return toy_pack(tmp_path_factory.mktemp("toy") / "pack")
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Ctrl-C raises, as in a terminal; a shell that starts pytest in the background has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

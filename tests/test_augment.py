@@ -199,10 +199,10 @@ def test_jitter_keeps_the_range() -> None:
     assert float(view.min()) >= -1e-5 and float(view.max()) <= 1 + 1e-5
 
 
-@pytest.mark.parametrize("channels", [3, 6])
-def test_noise_is_as_strong_as_drawn_and_stays_in_range(channels: int) -> None:
+@pytest.mark.parametrize(("channels", "apart"), [(3, False), (6, False), (6, True)])
+def test_noise_is_as_strong_as_drawn_and_stays_in_range(channels: int, apart: bool) -> None:
     gray = torch.full((400, channels, 32, 32), 128, dtype=torch.uint8)
-    config = ViewAugment(scale=(1.0, 1.0), flip=0, grayscale=0, noise=20)
+    config = ViewAugment(scale=(1.0, 1.0), flip=0, grayscale=0, noise=20, independent_sensors=apart)
     levels = 255 * denormalise(random_view(gray, config, 32, generator())) - 128
     spread = levels.flatten(1).std(1)  # of each image: uniform on [0, 20]
     assert float(spread.min()) < 0.5 and 19 < float(spread.max()) < 20.5

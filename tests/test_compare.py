@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -275,13 +276,15 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
         gather(lost, tmp_path, Session(controls=False))
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_path: Path) -> None:
     work = lay_out(small(pack, seeds=3, set={"steps": 30000, "eval_every": 0}), pack, tmp_path, Session(controls=False))
     terminal = Console(force_terminal=True, file=(screen := io.StringIO()), width=80)
 
     def press() -> None:
         shown = ("all runs", "MViTac, seed 0", "colder, seed 0", "loss")
-        while not all(words in screen.getvalue() for words in shown):
+        deadline = time.monotonic() + 300
+        while not all(words in screen.getvalue() for words in shown) and time.monotonic() < deadline:
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -291,6 +294,27 @@ def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_pat
     assert not any((job.out / "model.safetensors").exists() for job in work.jobs)
     steps = [torch.load(path, weights_only=True)["step"] for path in tmp_path.rglob("checkpoint.pt")]
     assert 2 <= len(steps) <= 4 and 0 < min(steps) <= max(steps) < 30000
+
+
+@pytest.mark.parametrize("num_jobs", [1, 2])
+def test_a_run_that_fails_is_told_and_the_others_go_on(
+    done: tuple[Path, dict], pack: Pack, tmp_path: Path, num_jobs: int
+) -> None:
+    work = lay_out(small(pack, rows=ROWS[:2], seeds=1, set={"steps": 3}), pack, tmp_path, Session(controls=False))
+    shutil.copytree(done[0] / "runs/mvitac/seed0", work.jobs[0].out)
+    (work.jobs[0].out / "scores.json").unlink()
+    said: list[str] = []
+    with pytest.raises(ValueError, match="holds a different run"):
+        do_all(work, num_jobs, said.append)
+    assert any(re.fullmatch(r"\[\d/2\] MViTac, seed 0: failed: .* holds a different run .*", line) for line in said)
+    assert [job.done for job in work.jobs] == [False, True]
+
+
+def test_a_run_killed_once_scored_loses_its_checkpoint_later(done: tuple[Path, dict], pack: Pack) -> None:
+    work = lay_out(small(pack), pack, done[0], Session())
+    (work.jobs[0].out / "checkpoint.pt").touch()
+    do_all(work, 1, lambda line: None)
+    assert not (work.jobs[0].out / "checkpoint.pt").exists()
 
 
 def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], pack: Pack, tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
@@ -80,6 +82,7 @@ def ctrl_c_answer() -> str:
     return signal.getsignal(signal.SIGINT).name  # type: ignore[union-attr]
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_an_error_beside_them_cuts_off_what_is_under_way_and_begins_no_more(tmp_path: Path) -> None:
     def work() -> None:
         with side_by_side(2) as pool:
@@ -96,3 +99,35 @@ def test_an_error_beside_them_cuts_off_what_is_under_way_and_begins_no_more(tmp_
         work()
     assert len(list(tmp_path.glob("*.begun"))) <= 4  # the executor has up to two more in its pipe
     assert not [path for path in tmp_path.iterdir() if not path.suffix]
+
+
+def test_a_process_that_dies_is_an_error_and_no_wait() -> None:
+    """Also on Linux short of memory, where the kernel chooses one of them."""
+    said: list[type] = []
+
+    def work() -> None:
+        try:
+            with side_by_side(2) as pool:
+                pool.submit(os.getpid).result()
+                pool.submit(os._exit, 9).result()
+        except BaseException as error:
+            said.append(type(error))
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(300)
+    assert said == [BrokenProcessPool]
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_sigterm_is_ctrl_c_beside_them() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+
+    def work() -> None:
+        with side_by_side(1):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert signal.getsignal(signal.SIGTERM) is before

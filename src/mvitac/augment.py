@@ -274,8 +274,9 @@ def random_view(
     num, channels, side, _ = images.shape
     if config.independent_sensors and channels > 3:
         apart = [apply(sensor, draw(config, num, side, generator), size, dtype) for sensor in images.split(3, dim=1)]
-        return torch.cat(apart, dim=1).contiguous(memory_format=torch.channels_last)
-    view = apply(images, draw(config, num, side, generator), size, dtype)
+        view = torch.cat(apart, dim=1).contiguous(memory_format=torch.channels_last)
+    else:
+        view = apply(images, draw(config, num, side, generator), size, dtype)
     return _noisy(view, config.noise, generator) if config.noise else view
 
 

@@ -14,6 +14,7 @@ import json
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from mvitac.log import bars, last_line
 from mvitac.model import load
 from mvitac.pack import Pack
 from mvitac.plans import Plan, Row, slug
-from mvitac.record import digest, provenance, read_json, write_json
+from mvitac.record import brief, digest, provenance, read_json, write_json
 from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.session import Session, chosen, probe_runs
@@ -60,6 +61,10 @@ class Job:
     def done(self) -> bool:
         scored = (self.out / "scores.json").exists() and (not self.stress or (self.out / "stress.json").exists())
         return scored or (self.out / "failed.json").exists()
+
+    def drop_checkpoint(self) -> None:
+        """Once scored, a run needs none; they are four times its weights, and hundreds of runs would fill a disk."""
+        (self.out / "checkpoint.pt").unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -149,35 +154,59 @@ def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
         own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
         write_json(job.out / "stress.json", {"records": [{**own, **record} for record in records]})
     write_json(job.out / "scores.json", {"records": result["records"], "retrieval": result["retrieval"]})
-    (job.out / "checkpoint.pt").unlink(missing_ok=True)  # four times its weights: hundreds of runs would fill a disk
+    job.drop_checkpoint()
     return f"{seconds_of(job.out):.0f} s of training"
 
 
 def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
     """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several.
 
-    ``console``, if it is a terminal, shows how far they are. Interrupted after Ctrl-C, when the runs under way have saved
+    ``console``, if it is a terminal, shows how far they are. A job that fails is told; the first one's error is raised after
+    all others are done. ValueError if a process dies. Interrupted after Ctrl-C, when the runs under way have saved
     their checkpoints.
     """
     todo = [job for job in work.jobs if not job.done]
+    for job in work.jobs:
+        if job.done and not (job.out / "failed.json").exists():
+            job.drop_checkpoint()  # of a run that was killed when it had been scored
     shown = console if console and console.is_terminal else None
+    errors: list[Exception] = []
 
-    def told(job: Job, line: str) -> None:
+    def told(job: Job, result: Callable[[], str]) -> None:
+        try:
+            line = result()
+        except (Interrupted, BrokenProcessPool):
+            raise
+        except Exception as error:  # the other runs need not wait for someone to mend it
+            errors.append(error)
+            line = f"failed: {brief(error)}"
         say(f"[{sum(j.done for j in work.jobs)}/{len(work.jobs)}] {job.name}: {line}")
 
     try:
         if num_jobs == 1 or len(todo) < 2:
             for job in todo:
                 say(f"{job.name} ...")
-                told(job, do(job, work.pack if job.run.data == work.plan.data else None, quiet=not shown))
+                pack = work.pack if job.run.data == work.plan.data else None
+                told(job, lambda job=job, pack=pack: do(job, pack, quiet=not shown))
         else:
             _side_by_side(work, todo, num_jobs, told, shown)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("stopped; the same command goes on from here") from None
+    except BrokenProcessPool:
+        raise ValueError(
+            f"one of {num_jobs} processes was killed, most likely for lack of memory: give fewer --jobs; the same command"
+            " goes on from here"
+        ) from None
+    if errors:
+        raise errors[0]
 
 
 def _side_by_side(
-    work: Work, todo: Sequence[Job], num_jobs: int, told: Callable[[Job, str], None], console: Console | None
+    work: Work,
+    todo: Sequence[Job],
+    num_jobs: int,
+    told: Callable[[Job, Callable[[], str]], None],
+    console: Console | None,
 ) -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
@@ -189,8 +218,8 @@ def _side_by_side(
         waiting = set(jobs)
         while waiting:
             done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
-            for job, line in ((jobs[future], future.result()) for future in done):
-                told(job, line)
+            for future in done:
+                told(job := jobs[future], future.result)
                 if job.out in tasks:
                     progress.remove_task(tasks.pop(job.out)[0])
             part = 0.0
@@ -202,7 +231,7 @@ def _side_by_side(
                 if job.out in tasks:
                     task, steps = tasks[job.out]
                     progress.update(task, completed=step, text=text)
-                    part += step / steps
+                    part += min(1, step / steps)  # a fold's own steps may be more
             progress.update(overall, completed=len(todo) - len(waiting) + part)
 
 

@@ -24,17 +24,24 @@ Result = TypeVar("Result")
 _device = "auto"
 
 
+@contextmanager
+def _answer(number: int, handler: Any) -> Iterator[None]:
+    """``handler`` of a signal for as long as the ``with`` lasts; nothing in other threads than the main one."""
+    here = threading.current_thread() is threading.main_thread()
+    before = signal.signal(number, handler) if here else None
+    try:
+        yield
+    finally:
+        if before is not None:
+            signal.signal(number, before)
+
+
 class _DeafProcess(SpawnProcess):
     """Ctrl-C is for its parent to hear: while it imports, it would only answer with a traceback."""
 
     def start(self) -> None:
-        here = threading.current_thread() is threading.main_thread()
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN) if here else None
-        try:
+        with _answer(signal.SIGINT, signal.SIG_IGN):
             super().start()
-        finally:
-            if before is not None:
-                signal.signal(signal.SIGINT, before)
 
 
 class _Context(SpawnContext):
@@ -45,19 +52,23 @@ class _Context(SpawnContext):
 def side_by_side(num: int, devices: Sequence[str] = ()) -> Iterator[ProcessPoolExecutor]:
     """A pool of ``num`` spawned processes; each takes one of ``devices``, if given, for its life (``my_device``).
 
-    On Ctrl-C, or any other error in the ``with``, nothing more is begun and what is under way gets SIGTERM: training saves
-    its checkpoint and stops after its step, anything else is cut off.
+    On Ctrl-C or SIGTERM, which is a KeyboardInterrupt here, or any other error in the ``with``, nothing more is begun and
+    what is under way gets SIGTERM: training saves its checkpoint and stops after its step, anything else is cut off.
     """
     context = _Context()
-    places, stop = context.Queue(), context.Event()
+    places, stop = context.Queue(), context.Semaphore(0)  # an Event would wait for sleepers that have died
     for i in range(num):
         places.put(devices[i % len(devices)] if devices else "auto")
     threads = max(1, (os.cpu_count() or 1) // num)
-    with ProcessPoolExecutor(num, context, initializer=_start, initargs=(places, threads, stop)) as pool:
+    with (
+        _answer(signal.SIGTERM, signal.default_int_handler),
+        ProcessPoolExecutor(num, context, initializer=_start, initargs=(places, threads, stop)) as pool,
+    ):
         try:
             yield pool
         except BaseException:
-            stop.set()
+            for _ in range(num):
+                stop.release()
             pool.shutdown(cancel_futures=True)
             raise
 
@@ -98,7 +109,7 @@ def _start(places: Any, threads: int, stop: Any) -> None:
         os._exit(1)
 
     def obey() -> None:
-        stop.wait()
+        stop.acquire()
         while True:  # training answers by stopping, but a further task may lie ready
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(1)

@@ -38,7 +38,8 @@ def compare(argv: list[str]) -> None:
         out: Path = Path("runs") / f"compare-{plan.name}-{chosen.name}"
         """Folder of the comparison: runs, controls, tables. The same command goes on where it stopped."""
         rows: tuple[str, ...] = ()
-        """Labels of the rows to run and to show beside the reference, e.g. --rows SSVTP "TAG (CMC)"; none = all."""
+        """Labels of the rows to run and to show beside the reference, e.g. --rows SSVTP "TAG (CMC)"; none = all. The tables
+        in --out are then of these; runs of others stay, and the same command without --rows shows them again."""
         seeds: int = plan.seeds
         """Runs per row, seeds 0 .. seeds - 1."""
         folds: tuple[str, ...] = plan.folds
