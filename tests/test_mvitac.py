@@ -13,7 +13,7 @@ from toy import Toy
 
 from mvitac.batch import Views
 from mvitac.encoders import SCRATCH, EncoderConfig
-from mvitac.methods.mvitac import MViTac, MViTacConfig
+from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
 from mvitac.run import Optim
 from mvitac.spec import DataSpec
 from mvitac.step import build_optimiser
@@ -192,6 +192,29 @@ def test_end_to_end_keys_are_the_queries_and_learn() -> None:
     found = [(a.grad, b.grad) for a, b in zip(learned.query.parameters(), copied.query.parameters(), strict=True)]
     assert not all(torch.allclose(a, b, rtol=0.05) for a, b in found if a is not None and b is not None)
     learned.after_step(0.5)  # has nothing to move
+
+
+@pytest.mark.parametrize("way", [{"keys": "end-to-end"}, {"symmetric": True}])
+def test_all_pairs_are_the_mean_over_four_pairs_of_views(way: dict[str, object]) -> None:
+    """Inter-modal losses: both queries against both keys; intra-modal ones never pair a view with itself."""
+    method = build(replace(CONFIG, **way, pairs="all"))  # type: ignore[arg-type]
+    batch = views()
+    z = method.queries(batch) | method.keys(batch)
+    key = "q" if "keys" in way else "k"
+    losses, tau = method.contrast(z), CONFIG.temperature
+    for part, (mine, other) in PARTS.items():
+        head = "intra" if mine == other else "inter"
+        pairs = [(q, k) for q in (0, 1) for k in (0, 1) if mine != other or q != k]
+        terms = [slow_info_nce(z[f"q{q}_{mine}_{head}"], z[f"{key}{k}_{other}_{head}"], tau) for q, k in pairs]
+        assert losses[part].item() == pytest.approx(sum(terms) / len(terms), rel=1e-5)
+    crossed = replace(method.config, pairs="crossed")
+    method.config = crossed
+    assert not torch.allclose(method.contrast(z)["vt"], losses["vt"])
+
+
+def test_all_pairs_need_each_view_as_query_and_key() -> None:
+    with pytest.raises(ValueError, match="pairs 'all': give keys 'end-to-end' or symmetric"):
+        replace(CONFIG, pairs="all")
 
 
 def test_end_to_end_on_touch_alone() -> None:

@@ -104,4 +104,5 @@ def test_choices_that_came_later_do_not_change_older_runs(monkeypatch: pytest.Mo
     monkeypatch.setattr("mvitac.run.digest", lambda value: value)
     before: Any = run.digest()
     assert "gel_flip" not in before["augment"] and "store" not in before["data"]
+    assert "pairs" not in before["method"] and before["method"]["keys"] == "momentum"
     assert not any("noise" in before["augment"][modality] for modality in ("vision", "touch"))

@@ -168,11 +168,14 @@ class Run:
         value = to_json(self)
         for name in ("device", "log_every", "eval_every", "checkpoint_every"):
             del value[name]
-        # What is as it was before there was a choice has the digest it had then: raw packs, plain flips, no noise.
+        # What is as it was before there was a choice has the digest it had then: raw packs, plain flips, no
+        # noise, crossed pairs.
         for name in (*self.data.local, *(("store", "quality") if self.data.store == "raw" else ())):
             del value["data"][name]
         if self.augment.gel_flip == "plain":
             del value["augment"]["gel_flip"]
+        if value["method"].get("pairs") == "crossed":
+            del value["method"]["pairs"]
         for modality in ("vision", "touch"):
             if not value["augment"][modality]["noise"]:
                 del value["augment"][modality]["noise"]

@@ -48,6 +48,9 @@ class MViTacConfig(MethodConfig):
     tower's (EMAN, arXiv:2101.08482)."""
     symmetric: bool = False
     """Each view is query and key in turn, the loss the mean of both ways (BYOL, MoCo v3); the paper has one way."""
+    pairs: Literal["crossed", "all"] = "crossed"
+    """Which views the inter-modal losses pair: a view of one modality with the other's other view (the paper's query and
+    key), or with both, at the same forward passes. "all" needs each view as query and key: end-to-end or symmetric."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
     """Which of the four losses of eq. 14 to minimise; the paper minimises all."""
     shared_heads: bool = False
@@ -74,8 +77,17 @@ class MViTacConfig(MethodConfig):
                 raise ValueError(f"head width {name} {width}: give 1 to 65536")
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
+        if self.pairs == "all" and not self.both_ways:
+            raise ValueError(
+                "pairs 'all': give keys 'end-to-end' or symmetric as well, else each view is one of the two only"
+            )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
+
+    @property
+    def both_ways(self) -> bool:
+        """Whether each view is query and key."""
+        return self.symmetric or self.keys == "end-to-end"
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
         if not set(self.losses) & set(_possible(spec)):
@@ -138,8 +150,7 @@ class MViTac(Contrastive):
     @property
     def directions(self) -> tuple[tuple[int, int], ...]:
         """(view of the query, view of the key) of every term of a loss."""
-        both = self.config.symmetric or self.config.keys == "end-to-end"
-        return ((0, 1), (1, 0)) if both else ((0, 1),)
+        return ((0, 1), (1, 0)) if self.config.both_ways else ((0, 1),)
 
     def queries(self, batch: Views) -> dict[str, Tensor]:
         return _embed(self.query, batch, "q", [q for q, _ in self.directions])  # eq. 4, 6, 9, 12
@@ -154,9 +165,10 @@ class MViTac(Contrastive):
             if mine not in self.query or other not in self.query:
                 continue
             head = "intra" if mine == other else "inter"
+            same = ((0, 0), (1, 1)) if head == "inter" and self.config.pairs == "all" else ()
             ways = [
                 info_nce(z[f"q{query}_{mine}_{head}"], z[f"{tower}{key}_{other}_{head}"], self.config.temperature)
-                for query, key in self.directions
+                for query, key in self.directions + same
             ]
             losses[part] = torch.stack(ways).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
