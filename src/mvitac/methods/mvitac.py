@@ -19,6 +19,8 @@ from mvitac.batch import Views
 from mvitac.encoders import EncoderConfig, Head, build_trunk
 from mvitac.losses import info_nce
 from mvitac.methods.base import Contrastive, MethodConfig
+from mvitac.methods.simclr import nt_xent
+from mvitac.methods.vicreg import variance
 from mvitac.momentum import Momentum, rising
 from mvitac.spec import DataSpec
 
@@ -48,6 +50,12 @@ class MViTacConfig(MethodConfig):
     tower's (EMAN, arXiv:2101.08482)."""
     symmetric: bool = False
     """Each view is query and key in turn, the loss the mean of both ways (BYOL, MoCo v3); the paper has one way."""
+    inter_pairs: Literal["crossed", "exact", "all"] = "crossed"
+    """Which views of vision and touch the inter-modal losses pair, with end-to-end keys."""
+    pooled: bool = False
+    """Negatives from both views at once (end-to-end keys)."""
+    variance: float = 0.0
+    """Weight of VICReg's variance hinge on every embedding."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
     """Which of the four losses of eq. 14 to minimise; the paper minimises all."""
     shared_heads: bool = False
@@ -154,14 +162,31 @@ class MViTac(Contrastive):
             if mine not in self.query or other not in self.query:
                 continue
             head = "intra" if mine == other else "inter"
+            directions = self.directions
+            if head == "inter" and tower == "q":
+                exact = ((0, 0), (1, 1))
+                directions = {"crossed": directions, "exact": exact, "all": directions + exact}[self.config.inter_pairs]
+            if self.config.pooled and tower == "q":
+                a, b = (z[f"q{i}_{mine}_{head}"] for i in (0, 1))
+                if head == "intra":
+                    losses[part] = nt_xent(a, b, self.config.temperature)
+                    continue
+                x, y = (z[f"q{i}_{other}_{head}"] for i in (0, 1))
+                rights = {"crossed": [(y, x)], "exact": [(x, y)], "all": [(y, x), (x, y)]}[self.config.inter_pairs]
+                terms = [info_nce(torch.cat([a, b]), torch.cat(right), self.config.temperature) for right in rights]
+                losses[part] = torch.stack(terms).mean()
+                continue
             ways = [
                 info_nce(z[f"q{query}_{mine}_{head}"], z[f"{tower}{key}_{other}_{head}"], self.config.temperature)
-                for query, key in self.directions
+                for query, key in directions
             ]
             losses[part] = torch.stack(ways).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         # A loss that is left out of the sum is still told, as a witness of what the others do to it.
         weighted = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
+        if self.config.variance:
+            own = [variance(value.float()) for name, value in z.items() if name.startswith("q")]
+            weighted.append(self.config.variance * torch.stack(own).mean())
         return {"loss": torch.stack(weighted).sum(), **losses}  # eq. 14, or what is left of it with one modality
 
     def encoders(self) -> dict[str, nn.Module]:
