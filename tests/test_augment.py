@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from mvitac import augment
-from mvitac.augment import Drawn, ViewAugment, draw, plain_view, random_view
+from mvitac.augment import Augment, Drawn, ViewAugment, draw, plain_view, random_view
 from mvitac.encoders import IMAGENET_MEAN, IMAGENET_STD
 
 
@@ -226,3 +226,8 @@ def test_without_noise_a_view_is_what_it_was() -> None:
     plain = generator()
     augment.apply(images(), draw(ViewAugment(), 8, 40, plain), 24)
     assert after[0] == torch.rand(1, generator=plain) and after[0] != after[1]
+
+
+def test_coloured_flips_of_nothing_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"flips nothing at touch\.flip 0: give --augment\.touch\.flip 0\.5"):
+        Augment(gel_flip="colour", touch=ViewAugment(flip=0.0))

@@ -73,6 +73,10 @@ class Augment:
         for name, side in (("size", self.size), ("whole", self.seen)):
             if not 8 <= side <= 1024:
                 raise ValueError(f"augment {name} {side}: give a side of 8 to 1024 pixels")
+        if self.gel_flip == "colour" and not self.touch.flip:
+            raise ValueError(
+                "augment gel_flip 'colour' flips nothing at touch.flip 0: give --augment.touch.flip 0.5 as well"
+            )
 
     @property
     def seen(self) -> int:
