@@ -14,6 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from mvitac.record import naming, write_atomic
 
 Sink = Callable[[int, dict[str, float]], None]
+WIDE = 120
+"""Columns of a terminal in which all losses stand beside the progress; in fewer their sum alone."""
 
 
 class Log:
@@ -53,7 +55,8 @@ class Log:
         speed = (step - self.since_step) * batch_size / max(1e-9, now - self.since)
         self.since, self.since_step = now, step
         self._write({"step": step, **losses, "lr": lr, "pairs_per_s": round(speed, 1)})
-        text = " ".join(f"{name} {value:.2f}" for name, value in losses.items())
+        told = losses if self.progress.console.width >= WIDE else {"loss": losses["loss"]}
+        text = " ".join(f"{name} {value:.2f}" for name, value in told.items())
         self.progress.update(self.bar, text=f"{text}  {speed:.0f}/s")
 
     def advance(self, step: int) -> None:
