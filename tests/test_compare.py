@@ -23,12 +23,13 @@ from PIL import Image
 from rich.console import Console
 from toy import Toy, toy_pack
 
-from mvitac import compare as module
+from mvitac import compare, jobs
 from mvitac.cli import main
-from mvitac.compare import cost, do, do_all, gather, lay_out, leaks, seconds_of
+from mvitac.compare import cost, gather, lay_out, leaks
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.folds import lay_out_folds
+from mvitac.jobs import do, do_all, seconds_of
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.paper_tables import lines_of, write_tables
@@ -256,8 +257,8 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
 def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     out, result = done
     assert len(list(out.rglob("model.safetensors"))) == 6 and not list(out.rglob("checkpoint.pt"))
-    monkeypatch.setattr(module, "train", None)  # calling it would raise
-    monkeypatch.setattr(module, "controls_of", None)
+    monkeypatch.setattr(jobs, "train", None)  # calling it would raise
+    monkeypatch.setattr(compare, "controls_of", None)
     work = lay_out(small(pack), pack, out, Session())
     do_all(work, 1, lambda line: None)
     assert gather(work, out, Session()) == json.loads(json.dumps(result))

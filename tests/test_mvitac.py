@@ -213,7 +213,7 @@ def test_all_pairs_are_the_mean_over_four_pairs_of_views(way: dict[str, object])
 
 
 def test_all_pairs_need_each_view_as_query_and_key() -> None:
-    with pytest.raises(ValueError, match="pairs 'all': give keys 'end-to-end' or symmetric"):
+    with pytest.raises(ValueError, match="give keys 'end-to-end', symmetric, or pairs 'crossed'"):
         replace(CONFIG, pairs="all")
 
 

@@ -13,9 +13,10 @@ from test_compare import small
 
 from mvitac import stress as module
 from mvitac.cli import main
-from mvitac.compare import do_all, gather, lay_out
+from mvitac.compare import gather, lay_out
 from mvitac.datasets.packed import PackConfig
 from mvitac.features import features
+from mvitac.jobs import do_all
 from mvitac.model import Model, load
 from mvitac.pack import Pack
 from mvitac.paper_tables import write_tables

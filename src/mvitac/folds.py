@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.compare import Work, gather, lay_out
+from mvitac.compare import gather, lay_out
+from mvitac.jobs import Work
 from mvitac.plans import Plan
 from mvitac.record import digest
 from mvitac.registry import to_json

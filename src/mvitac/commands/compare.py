@@ -14,9 +14,10 @@ def compare(argv: list[str]) -> None:
     import tyro
     from rich.console import Console
 
-    from mvitac.compare import do_all, forecast, submit
+    from mvitac.compare import forecast
     from mvitac.datasets import DatasetConfig
     from mvitac.folds import gather_folds, lay_out_folds, together
+    from mvitac.jobs import do_all, submit
     from mvitac.paper_tables import write_tables
     from mvitac.plans import PLANS, find_plan, setting
     from mvitac.recipes import RECIPES

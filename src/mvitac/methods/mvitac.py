@@ -79,7 +79,7 @@ class MViTacConfig(MethodConfig):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if self.pairs == "all" and not self.both_ways:
             raise ValueError(
-                "pairs 'all': give keys 'end-to-end' or symmetric as well, else each view is one of the two only"
+                "pairs 'all' need each view as query and as key: give keys 'end-to-end', symmetric, or pairs 'crossed'"
             )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
