@@ -5,11 +5,14 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from toy import Counting, Toy, toy_pack
 
 from mvitac import packing
@@ -77,6 +80,54 @@ def test_interrupted_build_resumes_to_the_same_bytes(pack: Pack, tmp_path: Path,
     assert contents(tmp_path / "p") == contents(pack.path)
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted([*FILES, "provenance.json"])
     assert not (tmp_path / "p.partial").exists()
+
+
+class Held(Counting):
+    """Reads no second item before ``go``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.go = threading.Event(), threading.Event()
+
+    def read(self, item: int) -> list[Sample]:
+        self.begun.set()
+        assert self.go.wait(60)
+        return super().read(item)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_one_process_packs_and_the_others_wait(
+    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], fails: bool
+) -> None:
+    waits = threading.Event()
+
+    class Lock(FileLock):
+        def acquire(self, *args: Any, blocking: bool = True, **options: Any) -> Any:
+            if blocking:
+                waits.set()
+            return super().acquire(*args, blocking=blocking, **options)
+
+    monkeypatch.setattr(packing, "FileLock", Lock)
+    first, second = Held(), Counting()
+    with ThreadPoolExecutor(2) as threads:
+        one = threads.submit(build, first, tmp_path / "p", size=32, quiet=True)
+        assert first.begun.wait(60)
+        other = threads.submit(build, second, tmp_path / "p", size=32, exist_ok=True)
+        assert waits.wait(60) and not other.done()
+        if fails:
+            first.damaged = (100,)
+        first.go.set()
+        if fails:
+            with pytest.raises(ValueError, match="item 100 is damaged on purpose"):
+                one.result()
+        else:
+            assert one.result().digest == pack.digest
+        assert other.result().digest == pack.digest
+    assert second.seen == (list(range(96, 120)) if fails else []), "what the first one did is not done again"
+    assert contents(tmp_path / "p") == contents(pack.path)
+    assert [path.name for path in tmp_path.iterdir()] == ["p"], "no lock, no unfinished pack"
+    assert "is being packed by another process: waiting for it" in " ".join(capsys.readouterr().out.split())
+    assert build(Toy(), tmp_path / "p", size=32, exist_ok=True).digest == pack.digest
 
 
 def almost_finished(path: Path, source: Source) -> Path:

@@ -1,7 +1,8 @@
 """Making a pack: any source's items, resized, checked, and written so that no interruption costs more than a part of them.
 
 ``build`` works in ``<pack>.partial`` (``unfinished.py`` has its files). Killed at any instant, it resumes there and ends
-byte-identical. The finished folder is renamed into place, so a folder with a pack.json is a whole pack. No torch here.
+byte-identical. The finished folder is renamed into place, so a folder with a pack.json is a whole pack. Of several
+processes that want one pack, one makes it and the others wait. No torch here.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -70,16 +72,54 @@ def build(
     quiet: bool = False,
     store: Store = "raw",
     quality: int = QUALITY,
+    exist_ok: bool = False,
 ) -> Pack:
     """Read ``source`` into a new pack at ``out``, images stored [size, size]: raw, or as JPEG of ``quality``.
 
-    An interrupted build continues from ``<out>.partial``. Damaged items are listed in pack.json under "damaged" if they
-    are at most the fraction ``max_damaged`` of all, otherwise ValueError names the first.
+    An interrupted build continues from ``<out>.partial``; one under way in another process is waited for. Damaged items are
+    listed in pack.json under "damaged" if they are at most the fraction ``max_damaged`` of all, otherwise ValueError names
+    the first. A pack that is there is a ValueError or, with ``exist_ok``, what is returned.
     """
     out = Path(out)
     check_request(size, workers, max_damaged, store=store, quality=quality)
-    if out.exists():
-        raise ValueError(f"{out} already exists: choose another --out, or delete it first")
+    if not out.exists():
+        with _alone(out, quiet):
+            if not out.exists():
+                return _build(source, out, size, workers, max_damaged, quiet, store, quality)
+    if exist_ok:
+        return Pack(out)
+    raise ValueError(f"{out} already exists: choose another --out, or delete it first")
+
+
+@contextlib.contextmanager
+def _alone(out: Path, quiet: bool) -> Iterator[None]:
+    """Hold ``<out>.lock``, which a process that dies lets go of."""
+    lock = FileLock(out.with_name(out.name + ".lock"))
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        if not quiet:
+            text = f"{out} is being packed by another process: waiting for it"
+            Console().print(text, soft_wrap=True, highlight=False, markup=False)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        Path(lock.lock_file).unlink(missing_ok=True)  # filelock tells a deleted file from a lock
+        lock.release()
+
+
+def _build(
+    source: Source,
+    out: Path,
+    size: int,
+    workers: int,
+    max_damaged: float,
+    quiet: bool,
+    store: Store,
+    quality: int,
+) -> Pack:
+    """``build`` for the one process that does."""
     spec, items, counts = source.spec(), source.items(), source.samples_per_item()
     num = sum(counts)
     if not num:

@@ -53,5 +53,12 @@ class DatasetConfig(Registered, ABC):
         except ValueError as error:
             raise ValueError(f"the cache of packs: {error} with MVITAC_CACHE") from None
         return build(
-            source, path, size=self.size, workers=self.workers, quiet=quiet, store=self.store, quality=self.quality
+            source,
+            path,
+            size=self.size,
+            workers=self.workers,
+            quiet=quiet,
+            store=self.store,
+            quality=self.quality,
+            exist_ok=True,
         )
