@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from toy import toy_pack
 from mvitac import batches
 from mvitac.batches import epoch_order, make_views, partners
 from mvitac.datasets.packed import PackConfig
+from mvitac.feed import Feed
 from mvitac.log import last_line
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
@@ -243,6 +245,31 @@ def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pyte
     monkeypatch.setattr(Pack, "column", halved)
     rows = np.flatnonzero(real(pack, "split") != "test")  # those already in test keep their partner there
     assert np.array_equal(partners(pack, rows, torch.Generator().manual_seed(0)), rows)
+
+
+@pytest.mark.parametrize("num_views", [1, 2])
+@pytest.mark.parametrize("positives", ["same-image", "same-touch", "same-touch-pairs"])
+def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> None:
+    rows = pack.rows("train")[:16]
+    asked: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
+    device = torch.device("cpu")
+
+    class Spy(Feed):
+        def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
+            asked[modality].append(rows)
+            return super().__call__(modality, rows)
+
+    run, generator = smoke(pack, positives=positives), torch.Generator().manual_seed(0)
+    made = make_views(run, pack, rows, num_views, generator, device, Spy(pack, device))
+    assert {m: len(views) for m, views in made.images.items()} == {"vision": num_views, "touch": num_views}
+    touch_groups = pack.touch_groups
+    for found in (one for each in asked.values() for one in each):
+        assert np.array_equal(touch_groups[found], touch_groups[rows])
+    other = {m: [bool((found != rows).all()) for found in each] for m, each in asked.items()}
+    if num_views == 2:
+        assert other["vision"] == other["touch"] == ([False] if positives == "same-image" else [False, True])
+    else:
+        assert other == {"vision": [False], "touch": [positives == "same-touch-pairs"]}
 
 
 def test_same_touch_positives_train_and_repeat(pack: Pack, tmp_path: Path) -> None:

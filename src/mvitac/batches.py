@@ -177,18 +177,21 @@ def make_views(
     ``mirror`` is what ``gel_mirror`` gave for the run.
     """
     assert (mirror is None) == (run.augment.gel_flip == "plain")
-    sources = [rows] * num_views
-    if run.positives == "same-touch":
-        sources[1:] = [partners(pack, rows, generator) for _ in range(num_views - 1)]
+    views = [rows] * num_views
+    if run.positives != "same-image":
+        views[1:] = [partners(pack, rows, generator) for _ in range(num_views - 1)]
+    sources = dict.fromkeys(pack.spec.modalities, views)
+    if run.positives == "same-touch-pairs" and num_views == 1:
+        sources["touch"] = [partners(pack, rows, generator)]
     dtype = torch.bfloat16 if run.precision == "bf16" else torch.float32
     images: dict[str, list[Tensor]] = {}
     for modality in pack.spec.modalities:
         config, images[modality] = getattr(run.augment, modality), []
         if mirror and modality == "touch":
             config = replace(config, flip=0.0)  # the mirror flips
-        own = feed(modality, rows)
-        for source in sources:
-            seen = own if source is rows else feed(modality, source)
+        fed: dict[int, Tensor] = {}  # two views of one image need it once
+        for source in sources[modality]:
+            seen = fed[id(source)] if id(source) in fed else fed.setdefault(id(source), feed(modality, source))
             if mirror and modality == "touch":
                 seen = mirror.random(seen, source, run.augment.touch, generator)
             view = random_view(seen, config, run.augment.size, generator, dtype)
