@@ -88,8 +88,9 @@ class Run:
     positives: Literal["same-image", "same-touch", "same-touch-pairs"] = "same-image"
     """What a query must find. same-image: another view of its own row (paper). same-touch: a view of another row of its
     touch group (another frame of the contact, another press of the thing), so that lamp, background, sensor and place,
-    which differ between the two, cannot give the answer away; a row alone in its group is its own partner. Methods of one view (ssvtp, cmc) have one row's
-    vision and touch under both; same-touch-pairs gives them the vision of one row and the touch of another."""
+    which differ between the two, cannot give the answer away; a row alone in its group is its own partner. Methods of one
+    view (ssvtp, cmc) have one row's vision and touch under both; same-touch-pairs gives them the vision of one row and the
+    touch of another."""
     precision: Literal["fp32", "tf32", "bf16"] = "fp32"
     """Arithmetic of the networks; losses, weights and the optimiser stay fp32. fp32 is never TF32 in silence; tf32 lets a
     GPU round products to 10 bits."""

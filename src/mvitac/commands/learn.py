@@ -60,7 +60,7 @@ def pretrain(argv: list[str]) -> None:
 
 
 def probe(argv: list[str]) -> None:
-    """mvitac probe RUN... [--data-pack DIR] [--json FILE]"""
+    """mvitac probe RUN... [--on PACK] [--learn-on PACK] [--json FILE]"""
     from typing import Annotated
 
     import tyro
@@ -73,6 +73,7 @@ def probe(argv: list[str]) -> None:
     from mvitac.session import Session, chosen, probe_runs
     from mvitac.stress import STRESSES, stress
     from mvitac.tables import print_retrieval, print_summary
+    from mvitac.transfer import Transfer
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -83,6 +84,9 @@ def probe(argv: list[str]) -> None:
         session: Annotated[Session, tyro.conf.arg(name="")] = Session()
         on: Path | None = None
         """Probe on this pack instead of the data the runs were trained on."""
+        learn_on: Path | None = None
+        """The probes learn from this pack's train rows, and only meet the test rows of --on: what they are worth on a
+        sensor that nobody labelled anything of."""
         stress: bool = False
         """Also learn from 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and say
         what a split that leaks groups would add."""
@@ -95,6 +99,10 @@ def probe(argv: list[str]) -> None:
         if options.json.is_dir():
             raise ValueError(f"--json {options.json} is a folder: give another name, of a file")
     pack = Pack(options.on) if options.on else None
+    if options.learn_on:
+        if not pack:
+            raise ValueError("--learn-on says what probes learn from: say with --on which pack they are scored on")
+        pack = Transfer(Pack(options.learn_on), pack)
     result = probe_runs(options.runs, options.session, pack)
     console, worse = Console(), []
     for i, path in enumerate(options.runs if options.stress else (), start=1):
