@@ -25,14 +25,14 @@ from toy import Toy, toy_pack
 
 from mvitac import compare, jobs
 from mvitac.cli import main
-from mvitac.compare import cost, gather, lay_out, leaks
+from mvitac.compare import cost, gather, lay_out, leaks, pairs_of
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.folds import lay_out_folds
 from mvitac.jobs import do, do_all, seconds_of
 from mvitac.pack import Pack
 from mvitac.packing import build
-from mvitac.paper_tables import lines_of, write_tables
+from mvitac.paper_tables import lines_of, markdown, write_tables
 from mvitac.plans import ABLATION, PLANS, TABLE1, TABLE2, Plan, Row, changed, find_plan, setting, slug
 from mvitac.recipes import RECIPES, recipe
 from mvitac.scores import paired_difference
@@ -328,6 +328,22 @@ def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], 
             do(job, pack)
     finally:
         (tmp_path / "scores.json").rename(scores)
+
+
+def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) -> None:
+    said = {
+        (positives, views): pairs_of(replace(recipe("smoke", PackConfig()), positives=positives), views, pack)
+        for positives in ("same-image", "same-touch", "same-touch-pairs")
+        for views in (1, 2)
+    }
+    two = {key for key, words in said.items() if words == "two rows of a touch"}
+    assert two == {("same-touch", 2), ("same-touch-pairs", 1), ("same-touch-pairs", 2)}
+    assert set(said.values()) == {"two rows of a touch", "one row"}
+    for other in ("one row", "two rows of a touch"):
+        costs = [{**c, "pairs_of": other if c["row"] == "MViTac" else "one row"} for c in done[1]["cost"]]
+        text = markdown({**done[1], "cost": costs}, lines_of(done[1]))
+        assert ("**pairs are not from the same rows (see cost)**" in text) == (other != "one row")
+        assert f"| {other} |" in text
 
 
 def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> None:

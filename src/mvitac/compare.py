@@ -28,6 +28,7 @@ from mvitac.pack import Pack
 from mvitac.plans import Plan, Row, slug
 from mvitac.record import digest, provenance, read_json, write_json
 from mvitac.registry import to_json
+from mvitac.run import Run
 from mvitac.session import Session, chosen
 
 
@@ -166,11 +167,19 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
         "seeds": len(jobs),
         "steps": steps,
         "pairs": steps * run.batch_size,
+        "pairs_of": pairs_of(run, method.views, pack),
         "images": steps * run.batch_size * method.views * len(method.encoders()),
         "trained_parameters": sum(p.numel() for p in method.parameters() if p.requires_grad),
         "seconds": statistics.median(seconds_of(job.out) for job in jobs),
         "peak_gpu_bytes": int(np.max(peaks)) if peaks else None,
     }
+
+
+def pairs_of(run: Run, views: int, pack: Pack) -> str:
+    """What the method is told belongs together, which decides more than most methods do (``Run.positives``)."""
+    other = run.positives != "same-image" if views > 1 else run.positives == "same-touch-pairs"
+    several = len(np.unique(pack.touch_groups)) < pack.num
+    return "two rows of a touch" if other and several else "one row"
 
 
 def forecast(work: Work) -> list[str]:

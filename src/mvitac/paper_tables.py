@@ -166,13 +166,15 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
         budget = f"equal budget: every run saw {pairs} pairs in {num} steps"
     else:
         budget = "budgets differ (see cost)"
+    if len({c["pairs_of"] for c in result["cost"]}) > 1:
+        budget += ", **pairs are not from the same rows (see cost)**"
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
         f" {budget}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
         f" code {(result['commit'] or 'unknown')[:12]}, {result['device']}.",
         f"95 % intervals and p: bootstrap over test {result['group_by']}s and seeds; p of the difference to {plan.reference}"
-        " on the same test rows, not corrected for the number of rows. Controls in italics.",
+        " on the same test rows, .001 the least it can say, not corrected for the number of rows. Controls in italics.",
     ]
     if plan.folds:
         unseen = "" if result["leaks"] else ", by encoders and probes that never saw it"
@@ -245,13 +247,13 @@ def _retrieval(result: dict[str, Any]) -> list[str]:
 
 def _cost(result: dict[str, Any]) -> list[str]:
     text = [
-        "| cost of one run | seeds | steps | pairs | images seen | trained weights | seconds | peak GPU MiB |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|",
+        "| cost of one run | seeds | steps | pairs | from | images seen | trained weights | seconds | peak GPU MiB |",
+        "|---|---:|---:|---:|---|---:|---:|---:|---:|",
     ]
     for c in result["cost"]:
         peak = f"{c['peak_gpu_bytes'] / 2**20:.0f}" if c["peak_gpu_bytes"] else "not measured"
         text.append(
-            f"| {c['row']} | {c['seeds']} | {c['steps']} | {c['pairs']} | {c['images']} |"
+            f"| {c['row']} | {c['seeds']} | {c['steps']} | {c['pairs']} | {c['pairs_of']} | {c['images']} |"
             f" {c['trained_parameters'] / 1e6:.2f} M | {c['seconds']:.0f} | {peak} |"
         )
     return [*text, ""]
