@@ -100,9 +100,9 @@ def test_the_plans_hold_the_papers_tables() -> None:
 
 def test_table1_has_one_budget(pack: Pack, tmp_path: Path) -> None:
     work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, Session())
-    assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 28  # smoke changes no tau
+    assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 30  # smoke changes no tau
     assert {(job.run.steps, job.run.batch_size, job.run.optim.lr) for job in work.jobs} == {(4, 16, 2e-3)}
-    assert [job.run.seed for job in work.jobs] == [0] * 14 + [1] * 14
+    assert [job.run.seed for job in work.jobs] == [0] * 15 + [1] * 15
 
 
 def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) -> None:

@@ -192,6 +192,8 @@ def find_plan(given: str) -> Plan:
 MOMENTUM = {"method.keys": "momentum", "method.pairs": "crossed"}
 END_TO_END = {"method.keys": "end-to-end", "method.pairs": "crossed"}
 ALL_PAIRS = {"method.keys": "end-to-end", "method.pairs": "all"}
+PRINTED = Row(label="MViTac, positives of the same image", set={**MOMENTUM, "positives": "same-image"})
+"""The paper's own positives, under recipes that have others (``Run.positives``)."""
 
 ANCESTORS = (
     Row(label="SimCLR per modality", method="simclr"),
@@ -238,6 +240,7 @@ TABLE1 = Plan(
             set=MOMENTUM,
             printed={"touch": _three(57.6, 86.2, 82.1), "both": _three(74.9, 91.8, 84.1)},
         ),
+        PRINTED,
         Row(label="MViTac, end-to-end", set=END_TO_END),
         Row(label="MViTac, end-to-end, all pairs", set=ALL_PAIRS),
         *ANCESTORS,
@@ -255,6 +258,7 @@ TABLE2 = Plan(
         Row(label="TAG (CMC), its own tau .07", method="cmc", set={"method.temperature": 0.07}),
         Row(label="SSVTP", method="ssvtp"),
         Row(label="MViTac", set=MOMENTUM, printed={"both": {"success": 60.3}}),
+        PRINTED,
         Row(label="MViTac, end-to-end", set=END_TO_END),
         Row(label="MViTac, end-to-end, all pairs", set=ALL_PAIRS),
         Row(label="Calandra et al., supervised", method="calandra", printed={"both": {"success": 73.1}}),
