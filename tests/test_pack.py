@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import io
 import json
 import shutil
@@ -128,6 +130,15 @@ def test_one_process_packs_and_the_others_wait(
     assert [path.name for path in tmp_path.iterdir()] == ["p"], "no lock, no unfinished pack"
     assert "is being packed by another process: waiting for it" in " ".join(capsys.readouterr().out.split())
     assert build(Toy(), tmp_path / "p", size=32, exist_ok=True).digest == pack.digest
+
+
+def test_packs_where_files_cannot_be_locked(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def flock(*_: Any) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    assert toy_pack(tmp_path / "p").digest == pack.digest
+    assert [path.name for path in tmp_path.iterdir()] == ["p"]
 
 
 def almost_finished(path: Path, source: Source) -> Path:

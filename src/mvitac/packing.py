@@ -8,6 +8,7 @@ processes that want one pack, one makes it and the others wait. No torch here.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
@@ -94,7 +95,8 @@ def build(
 @contextlib.contextmanager
 def _alone(out: Path, quiet: bool) -> Iterator[None]:
     """Hold ``<out>.lock``, which a process that dies lets go of."""
-    lock = FileLock(out.with_name(out.name + ".lock"))
+    # No soft lock where the file system has no locks: it would outlive a process that was killed. There nobody waits.
+    lock = FileLock(out.with_name(out.name + ".lock"), fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)
     except Timeout:
@@ -102,6 +104,9 @@ def _alone(out: Path, quiet: bool) -> Iterator[None]:
             text = f"{out} is being packed by another process: waiting for it"
             Console().print(text, soft_wrap=True, highlight=False, markup=False)
         lock.acquire()
+    except OSError as error:
+        if error.errno != errno.ENOSYS:
+            raise
     try:
         yield
     finally:
