@@ -74,7 +74,8 @@ class _Both(Lazy):
     """Images of one pack, then of another."""
 
     def __init__(self, first: Images, second: Images) -> None:
-        super().__init__((len(first) + len(second), *first.shape[1:]))
+        _, height, width, channels = first.shape
+        super().__init__((len(first) + len(second), height, width, channels))
         self.first, self.second = first, second
 
     def _made(self, rows: np.ndarray) -> np.ndarray:
