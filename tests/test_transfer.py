@@ -76,6 +76,36 @@ def test_rows_without_an_image_stay_without(pack: Pack, tmp_path: Path) -> None:
     np.testing.assert_array_equal(both.has("touch"), np.concatenate([pack.has("touch"), holes.has("touch")]))
 
 
+@pytest.mark.parametrize("column", ["sensor", "phase"])
+def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
+    """A name here, a number there: of no matter in a column beside, an error in one that says what a task is about."""
+
+    class Marked(Toy):
+        mark: object = "during"
+
+        def spec(self) -> DataSpec:
+            spec = super().spec()
+            only = {"phase": "during"} if column == "phase" else {}
+            return replace(spec, tasks=(replace(spec.tasks[0], only=only),))
+
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            return [replace(sample, columns={**sample.columns, column: self.mark})]
+
+    packs = []
+    for name, mark in (("a", "during"), ("b", 3)):
+        source = Marked()
+        source.mark = mark
+        packs.append(build(source, tmp_path / name, size=32, quiet=True))
+    if column == "sensor":
+        assert "sensor" not in Transfer(*packs).table.column_names
+    else:
+        with pytest.raises(ValueError, match=r"columns differ in kind .*phase"):
+            Transfer(*packs)
+        with pytest.raises(ValueError, match=r"task 'pattern' is about other rows or split otherwise in"):
+            Transfer(packs[0], toy_pack(tmp_path / "c"))
+
+
 def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path: Path) -> None:
     class Shuffled(Toy):
         """Other groups are test here."""

@@ -86,11 +86,18 @@ class _Both(Lazy):
 
 
 def _side(pack: Pack, tasks: list[tuple[Task, Task]], sides: set[str], name: str, keep: set[str]) -> pa.Table:
-    """The table of ``pack``, other splits than ``keep`` hidden, labels as numbered by the first of each pair of tasks."""
-    columns = {n: pack.table.column(n) for n in pack.table.column_names if not n.startswith(("crc_", "bytes_"))}
+    """What probes read of the table of ``pack``: other splits than ``keep`` hidden, labels as numbered by the first of each
+    pair of tasks."""
+    read = {
+        "id",
+        "group",
+        *(c for task, _ in tasks for c in task.only),
+        *(c for cs in pack.spec.controls.values() for c in cs),
+    }
+    columns = {n: pack.table.column(n) for n in pack.table.column_names if n in read}
     columns["id"] = pa.array([f"{name}/{one}" for one in columns["id"].to_pylist()])
     for column in sides:
-        columns[column] = pa.array([split if split in keep else "hidden" for split in columns[column].to_pylist()])
+        columns[column] = pa.array([s if s in keep else "hidden" for s in pack.table.column(column).to_pylist()])
     for modality in pack.spec.modalities:
         columns[f"has_{modality}"] = pa.array(pack.has(modality))
     own = {task.name: task for task in pack.spec.tasks}
