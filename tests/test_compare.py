@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.folds import lay_out_folds
 from mvitac.jobs import do, do_all, seconds_of
+from mvitac.locks import Busy, alone
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.paper_tables import lines_of, markdown, write_tables
@@ -38,7 +40,7 @@ from mvitac.recipes import RECIPES, recipe
 from mvitac.scores import paired_difference
 from mvitac.session import Session
 from mvitac.source import Sample
-from mvitac.train import Interrupted
+from mvitac.train import Interrupted, train
 
 ROWS = (
     Row(label="MViTac", printed={"touch": {"pattern": 57.6}}),
@@ -100,9 +102,9 @@ def test_the_plans_hold_the_papers_tables() -> None:
 
 def test_table1_has_one_budget(pack: Pack, tmp_path: Path) -> None:
     work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, Session())
-    assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 30  # smoke changes no tau
+    assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 32  # smoke changes no tau
     assert {(job.run.steps, job.run.batch_size, job.run.optim.lr) for job in work.jobs} == {(4, 16, 2e-3)}
-    assert [job.run.seed for job in work.jobs] == [0] * 15 + [1] * 15
+    assert [job.run.seed for job in work.jobs] == [0] * 16 + [1] * 16
 
 
 def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) -> None:
@@ -122,7 +124,14 @@ def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
     assert "learns from pairs" in work.left_out["TAG (CMC)"]
     assert "unknown modality" in work.left_out["supervised, vision only"]
     assert "the same run as 'supervised, touch only'" in work.left_out["supervised, both"]
+    assert "the same run as 'MViTac, end-to-end'" in work.left_out["MViTac, end-to-end, all pairs"]
+    assert "MViTac, end-to-end, all pairs, no touch flips" not in work.left_out
     assert {job.label for job in work.jobs} >= {"MViTac", "MoCo per modality", "supervised, touch only"}
+    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path / "out", Session())
+    for label in ("lambda_inter 2.0", "losses tt", "losses vv + tt"):
+        assert "the same run as 'MViTac'" in work.left_out[label]
+    assert "the same run as 'no flips'" in work.left_out["no touch flips"]
+    assert "another modality" in work.left_out["losses vv"]
     with pytest.raises(ValueError, match="no row that this data allows"):
         lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", Session())
 
@@ -309,6 +318,32 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(
         do_all(work, num_jobs, said.append)
     assert any(re.fullmatch(r"\[\d/2\] MViTac, seed 0: failed: .* holds a different run .*", line) for line in said)
     assert [job.done for job in work.jobs] == [False, True]
+
+
+def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) -> None:
+    """As when the same command runs on two machines; here a thread is the other one."""
+    work = lay_out(small(pack, rows=ROWS[:2], seeds=1), pack, tmp_path, Session(controls=False))
+    begun, go, said = threading.Event(), threading.Event(), []
+
+    def other() -> None:
+        with alone(work.jobs[0].out, "", wait=False):
+            begun.set()
+            go.wait(60)
+
+    with ThreadPoolExecutor(1) as threads:
+        held = threads.submit(other)
+        assert begun.wait(60)
+        with pytest.raises(Busy, match="is being trained by another process"):
+            train(work.jobs[0].run, work.jobs[0].out, pack=pack)
+        do_all(work, 1, said.append)
+        assert "[0/2] MViTac, seed 0: another process is at it; this command makes the whole table once it is done" in said
+        assert [job.done for job in work.jobs] == [False, True] and not work.jobs[0].out.exists()
+        go.set()
+        held.result()
+    text = write_tables(gather(work, tmp_path, Session(controls=False)), tmp_path)[0].read_text()
+    assert "**Not finished: MViTac, seed 0.**" in text
+    do_all(work, 1, lambda line: None)
+    assert [job.done for job in work.jobs] == [True, True] and not list(tmp_path.rglob("*.lock"))
 
 
 def test_a_run_killed_once_scored_loses_its_checkpoint_later(done: tuple[Path, dict], pack: Pack) -> None:

@@ -17,7 +17,7 @@ import pytest
 from filelock import FileLock
 from toy import Counting, Toy, toy_pack
 
-from mvitac import packing
+from mvitac import locks, packing
 from mvitac.datasets.packed import PackConfig
 from mvitac.pack import Pack
 from mvitac.packing import build
@@ -109,7 +109,7 @@ def test_one_process_packs_and_the_others_wait(
                 waits.set()
             return super().acquire(*args, blocking=blocking, **options)
 
-    monkeypatch.setattr(packing, "FileLock", Lock)
+    monkeypatch.setattr(locks, "FileLock", Lock)
     first, second = Held(), Counting()
     with ThreadPoolExecutor(2) as threads:
         one = threads.submit(build, first, tmp_path / "p", size=32, quiet=True)

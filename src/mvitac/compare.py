@@ -57,10 +57,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
         except ValueError as error:
             left_out[row.label] = str(error)
             continue
-        alike = replace(run, recipe="")
-        if set(getattr(run.method, "modalities", ())) == set(own.spec.modalities):  # all there are, named or not
-            alike = replace(alike, method=replace(run.method, modalities=()))  # type: ignore[call-arg]
-        if (key := alike.digest()) in seen:
+        if (key := run.without_idle(own.spec).digest()) in seen:
             left_out[row.label] = f"the same run as {seen[key]!r} under recipe {plan.recipe!r}"
             continue
         seen[key] = row.label

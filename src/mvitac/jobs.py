@@ -1,4 +1,5 @@
-"""Doing the runs of a comparison: one after another, several at a time, or as a SLURM array; safe to kill at any instant.
+"""Doing the runs of a comparison: one after another, several at a time, as a SLURM array, or by the same command on several
+machines; safe to kill at any instant.
 
 A run whose loss stops being a number is done too: it is kept as failed.json. One that fails otherwise is told, and tried
 again by the next call.
@@ -19,6 +20,7 @@ from rich.console import Console
 from rich.progress import TaskID
 
 from mvitac.batches import training_rows
+from mvitac.locks import Busy, alone
 from mvitac.log import bars, last_line
 from mvitac.model import load
 from mvitac.pack import Pack
@@ -68,9 +70,16 @@ class Work:
 
 
 def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
-    """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant."""
-    if job.done:
-        return "finished before"
+    """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant, and from several
+    processes at once: what one is at, the others leave to it."""
+    try:
+        with alone(job.out, "another process is at it; this command makes the whole table once it is done", wait=False):
+            return "finished before" if job.done else _do(job, pack, quiet)
+    except Busy as busy:
+        return str(busy)
+
+
+def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
     pack = pack or job.run.data.open(quiet=True)
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()

@@ -8,7 +8,6 @@ processes that want one pack, one makes it and the others wait. No torch here.
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import io
 import json
@@ -26,12 +25,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mvitac.allocator import keep_freed_memory
 from mvitac.jpegs import QUALITY
+from mvitac.locks import alone
 from mvitac.pack import FORMAT, FORMAT_VERSIONS, SPLITS, SUFFIXES, Pack, Store, check_table, fit
 from mvitac.record import brief, digest, digest_file, provenance, read_json, write_atomic, write_json
 from mvitac.registry import from_json, to_json, unknown
@@ -84,34 +83,12 @@ def build(
     out = Path(out)
     check_request(size, workers, max_damaged, store=store, quality=quality)
     if not out.exists():
-        with _alone(out, quiet):
+        with alone(out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet):
             if not out.exists():
                 return _build(source, out, size, workers, max_damaged, quiet, store, quality)
     if exist_ok:
         return Pack(out)
     raise ValueError(f"{out} already exists: choose another --out, or delete it first")
-
-
-@contextlib.contextmanager
-def _alone(out: Path, quiet: bool) -> Iterator[None]:
-    """Hold ``<out>.lock``, which a process that dies lets go of."""
-    # No soft lock where the file system has no locks: it would outlive a process that was killed. There nobody waits.
-    lock = FileLock(out.with_name(out.name + ".lock"), fallback_to_soft=False)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        if not quiet:
-            text = f"{out} is being packed by another process: waiting for it"
-            Console().print(text, soft_wrap=True, highlight=False, markup=False)
-        lock.acquire()
-    except OSError as error:
-        if error.errno != errno.ENOSYS:
-            raise
-    try:
-        yield
-    finally:
-        Path(lock.lock_file).unlink(missing_ok=True)  # filelock tells a deleted file from a lock
-        lock.release()
 
 
 def _build(

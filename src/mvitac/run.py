@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import tyro
 
-from mvitac.augment import Augment
+from mvitac.augment import Augment, ViewAugment
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.encoders import EncoderConfig
@@ -164,6 +164,11 @@ class Run:
             )
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
+
+    def without_idle(self, spec: DataSpec) -> Run:
+        """The same training on a dataset, settings that do nothing there at one value: equal ones train alike."""
+        unseen = {m: ViewAugment() for m in ("vision", "touch") if m not in spec.modalities}
+        return replace(self, recipe="", method=self.method.without_idle(spec), augment=replace(self.augment, **unseen))
 
     def digest(self) -> str:
         """Content address of the outcome: where it runs and how often it reports do not count."""

@@ -20,6 +20,7 @@ from mvitac.allocator import keep_freed_memory
 from mvitac.batches import feed_parts, gel_mirror, mix, training_rows
 from mvitac.device import describe, pick_device
 from mvitac.distributed import World, join, local_device, synchronise_norms
+from mvitac.locks import alone
 from mvitac.log import Log, Sink
 from mvitac.memory import replicated, shard_banks
 from mvitac.methods.base import Method
@@ -52,11 +53,21 @@ def train(
     """Pre-train ``run`` into the folder ``out`` and return it.
 
     Leaves run.json, log.jsonl, checkpoint.pt (resumable) and model.safetensors (what to probe). ``resume`` continues
-    from the checkpoint if there is one. ValueError for anything impossible, before the first step where it can be told.
+    from the checkpoint if there is one. ValueError for anything impossible, before the first step where it can be told; Busy
+    if another process trains there.
     """
     out = Path(out)
     _check_out(out, resume)
     world = join()
+    busy = f"{out} is being trained by another process: let it end, or choose another --out"
+    with alone(out, busy, wait=False) if world.writes else nullcontext():
+        return _train(run, out, world, resume=resume, quiet=quiet, sinks=sinks, pack=pack)
+
+
+def _train(
+    run: Run, out: Path, world: World, *, resume: bool, quiet: bool, sinks: tuple[Sink, ...], pack: Pack | None
+) -> Path:
+    """``train`` for the one process that does, and its ranks."""
     device = pick_device(local_device(run.device))
     if world.rank:
         world.wait()  # rank 0 simulates or packs what is not there yet, the others find it

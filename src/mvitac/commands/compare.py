@@ -49,7 +49,8 @@ def compare(argv: list[str]) -> None:
         set: tuple[str, ...] = ()
         """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own come after."""
         jobs: int | None = None
-        """Runs at a time; none = one per GPU, one on a machine without."""
+        """Runs at a time; none = one per GPU, one on a machine without. The same command given again meanwhile, also on
+        another machine that shares the folder, does the runs that nobody is at."""
         device: str = "auto"
         """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
         imagenet: Path | None = None

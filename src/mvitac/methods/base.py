@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from torch import Tensor, nn
 
@@ -112,6 +112,10 @@ class MethodConfig(Registered, ABC):
     def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
         """Tasks whose labels it learns from; none for a self-supervised method."""
         return ()
+
+    def without_idle(self, spec: DataSpec) -> Self:
+        """The same method on a dataset, settings that do nothing there at one value: equal ones train alike."""
+        return self
 
     @abstractmethod
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> Method:

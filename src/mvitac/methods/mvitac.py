@@ -9,8 +9,8 @@ features [B, D], embeddings z [B, 128].
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -88,6 +88,10 @@ class MViTacConfig(MethodConfig):
     def both_ways(self) -> bool:
         """Whether each view is query and key."""
         return self.symmetric or self.keys == "end-to-end"
+
+    def without_idle(self, spec: DataSpec) -> Self:
+        mine = replace(self, losses=tuple(part for part in _possible(spec) if part in self.losses))
+        return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
         if not set(self.losses) & set(_possible(spec)):

@@ -6,8 +6,8 @@ could teach the same network: its own classifiers are scored, and its frozen tru
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, Self
 
 import torch
 import torch.nn.functional as F
@@ -44,6 +44,9 @@ class LabelledConfig(MethodConfig):
             if modality not in spec.modalities:
                 raise unknown("modality", modality, spec.modalities)
         return tuple(m for m in spec.modalities if m in (self.modalities or spec.modalities))
+
+    def without_idle(self, spec: DataSpec) -> Self:
+        return replace(self, modalities=self.modalities_of(spec))
 
     def num_classes(self, spec: DataSpec) -> dict[str, int]:
         """task -> number of classes, for the tasks to learn."""
