@@ -30,16 +30,18 @@ from mvitac.compare import cost, gather, lay_out, leaks, pairs_of
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.folds import lay_out_folds
-from mvitac.jobs import do, do_all, seconds_of
+from mvitac.jobs import do_all, seconds_of
 from mvitac.locks import Busy, alone
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.paper_tables import lines_of, markdown, write_tables
 from mvitac.plans import ABLATION, PLANS, TABLE1, TABLE2, Plan, Row, changed, find_plan, setting, slug
 from mvitac.recipes import RECIPES, recipe
+from mvitac.record import write_json
 from mvitac.scores import paired_difference
 from mvitac.session import Session
 from mvitac.source import Sample
+from mvitac.step import Step
 from mvitac.train import Interrupted, train
 
 ROWS = (
@@ -336,7 +338,9 @@ def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) ->
         with pytest.raises(Busy, match="is being trained by another process"):
             train(work.jobs[0].run, work.jobs[0].out, pack=pack)
         do_all(work, 1, said.append)
-        assert "[0/2] MViTac, seed 0: another process is at it; this command makes the whole table once it is done" in said
+        assert (
+            "[0/2] MViTac, seed 0: another process is at it; this command makes the whole table once it is done" in said
+        )
         assert [job.done for job in work.jobs] == [False, True] and not work.jobs[0].out.exists()
         go.set()
         held.result()
@@ -354,15 +358,37 @@ def test_a_run_killed_once_scored_loses_its_checkpoint_later(done: tuple[Path, d
 
 
 def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], pack: Pack, tmp_path: Path) -> None:
+    """Before anything is trained or told, though all runs are finished."""
     out, _ = done
-    work = lay_out(small(pack, set={"steps": 5, "eval_every": 0}), pack, out, Session())
-    job = work.jobs[0]
-    (scores := job.out / "scores.json").rename(tmp_path / "scores.json")
-    try:
-        with pytest.raises(ValueError, match="holds a different run"):
-            do(job, pack)
-    finally:
-        (tmp_path / "scores.json").rename(scores)
+    with pytest.raises(ValueError, match="mvitac/seed0 holds a different run"):
+        lay_out(small(pack, set={"steps": 5, "eval_every": 0}), pack, out, Session())
+    other = toy_pack(tmp_path / "other", num=90)
+    with pytest.raises(ValueError, match="mvitac/seed0 holds a different run"):
+        lay_out(small(other), other, out, Session())
+
+
+def test_other_probes_score_finished_runs_again(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (Session(controls=False, probes=probes) for probes in (("linear",), ("knn", "linear")))
+    plan = small(pack, rows=ROWS[:1], seeds=1)
+    work = lay_out(plan, pack, tmp_path, first)
+    do_all(work, 1, lambda line: None)
+    linear = gather(work, tmp_path, first)["records"]
+    monkeypatch.setattr(Step, "__call__", None)  # nothing is trained again
+    work = lay_out(plan, pack, tmp_path, second)
+    assert not work.jobs[0].done
+    do_all(work, 1, lambda line: None)
+    both = gather(work, tmp_path, second)["records"]
+    assert work.jobs[0].done and {record["probe"] for record in both} == {"knn", "linear"}
+    assert [record for record in both if record["probe"] == "linear"] == linear
+
+
+def test_scores_that_do_not_say_what_they_are_of_are_of_linear_probes(pack: Pack, tmp_path: Path) -> None:
+    """As they were written before there was a choice of probes in a plan."""
+    work = lay_out(small(pack, rows=ROWS[:1], seeds=1), pack, tmp_path, Session(controls=False))
+    write_json(work.jobs[0].out / "scores.json", {"records": [], "retrieval": []})
+    assert work.jobs[0].done
+    asked = replace(work.jobs[0], session=Session(tasks=("pattern",), controls=False))
+    assert not asked.done and not replace(work.jobs[0], stress=True).done
 
 
 def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) -> None:

@@ -30,10 +30,12 @@ from mvitac.record import digest, provenance, read_json, write_json
 from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.session import Session, chosen
+from mvitac.train import check_same
 
 
 def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "auto") -> Work:
-    """The jobs of ``plan`` on the data of its rows, seeds outermost; ValueError if not one row is possible.
+    """The jobs of ``plan`` on the data of its rows, seeds outermost; ValueError if not one row is possible, or if ``out``
+    holds other runs.
 
     Rows that need what the data lacks (labels, a camera) and rows that are the same run as an earlier one are left out. A
     row may read the same samples in another way (difference images of touch), not other samples.
@@ -41,7 +43,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
     assert plan.data is not None
     chosen(pack, session)
     session = replace(session, controls=False)
-    possible: list[Row] = []
+    possible: list[tuple[Row, Pack]] = []
     left_out: dict[str, str] = {}
     seen: dict[str, str] = {}
     for row in plan.rows:
@@ -61,15 +63,19 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
             left_out[row.label] = f"the same run as {seen[key]!r} under recipe {plan.recipe!r}"
             continue
         seen[key] = row.label
-        possible.append(row)
+        possible.append((row, own))
     if not possible:
         raise ValueError(f"plan {plan.name!r} has no row that this data allows: {next(iter(left_out.values()))}")
     jobs = [
         Job(row.label, replace(plan.run(row, plan.data, seed), device=device), place, session, plan.stress)
         for seed in range(plan.seeds)
-        for row in possible
+        for row, _ in possible
         for place in (out / "runs" / slug(row.label) / f"seed{seed}",)
     ]
+    packs = {row.label: own for row, own in possible}
+    for job in jobs:
+        if (job.out / "run.json").exists():
+            check_same(job.run, packs[job.label], job.out)
     return Work(plan, pack, jobs, left_out)
 
 
@@ -185,7 +191,7 @@ def forecast(work: Work) -> list[str]:
     num = len({job.fold for job in work.jobs})
     folds = f" x {num} folds" if num > 1 else ""
     lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
-    known = [seconds_of(job.out) for job in work.jobs if (job.out / "scores.json").exists()]
+    known = [seconds_of(job.out) for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
     for label, job in rows.items():
         num = len(training_rows(job.run, work.pack))
         steps = job.run.num_steps(num)

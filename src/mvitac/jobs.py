@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from mvitac.model import load
 from mvitac.pack import Pack
 from mvitac.plans import Plan
 from mvitac.record import brief, read_json, write_json
+from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.session import Session, chosen, probe_runs
 from mvitac.stress import stress
@@ -50,13 +52,33 @@ class Job:
         return f"{self.label}, {f'{self.fold}, ' if self.fold else ''}seed {self.run.seed}"
 
     @property
+    def asked(self) -> dict[str, Any]:
+        """What its scores are of, as it stands beside them."""
+        return to_json(
+            Session(probes=self.session.probes, tasks=self.session.tasks, modalities=self.session.modalities)
+        )
+
+    @property
     def done(self) -> bool:
-        scored = (self.out / "scores.json").exists() and (not self.stress or (self.out / "stress.json").exists())
-        return scored or (self.out / "failed.json").exists()
+        kept = ["scores.json", *(["stress.json"] if self.stress else [])]
+        return (self.out / "failed.json").exists() or all(_scored(self.out / name) == self.asked for name in kept)
 
     def drop_checkpoint(self) -> None:
         """Once scored, a run needs none; they are four times its weights, and hundreds of runs would fill a disk."""
         (self.out / "checkpoint.pt").unlink(missing_ok=True)
+
+
+def _scored(path: Path) -> dict[str, Any] | None:
+    """What the scores in ``path`` are of; None if there are none."""
+    try:
+        return _asked(path, path.stat().st_mtime_ns)
+    except FileNotFoundError:
+        return None
+
+
+@cache
+def _asked(path: Path, changed: int) -> dict[str, Any]:
+    return read_json(path, "a run's scores").get("asked", to_json(Session()))  # older ones do not say
 
 
 @dataclass(frozen=True)
@@ -94,8 +116,10 @@ def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
     if job.stress:
         records = stress(load(job.out), pack, *chosen(pack, job.session))
         own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
-        write_json(job.out / "stress.json", {"records": [{**own, **record} for record in records]})
-    write_json(job.out / "scores.json", {"records": result["records"], "retrieval": result["retrieval"]})
+        write_json(job.out / "stress.json", {"asked": job.asked, "records": [{**own, **record} for record in records]})
+    write_json(
+        job.out / "scores.json", {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
+    )
     job.drop_checkpoint()
     return f"{seconds_of(job.out):.0f} s of training"
 

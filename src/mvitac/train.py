@@ -80,7 +80,7 @@ def _train(
     _check_world(run, world)
     again = (out / "run.json").exists()
     if again:
-        _check_same(run, pack, out)
+        check_same(run, pack, out)
     if again and (out / "model.safetensors").exists():
         return out  # resumed after its end
 
@@ -163,7 +163,8 @@ def _check_world(run: Run, world: World) -> None:
         )
 
 
-def _check_same(run: Run, pack: Pack, out: Path) -> None:
+def check_same(run: Run, pack: Pack, out: Path) -> None:
+    """ValueError unless the folder ``out`` is that of ``run`` on ``pack``."""
     old, record = load_run(out)
     if old.digest() != run.digest() or record.get("pack") != pack.digest:
         raise ValueError(f"{out} holds a different run (other settings or data): give the same ones, or another --out")
