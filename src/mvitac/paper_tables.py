@@ -16,7 +16,7 @@ from typing import Any
 from mvitac.plans import Plan
 from mvitac.record import write_atomic, write_json
 from mvitac.registry import from_json
-from mvitac.scores import paired_difference, summarise
+from mvitac.scores import least_p, paired_difference, summarise
 from mvitac.session import END_TO_END
 from mvitac.stress import STRESSES
 from mvitac.tables import MODALITY_ORDER, PROBE_NAMES, retrieval_means
@@ -169,12 +169,14 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     if len({c["pairs_of"] for c in result["cost"]}) > 1:
         budget += ", **pairs are not from the same rows (see cost)**"
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
+    least = least_p(max((len(record["group_sizes"]) for record in result["records"]), default=1))
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
         f" {budget}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
         f" code {(result['commit'] or 'unknown')[:12]}, {result['device']}.",
         f"95 % intervals and p: bootstrap over test {result['group_by']}s and seeds; p of the difference to {plan.reference}"
-        " on the same test rows, .001 the least it can say, not corrected for the number of rows. Controls in italics.",
+        f" on the same test rows, {least:.3f} the least it can say, not corrected for the number of rows. Controls are"
+        " in italics.",
     ]
     if plan.folds:
         unseen = "" if result["leaks"] else ", by encoders and probes that never saw it"
