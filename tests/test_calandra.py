@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 from collections import Counter
@@ -126,6 +127,16 @@ def test_the_pack_does_not_depend_on_where_the_shards_lie(folder: Path, tmp_path
     one, other = CalandraConfig(path=folder), CalandraConfig(path=tmp_path / "elsewhere", workers=3)
     assert one.source().fingerprint() == other.source().fingerprint()
     assert one.source().fingerprint() != replace(one, split="object").source().fingerprint()
+
+
+def test_a_shard_written_anew_is_another_pack_by_its_time_alone(folder: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(folder, tmp_path / "copy")
+    before = CalandraConfig(path=root, split="object").source()
+    os.utime(root / "calandra_corl2017_000.h5", (10, 10))
+    after = CalandraConfig(path=root, split="object").source()
+    assert before.fingerprint() == after.fingerprint()
+    for name, old, new in zip(before.items(), before.stamps() or (), after.stamps() or (), strict=True):
+        assert (old != new) == name.startswith("calandra_corl2017_000")
 
 
 def test_any_subset_of_shards(folder: Path) -> None:

@@ -275,6 +275,19 @@ def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, m
     assert gather(work, out, Session()) == json.loads(json.dumps(result))
 
 
+def test_controls_are_made_again_where_the_data_names_others(
+    done: tuple[Path, dict], pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the same pixels and columns: the pack's digest is the same."""
+    out = shutil.copytree(done[0], tmp_path / "out")
+    other = Pack(pack.path)
+    other.spec = replace(pack.spec, controls={"noise": ("noise",)})
+    monkeypatch.setattr(compare, "controls_of", lambda *_: ([], []))
+    for data, kept in ((pack, True), (other, False)):
+        result = gather(lay_out(small(pack), data, out, Session()), out, Session())
+        assert any(record["source"] == "noise only" for record in result["records"]) == kept
+
+
 def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: Path) -> None:
     wild = Row(label="wild", set={"optim.name": "sgd", "optim.lr": 1e30, "log_every": 1})
     work = lay_out(small(pack, rows=(ROWS[0], wild), seeds=1), pack, tmp_path, Session(controls=False))

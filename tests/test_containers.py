@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import tarfile
 from pathlib import Path
 from typing import Any
@@ -255,6 +256,20 @@ def test_a_webdataset_is_read_in_place(tmp_path: Path) -> None:
         assert pack.column("force")[row] == i / 2
     one = packed(WebDatasetConfig(path=root / "shard-1.tar", **options), tmp_path / "one")
     assert one.num == 12
+
+
+def test_the_cache_knows_another_tar_of_the_same_size(tmp_path: Path) -> None:
+    """By its time or, where that is the same too, by where its members lie."""
+    options, packs = WebDatasetConfig(path=tmp_path / "shard.tar", size=16, workers=1), []
+    for value, extra, when in ((40, 0, 10), (200, 0, 20), (90, 3, 20)):
+        with tarfile.open(options.path, "w") as tar:
+            for i in range(8):
+                add(tar, f"{i:04d}.touch.png", png(value) + bytes(extra))
+                add(tar, f"{i:04d}.json", json.dumps({"split": "train" if i < 4 else "test"}).encode())
+        os.utime(options.path, (when, when))
+        packs.append(options.open(quiet=True))
+    assert len({pack.meta["fingerprint"]["file_sizes"] for pack in packs}) == 1
+    assert [int(pack.images["touch"][0, 0, 0, 0]) for pack in packs] == [40, 200, 90]
 
 
 def test_tars_that_cannot_be_read(tmp_path: Path) -> None:

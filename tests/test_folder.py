@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -146,6 +147,73 @@ def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_p
     assert config(tmp_path / place, split_seed=1).source().fingerprint() != prints[0]
     Image.new("RGB", (64, 64), (1, 2, 3)).save(tmp_path / place / "vision" / "03.png")
     assert config(tmp_path / place).source().fingerprint() != prints[0]
+
+
+# -- files that change ------------------------------------------------------------------------------------------------
+
+
+def write_plain(folder: Path, level: int, when: int, *, suffix: str = "bmp") -> FolderConfig:
+    """40 plain pictures, of one size as BMP, all written at second ``when``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"{i}.{suffix}" for i in range(40)]
+    for name in names:
+        Image.new("RGB", (16, 16), (level, 0, 0)).save(folder / name)
+        os.utime(folder / name, (when, when))
+    rows = [{"touch": name, "split": "train" if i < 20 else "test"} for i, name in enumerate(names)]
+    return FolderConfig(path=write(rows, folder / "manifest.csv"), size=16, workers=1)
+
+
+def test_the_cache_knows_changed_files_of_the_same_size(tmp_path: Path) -> None:
+    sets = [("x", 40, 10), ("y", 200, 20), ("x", 90, 30), ("x", 90, 30)]  # two of one name, one written over, unchanged
+    packs = [write_plain(tmp_path / name / "session", level, when).open(quiet=True) for name, level, when in sets]
+    assert [int(pack.images["touch"][0, 0, 0, 0]) for pack in packs] == [40, 200, 90, 90]
+    assert packs[2].path == packs[3].path and len({pack.path for pack in packs}) == 3
+    assert packs[0].meta["fingerprint"] == packs[1].meta["fingerprint"], "when files were written is not told"
+
+
+def seen_while_packing(options: FolderConfig, out: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Items that are read."""
+    seen: list[int] = []
+    read = Rows.read
+    with monkeypatch.context() as patch:
+        patch.setattr(Rows, "read", lambda self, item: seen.append(item) or read(self, item))
+        packed(options, out)
+    return seen
+
+
+@pytest.mark.parametrize("suffix", ["bmp", "png"])
+def test_a_repaired_image_costs_its_part_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """Of the same size (BMP) or not (PNG)."""
+    options = write_plain(tmp_path / "set", 200, 10, suffix=suffix)
+    bad = tmp_path / "set" / f"5.{suffix}"
+    good = bad.read_bytes()
+    bad.write_bytes(b"x" * (len(good) if suffix == "bmp" else 7))
+    with pytest.raises(ValueError, match=r"1 of 40 items cannot be read, first row 6: .*repair it"):
+        packed(options, tmp_path / "p")
+    bad.write_bytes(good)
+    os.utime(bad, (20, 20))
+    assert seen_while_packing(options, tmp_path / "p", monkeypatch) == list(range(32))
+    assert (Pack(tmp_path / "p").images["touch"][:, :, :, 0] == 200).all()
+
+
+def test_an_unfinished_pack_of_files_that_have_all_changed_mixes_no_old_pixels(tmp_path: Path) -> None:
+    options = write_plain(tmp_path / "set", 200, 10)
+    bad = tmp_path / "set" / "5.bmp"
+    bad.write_bytes(bytes(bad.stat().st_size))
+    with pytest.raises(ValueError, match="1 of 40 items cannot be read"):
+        packed(options, tmp_path / "p")
+    pack = packed(write_plain(tmp_path / "set", 90, 20), tmp_path / "p")
+    assert (pack.images["touch"][:, :, :, 0] == 90).all()
+    straight = packed(options, tmp_path / "straight")
+    assert (pack.path / "pack.json").read_bytes() == (straight.path / "pack.json").read_bytes()
+
+
+def test_an_unfinished_pack_of_another_table_is_not_continued(tmp_path: Path) -> None:
+    options = write_plain(tmp_path / "set", 200, 10)
+    (tmp_path / "set" / "5.bmp").write_bytes(b"x")
+    for changed in ({}, {"only": ("split!=val",)}):
+        with pytest.raises(ValueError, match="something else" if changed else "cannot be read"):
+            packed(replace(options, **changed), tmp_path / "p")
 
 
 def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_path: Path, rows: Table) -> None:

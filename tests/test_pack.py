@@ -9,6 +9,7 @@ import json
 import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -200,6 +201,37 @@ def test_unfinished_pack_of_something_else_is_not_continued(tmp_path: Path) -> N
     almost_finished(tmp_path / "p", Toy())
     with pytest.raises(ValueError, match="unfinished pack of something else"):
         toy_pack(tmp_path / "p", num=60)
+
+
+@dataclass
+class Stamped(Counting):
+    """The toy as if read from a file per item."""
+
+    changed: tuple[int, ...] = ()
+
+    def stamps(self) -> list[int]:
+        return [int(item in self.changed) for item in range(self.num)]
+
+
+def test_only_parts_whose_files_have_changed_are_made_again(pack: Pack, tmp_path: Path) -> None:
+    partial = almost_finished(tmp_path / "p", Stamped())
+    source = Stamped(changed=(40, 119))
+    build(source, tmp_path / "p", size=32, quiet=True)
+    assert source.seen == [*range(32, 64), *range(96, 120)]
+    assert not partial.exists()
+    assert contents(tmp_path / "p") == contents(pack.path), "no pack tells when its files were written"
+
+
+def test_parts_that_remember_no_files_are_made_again(pack: Pack, tmp_path: Path) -> None:
+    """Those of a version that did not ask when they were written."""
+    part = almost_finished(tmp_path / "p", Stamped()) / "part-000001.json"
+    known = json.loads(part.read_text())
+    del known["stamp"]
+    part.write_text(json.dumps(known))
+    source = Stamped()
+    build(source, tmp_path / "p", size=32, quiet=True)
+    assert source.seen == list(range(32, 64))
+    assert contents(tmp_path / "p") == contents(pack.path)
 
 
 def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import shutil
 from collections import Counter, defaultdict
@@ -301,6 +302,26 @@ def test_frames_without_a_label_serve_pre_training(tree: Path, tmp_path: Path) -
     check_pairs(pack)
     between = [t for t, f in zip(pack.column("touch_group")[rows], pack.column("frame")[rows], strict=True) if f == 35]
     assert all(touch.endswith(("/0000000030", "/0000000000")) for touch in between)
+
+
+def test_the_cache_knows_changed_jpegs(tmp_path: Path) -> None:
+    """Another frame in place of a listed one, of whatever size; more frames, of which some are taken without a label."""
+    for name, side in zip(NAMES[:2], ("train", "test"), strict=True):
+        (tmp_path / f"{side}.txt").write_text("\n".join(f"{name}/{i:010d}.jpg,{i % 2}" for i in range(6)))
+    config = TouchAndGoConfig(root=tmp_path, size=16, workers=1, split="official", frames="jpeg", unlabelled=2)
+    packs = []
+    for level, num, when in ((40, 8, 10), (200, 8, 20), (200, 12, 20)):
+        for name in NAMES[:2]:
+            for stem in ("video", "gelsight"):
+                folder = tmp_path / "dataset" / name / f"{stem}_frame"
+                folder.mkdir(parents=True, exist_ok=True)
+                for number in range(num):
+                    file = folder / f"{number:010d}.jpg"
+                    Image.new("RGB", (16, 16), (level, level, level)).save(file)
+                    os.utime(file, (when, when))
+        packs.append(config.open(quiet=True))
+    assert [(pack.num, int(pack.images["touch"][0, 0, 0, 0])) for pack in packs] == [(13, 40), (13, 200), (15, 200)]
+    assert packs[0].meta["fingerprint"] == packs[2].meta["fingerprint"]
 
 
 def test_frames_without_a_label_that_are_nowhere(tree: Path) -> None:

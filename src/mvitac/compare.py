@@ -138,7 +138,7 @@ def _controls(work: Work, out: Path, session: Session) -> tuple[list[dict[str, A
     if not session.controls:
         return [], []
     beside = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
-    key = digest([to_json(session), work.pack.digest, [run.digest() for run in beside]])
+    key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in beside]])
     path = out / "controls.json"
     if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
         return kept["records"], kept["retrieval"]

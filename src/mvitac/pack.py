@@ -101,7 +101,7 @@ class Pack:
 
     @property
     def digest(self) -> str:
-        """Content address of the pack: equal content, equal digest."""
+        """Content address of images and table: equal content, equal digest, whatever the spec says of it."""
         return digest(self.digests)
 
     def column(self, name: str) -> np.ndarray:

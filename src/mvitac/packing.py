@@ -114,9 +114,11 @@ def _build(
         files[modality] = RowFile(path, num, shape) if store == "raw" else JpegFile(path, num, shape, quality)
     disk = _check_disk(out, list(files.values()))
     if (partial / "request.json").exists():
-        if read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})") != json.loads(
-            json.dumps(request)
-        ):
+        known = read_json(partial / "request.json", f"an unfinished pack's request (delete {partial})")
+        if source.sizes_at:
+            with contextlib.suppress(KeyError, TypeError):  # it is of something else
+                known["fingerprint"][source.sizes_at] = request["fingerprint"][source.sizes_at]
+        if known != json.loads(json.dumps(request)):
             raise ValueError(f"{partial} is an unfinished pack of something else: delete it or choose another --out")
     else:
         write_json(partial / "request.json", request)
@@ -128,10 +130,11 @@ def _build(
 
     step = max(1, NUM_PART_ITEMS * len(items) // max(len(items), num))  # few items where one gives many (a video)
     firsts = [0, *accumulate(counts)]
-    parts = [
-        Part(partial / f"part-{i:06d}.json", (start, min(start + step, len(items))), firsts[start])
-        for i, start in enumerate(range(0, len(items), step))
-    ]
+    stamps, parts = source.stamps(), []
+    for i, start in enumerate(range(0, len(items), step)):
+        end = min(start + step, len(items))
+        stamp = None if stamps is None else digest([items[start:end], stamps[start:end]])
+        parts.append(Part(partial / f"part-{i:06d}.json", (start, end), firsts[start], stamp))
     # Parts come in order, so the digests are taken beside the other processes' work, of rows still in memory.
     sums = {modality: hashlib.sha256(rows.header(num)) for modality, rows in files.items()}
     with _progress(quiet) as progress:
@@ -252,6 +255,7 @@ def _write_part(work: _Work, part: Part) -> int:
     known = {
         "items": part.items,
         "first": part.first,
+        "stamp": part.stamp,
         "columns": columns,
         "damaged": damaged,
         "lost": lost,

@@ -5,10 +5,13 @@ A worker process that packs has a copy of its source, so a source is picklable a
 
 from __future__ import annotations
 
+import os
+import stat
+import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -49,8 +52,29 @@ class Lost:
     why: str
 
 
+Stamp = tuple[int, ...]
+"""What tells a changed file from an unchanged one without reading it: its bytes and when it was last written (ns)."""
+
+
+def stamp_of(path: str) -> Stamp:
+    """The stamp of a regular file, (-1, 0) if it is none. (Strings and one call: a manifest may name 200,000 files.)"""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):  # a NUL in the name is a ValueError
+        return -1, 0
+    return (found.st_size, found.st_mtime_ns) if stat.S_ISREG(found.st_mode) else (-1, 0)
+
+
+def one_stamp(stamps: Iterable[Stamp]) -> int:
+    """The stamps of the files of one item, in order, as one number."""
+    return zlib.crc32(repr([*stamps]).encode())
+
+
 class Source(ABC):
     """Something to read samples from; picklable, so that packing can use several processes."""
+
+    sizes_at: ClassVar[str | None] = None
+    """Key of the fingerprint that holds sizes of files. An unfinished pack goes by the stamps instead, part by part."""
 
     @abstractmethod
     def spec(self) -> DataSpec: ...
@@ -65,7 +89,12 @@ class Source(ABC):
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any]:
-        """Whatever decides the content, JSON-ready: two sources with equal fingerprints give equal packs."""
+        """Whatever decides the content, JSON-ready: two sources with equal fingerprints and stamps give equal packs."""
+
+    def stamps(self) -> Sequence[int] | None:
+        """Per item a number (``one_stamp``) that is another when a file of it has changed; None if no files are read, or
+        if the fingerprint tells their content. Not part of the pack, which does not depend on when a file was written."""
+        return None
 
     def samples_per_item(self) -> Sequence[int]:
         """How many samples each item gives if none is damaged or lost, which decides where their rows lie; never more."""

@@ -161,11 +161,13 @@ class Part:
     path: Path
     items: tuple[int, int]
     first: int
+    stamp: str | None = None
+    """Of the files that its items are read from, if they are files."""
 
     def read(self) -> dict[str, Any]:
         """columns, damaged, lost, crc and bytes (modality -> sum and, of JPEGs, length of each row); ValueError if it is
-        not there or of other rows."""
+        not there, or of other rows or of files that have changed since."""
         known = read_json(self.path, "a part of an unfinished pack")
-        if known["items"] != [*self.items] or known["first"] != self.first:
-            raise ValueError(f"{self.path} is of other rows: delete it and run the same command again")
+        if (known["items"], known["first"], known.get("stamp")) != ([*self.items], self.first, self.stamp):
+            raise ValueError(f"{self.path} is of other rows or files: delete it and run the same command again")
         return known

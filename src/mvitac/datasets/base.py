@@ -41,10 +41,13 @@ class DatasetConfig(Registered, ABC):
         """Where the samples come from; ValueError if it is not there."""
 
     def open(self, *, quiet: bool = False) -> Pack:
-        """The pack of this dataset, made in the cache (see ``record.cache_dir``) the first time."""
+        """The pack of this dataset, made in the cache (see ``record.cache_dir``) the first time, and anew when its files
+        have changed."""
         source = self.source()
         kept = stored_as(self.store, self.quality)
-        key = digest({"fingerprint": source.fingerprint(), "size": self.size, **kept})[:16]
+        stamps = source.stamps()
+        changed = {} if stamps is None else {"stamps": digest(stamps)}
+        key = digest({"fingerprint": source.fingerprint(), "size": self.size, **kept, **changed})[:16]
         path = cache_dir() / "packs" / f"{self.name}-{key}"
         if path.exists():
             return Pack(path)

@@ -40,7 +40,7 @@ from mvitac.datasets.calandra_objects import (
 )
 from mvitac.record import brief, digest
 from mvitac.registry import to_json, unknown
-from mvitac.source import Count, Sample, Source
+from mvitac.source import Count, Sample, Source, one_stamp, stamp_of
 from mvitac.spec import DataSpec, Task
 
 VERSION = 1
@@ -135,9 +135,11 @@ class Grasp:
 class Calandra(Source):
     """Item = grasp, in order of shard and number. Names and outcomes are read at once, images only by ``read``."""
 
+    sizes_at = "files"
+
     def __init__(self, config: CalandraConfig) -> None:
         self.config = config
-        self._files = find_shards(config.path, config.shards)
+        self._files = {file: stamp_of(str(file)) for file in find_shards(config.path, config.shards)}
         repairs = REPAIRS | dict(text.split("=") for text in config.repairs)
         everything = [grasp for file in self._files for grasp in list_grasps(file, repairs)]
         self.counts = Counter(grasp.object for grasp in everything if not grasp.damage)
@@ -167,10 +169,14 @@ class Calandra(Source):
         known = [[g.shard, g.index, g.object, g.gripping, bool(g.damage)] for g in self._grasps]
         return {
             "reader": f"calandra {VERSION}",
-            "files": {file.name: file.stat().st_size for file in self._files},
+            "files": {file.name: stamp[0] for file, stamp in self._files.items()},
             "grasps": digest(known),
             "options": {k: v for k, v in to_json(self.config).items() if k not in ("path", *KEEPING)},
         }
+
+    def stamps(self) -> list[int]:
+        numbers = {file: one_stamp([stamp]) for file, stamp in self._files.items()}
+        return [numbers[grasp.file] for grasp in self._grasps]
 
     def samples_per_item(self) -> list[int]:
         return [len(self.config.phases)] * len(self._grasps)

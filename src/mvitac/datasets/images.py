@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import stat
 import struct
 from pathlib import Path
 from typing import BinaryIO
@@ -12,15 +10,6 @@ import numpy as np
 from PIL import Image, ImageOps
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".gif")
-
-
-def size_of(path: str) -> int:
-    """Bytes of a regular file, -1 if it is none. (Strings and one call: a manifest may name 200,000 files.)"""
-    try:
-        found = os.stat(path)
-    except (OSError, ValueError):  # a NUL in the name is a ValueError
-        return -1
-    return found.st_size if stat.S_ISREG(found.st_mode) else -1
 
 
 def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:

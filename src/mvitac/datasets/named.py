@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvitac.datasets.images import size_of
 from mvitac.datasets.manifest import Condition, Manifest
 from mvitac.datasets.places import Place
+from mvitac.source import Stamp, stamp_of
 
 NUM_NO_CONTACT = 16
 """No-contact frames whose mean is a sensor's background."""
@@ -127,9 +127,10 @@ def check_files(
     places: Places,
     backgrounds: Sequence[dict[int, tuple[Place, ...]]],
     numbers: Sequence[int],
-) -> list[int]:
-    """Sizes of the files that the rows name, for the fingerprint; ValueError for any that is missing or empty."""
-    sizes: dict[str, int] = {}
+) -> tuple[list[int], dict[str, Stamp]]:
+    """Sizes of the files that the rows name, for the fingerprint, and the stamp of each by its path; ValueError for any
+    that is missing or empty."""
+    stamps: dict[str, Stamp] = {}
     missing: list[str] = []
     every: list[int] = []
     for i, number in enumerate(numbers):
@@ -138,9 +139,9 @@ def check_files(
         for column, place in named:
             if place is None:
                 continue
-            size = sizes.get(place.path)
-            if size is None:
-                size = sizes[place.path] = size_of(place.path)
+            if place.path not in stamps:
+                stamps[place.path] = stamp_of(place.path)
+            size = stamps[place.path][0]
             every.append(size)
             if size <= 0:
                 name = manifest.rows[number - 1].get(column) or Path(place.path).name
@@ -150,4 +151,4 @@ def check_files(
             f"{manifest.file}: {len(missing)} of {len(every)} image files are missing or empty, e.g."
             f" {'; '.join(missing[:3])} (paths are relative to {manifest.root})"
         )
-    return every
+    return every, stamps

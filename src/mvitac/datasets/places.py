@@ -38,6 +38,10 @@ class Place(ABC):
         """What must be opened to read it and is worth opening once for many; None if it is read alone."""
         return None
 
+    def within(self) -> tuple[int, ...]:
+        """Which bytes of the file it is, where the table of rows does not decide that."""
+        return ()
+
     @staticmethod
     @abstractmethod
     def read(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:
@@ -89,6 +93,9 @@ class Stretch(Place):
 
     def __str__(self) -> str:
         return f"{self.path} byte {self.offset}"
+
+    def within(self) -> tuple[int, ...]:
+        return self.offset, self.size
 
     @staticmethod
     def read(places: Sequence[Place], lost: Damage) -> Iterator[tuple[Place, Image.Image]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from mvitac.datasets.splits import BY_GROUP, check_leak, check_sides, check_spli
 from mvitac.pack import fit, shrink
 from mvitac.record import digest
 from mvitac.registry import to_json
-from mvitac.source import Lost, Sample, Source
+from mvitac.source import Lost, Sample, Source, one_stamp
 from mvitac.spec import DataSpec
 
 VERSION = 2
@@ -146,9 +146,16 @@ class Row:
     """Per touch image the no-contact images whose mean it is compared with; empty = raw images."""
     columns: dict[str, Any]
 
+    def places(self) -> Iterator[Place]:
+        """Of every image that it is made of."""
+        yield from (place for place in (self.vision, *self.touch) if place)
+        yield from (place for many in self.background for place in many)
+
 
 class Rows(Source):
     """One item is one row, or the rows of one video (of one row group, ...) that are best read in one pass."""
+
+    sizes_at = "file_sizes"
 
     def __init__(self, config: RowsConfig) -> None:
         manifest = config.manifest()
@@ -189,7 +196,7 @@ class Rows(Source):
         numbers, rows = [i + 1 for i in kept], [manifest.rows[i] for i in kept]
         places = {column: [found[i] for i in kept] for column, found in places.items()}
         missing = check_present(manifest, places, vision, touch, numbers, config.allow_missing)
-        self._sizes = check_files(manifest, places, backgrounds, numbers)
+        self._sizes, files = check_files(manifest, places, backgrounds, numbers)
 
         where = str(manifest.file)
         groups = filled(where, numbers, rows, group, "group")
@@ -232,6 +239,10 @@ class Rows(Source):
             plain = tuple(b[numbers[i]] for b in backgrounds) if pressed else ()
             self._rows.append(Row(numbers[i], first, pressed, plain, columns))
         self._items = bundles(self._rows)
+        self._stamps = [
+            one_stamp((*files[place.path], *place.within()) for i in item for place in self._rows[i].places())
+            for item in self._items
+        ]
         self._spec = DataSpec(
             name=self._title,
             vision_channels=3 if vision else 0,
@@ -261,6 +272,9 @@ class Rows(Source):
             "file_sizes": digest(self._sizes),
             "options": self._options,
         }
+
+    def stamps(self) -> list[int]:
+        return self._stamps
 
     def read(self, item: int) -> list[Sample | Lost]:
         rows = [self._rows[i] for i in self._items[item]]

@@ -43,7 +43,7 @@ from mvitac.datasets.touch_and_go_recordings import (
 )
 from mvitac.record import digest, digest_file
 from mvitac.registry import to_json
-from mvitac.source import Count, Lost, Sample, Source
+from mvitac.source import Count, Lost, Sample, Source, one_stamp
 from mvitac.spec import MODALITIES, DataSpec, Task
 
 VERSION = 1
@@ -113,6 +113,8 @@ class TouchAndGoConfig(DatasetConfig):
 class TouchAndGo(Source):
     """One item is up to ``CHUNK`` wanted frames of one recording, in ascending order: one forward pass of each video."""
 
+    sizes_at = "recordings"
+
     def __init__(self, config: TouchAndGoConfig) -> None:
         folder = _lists_folder(config)
         listed = read_lists(folder)
@@ -152,6 +154,10 @@ class TouchAndGo(Source):
         for name in sorted(by_name):
             own = sorted(by_name[name], key=lambda frame: frame.number)
             self._chunks += [own[i : i + CHUNK] for i in range(0, len(own), CHUNK)]
+        self._stamps = [
+            one_stamp(self._recordings[chunk[0].recording].stamps([frame.number for frame in chunk]))
+            for chunk in self._chunks
+        ]
         notes = leaks(listed) if config.split == "official" else []
         if missing:
             notes.append(missing_report(missing, len(names)))
@@ -175,6 +181,9 @@ class TouchAndGo(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         return self._fingerprint
+
+    def stamps(self) -> list[int]:
+        return self._stamps
 
     def expected(self) -> list[Count]:
         """The lists against their published lengths; the recordings and frames they name against those that are there."""

@@ -5,10 +5,11 @@ Each modality of a recording is an mp4 file, or a folder of JPEGs named by frame
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +18,7 @@ import numpy as np
 
 from mvitac.datasets.images import decode
 from mvitac.pack import shrink
+from mvitac.source import Stamp, stamp_of
 from mvitac.video import frame_shape, num_frames
 from mvitac.video import frames as video_frames
 
@@ -36,8 +38,20 @@ class Recording:
         return min(num_frames(p) if p.suffix else _num_jpegs(p) for p in self.places.values())
 
     def state(self) -> list[Any]:
-        """What tells a changed download from an unchanged one without reading it."""
-        return [self.name, *([p.name, p.stat().st_size if p.suffix else 0] for p in self.places.values())]
+        """What is there of it, and how large its videos are."""
+        return [self.name, *([p.name, self._movies[p][0] if p.suffix else 0] for p in self.places.values())]
+
+    def stamps(self, numbers: Sequence[int]) -> Iterator[Stamp]:
+        """Of the files that hold the frames ``numbers``."""
+        for place in self.places.values():
+            if place.suffix:
+                yield self._movies[place]
+            else:
+                yield from (stamp_of(f"{place}/{number:010d}.jpg") for number in numbers)
+
+    @functools.cached_property
+    def _movies(self) -> dict[Path, Stamp]:
+        return {place: stamp_of(str(place)) for place in self.places.values() if place.suffix}
 
 
 def _num_jpegs(folder: Path) -> int:
