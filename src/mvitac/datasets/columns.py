@@ -69,11 +69,9 @@ def read_controls(
 
 
 def filled(
-    where: str, numbers: Sequence[int], rows: Sequence[dict[str, str]], column: str | None, what: str
+    where: str, numbers: Sequence[int], rows: Sequence[dict[str, str]], column: str, what: str
 ) -> list[str]:
-    """The cells of ``column``, none of them empty; without a column, every row's own number."""
-    if column is None:
-        return [f"{number:06d}" for number in numbers]
+    """The cells of ``column``, none of them empty."""
     empty = [number for number, row in zip(numbers, rows, strict=True) if not row[column]]
     if empty:
         hint = f"; write one of {', '.join(SPLITS)}" if what == "split" else ""

@@ -19,14 +19,14 @@ from mvitac.datasets.columns import filled, read_controls, read_ids, read_task
 from mvitac.datasets.manifest import Condition, Manifest
 from mvitac.datasets.named import check_files, check_present, image_columns, read_backgrounds
 from mvitac.datasets.places import Damage, Place, difference, mean_image, read_all
-from mvitac.datasets.splits import BY_GROUP, check_leak, check_sides, check_split_names, deal
+from mvitac.datasets.splits import BY_GROUP, by_video, check_leak, check_sides, check_split_names, deal
 from mvitac.pack import fit, shrink
 from mvitac.record import digest
 from mvitac.registry import to_json
 from mvitac.source import Lost, Sample, Source
 from mvitac.spec import DataSpec
 
-VERSION = 2
+VERSION = 3
 """Raised when the same table would give another pack."""
 CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet")
 """What the probe itself calls its controls."""
@@ -50,8 +50,8 @@ class RowsConfig(DatasetConfig, ABC):
     labels: tuple[str, ...] = ()
     """Columns that become tasks; classes are their sorted distinct values, an empty cell or NaN is unlabelled."""
     group: str | None = None
-    """Column of the unit of splits and of intervals (object, recording); default: "group" if there is one, else every
-    row is alone, which is wrong for frames of one video."""
+    """Column of the unit of splits and of intervals (object, recording); default: "group" if there is one, else the video
+    that a row's frame is of, else every row is alone."""
     touch_group: str | None = None
     """Column of near-duplicates (one touch, one grasp), kept apart in batches; default: the group."""
     split: str | None = None
@@ -192,7 +192,11 @@ class Rows(Source):
         self._sizes = check_files(manifest, places, backgrounds, numbers)
 
         where = str(manifest.file)
-        groups = filled(where, numbers, rows, group, "group")
+        group_by, groups = (
+            (group, filled(where, numbers, rows, group, "group"))
+            if group
+            else by_video(manifest.root, numbers, places.values())
+        )
         touch_groups = filled(where, numbers, rows, config.touch_group, "touch_group") if config.touch_group else groups
         counts = [all(condition.holds(row) for condition in label_conditions) for row in rows]
         tasks, targets = [], []
@@ -206,8 +210,8 @@ class Rows(Source):
             splits = filled(where, numbers, rows, split, "split")
             check_split_names(where, split, numbers, splits)
         if not config.allow_leak:
-            check_leak(where, split, f"groups ({group})", groups, splits)
-            check_leak(where, split, f"touch groups ({config.touch_group or group})", touch_groups, splits)
+            check_leak(where, split, f"groups ({group_by})", groups, splits)
+            check_leak(where, split, f"touch groups ({config.touch_group or group_by})", touch_groups, splits)
             for column, found in places.items():
                 there = [i for i, place in enumerate(found) if place]
                 images = [str(found[i]) for i in there]
@@ -237,10 +241,11 @@ class Rows(Source):
             vision_channels=3 if vision else 0,
             touch_channels=3 * len(touch),
             tasks=tuple(tasks),
-            group_by=group or "row",
+            group_by=group_by,
             controls=names,
             licence=config.licence,
             source=config.source_url or "not given",
+            notes=("no column says the groups, so frames of one video are one group",) if group_by == "video" else (),
         )
 
     def spec(self) -> DataSpec:

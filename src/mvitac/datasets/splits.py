@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from mvitac.datasets.places import Frame, Place
 from mvitac.pack import SPLITS
 from mvitac.registry import unknown
 from mvitac.spec import Task
@@ -43,6 +46,28 @@ def deal(
             dealt[strata[stratum][j]] = choice
             counts[choice] += 1
     return [dealt.get(group, "unlabelled") for group in groups]
+
+
+def by_video(root: Path, numbers: Sequence[int], places: Iterable[Sequence[Place | None]]) -> tuple[str, list[str]]:
+    """What a group is where no column names it, and every row's: frames of one video are one group, and so are videos that
+    a row shows side by side; a row of single images is alone. ``places`` has a list per image column."""
+    columns = list(places)
+    videos = [
+        [os.path.relpath(place.path, root) for column in columns if isinstance(place := column[i], Frame)]
+        for i in range(len(numbers))
+    ]
+    beside: dict[str, str] = {}
+
+    def first(video: str) -> str:
+        while (other := beside.setdefault(video, video)) != video:
+            video = other
+        return video
+
+    for shown in videos:
+        for video in shown[1:]:
+            beside[first(video)] = first(shown[0])
+    groups = [first(shown[0]) if shown else f"{number:06d}" for number, shown in zip(numbers, videos, strict=True)]
+    return "video" if any(videos) else "row", groups
 
 
 def check_split_names(where: str, column: str, numbers: Sequence[int], splits: Sequence[str]) -> None:
