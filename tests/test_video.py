@@ -12,9 +12,10 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
-from videos import numbered, read_number, write_video
+from videos import numbered, read_number, trimmed, write_video
 
 from mvitac import video
+from mvitac.datasets import videos
 from mvitac.video import frames, num_frames
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "touch_and_go_sample"
@@ -85,6 +86,24 @@ def test_the_pixels_are_those_of_decoding_from_the_start(path: Path) -> None:
         plain = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     for number, image in frames(path, (0, 13, 14, 39, 41, 77, 149)):
         assert np.array_equal(image, plain[number])
+
+
+@pytest.mark.parametrize("kind", ["mpeg4", "mpeg4-reordered", "mov", "h264", "h264-open"])
+@pytest.mark.parametrize("cut", [1, 7, 12, 43])
+def test_a_trim_without_encoding_anew_counts_from_what_is_shown(
+    made: dict[str, Path], tmp_path: Path, kind: str, cut: int
+) -> None:
+    if kind not in made:
+        pytest.skip("this PyAV cannot encode it")
+    path = trimmed(made[kind], tmp_path / "v.mp4", cut)
+    with av.open(str(path)) as container:
+        shown = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
+    assert read_number(shown[0][1]) == (cut, "touch") and len(shown) == NUM - cut == num_frames(path)
+    assert videos.num_frames(path) == NUM - cut and np.allclose(videos.timestamps(path), [time for time, _ in shown])
+    for wanted in ([0], [1, 2, 60], range(NUM - cut)):
+        found = list(frames(path, wanted))
+        assert [number for number, _ in found] == list(wanted)
+        assert all(np.array_equal(image, shown[number][1]) for number, image in found)
 
 
 def test_a_player_that_seeks_shows_the_same_frame(path: Path) -> None:

@@ -65,3 +65,17 @@ def write_video(
         for packet in stream.encode():
             container.mux(packet)
     return path
+
+
+def trimmed(path: Path, out: Path, frames: int) -> Path:
+    """``path`` (mp4, 25 frames a second) without its first ``frames``, as ``ffmpeg -ss ... -c copy`` cuts: every packet
+    stays, and an edit list says what is shown."""
+    with av.open(str(path)) as old, av.open(str(out), "w", options={"avoid_negative_ts": "disabled"}) as new:
+        stream = old.streams.video[0]
+        copy = new.add_stream_from_template(stream)
+        for packet in old.demux(stream):
+            if packet.size and packet.pts is not None and packet.dts is not None and packet.time_base:
+                away = round(frames / 25 / packet.time_base)
+                packet.pts, packet.dts, packet.stream = packet.pts - away, packet.dts - away, copy
+                new.mux(packet)
+    return out
