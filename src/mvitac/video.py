@@ -266,6 +266,8 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
         raise ValueError(f"{path} holds no frames that can be told apart: it is damaged, or convert it to mp4")
     dts, places = (np.array([row[i] for row in found], np.int64) for i in (0, 1))
     keys = np.flatnonzero([key for _, _, key, _ in found])
+    if (np.diff(dts) <= 0).any() and before[-1] < len(dts):
+        raise ValueError(f"{path} is put together from pieces by an edit list: encode it anew, ffmpeg -i IN OUT.mp4")
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
     return Packets(dts, places, keys, before, shape)
