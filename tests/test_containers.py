@@ -322,6 +322,24 @@ def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
     assert [name for name, _ in pack.meta["damaged"]] == ["row 4"]
 
 
+def test_hub_files_name_their_split_all_or_none(tmp_path: Path) -> None:
+    root = make_hub(tmp_path / "data")
+    options: dict[str, Any] = {"path": root, "size": 16, "labels": ("kind",), "group": "thing"}
+    (root / "train-00001-of-00002.parquet").rename(root / "more.parquet")
+    with pytest.raises(ValueError, match=r"the name of more\.parquet says no split, others do: begin it with train-"):
+        HubConfig(**options).source()
+    assert HubConfig(**options, split="by-group").source().spec().group_by == "thing"
+
+
+def test_hub_gaps_of_a_column_whose_name_has_dots(tmp_path: Path) -> None:
+    images = [None if i == 3 else {"bytes": png(i), "path": None} for i in range(20)]
+    rows = [{"obs.touch": image, "photo": png(i), "kind": i % 2} for i, image in enumerate(images)]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "gaps.parquet")
+    options: dict[str, Any] = {"labels": ("kind",), "vision": "photo", "touch": ("obs.touch",), "size": 16}
+    pack = packed(HubConfig(path=tmp_path / "gaps.parquet", allow_missing=True, **options), tmp_path / "pack")
+    assert pack.num == 20 and level(pack.images["vision"][~pack.has("touch")]) == 3
+
+
 def test_hub_parquet_with_gaps_or_without_images(tmp_path: Path) -> None:
     rows = [{"touch": None if i == 3 else png(i), "photo": png(i), "kind": i % 2} for i in range(20)]
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "gaps.parquet")
