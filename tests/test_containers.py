@@ -147,6 +147,15 @@ def test_cameras_are_chosen_or_guessed() -> None:
     assert choose(three, None, (), where) == {"left": "cam.tactile_l", "right": "cam.tactile_r", "vision": "cam.front"}
     assert choose(three, "", ("cam.front",), where) == {"cam.front": "cam.front"}
     assert choose(["a", "b"], "b", ("a",), where) == {"a": "a", "b": "b"}
+    assert choose(["front", "finger_cam", "gel"], "finger_cam", (), where) == {
+        "touch": "gel",
+        "finger_cam": "finger_cam",
+    }
+    assert choose(["front", "finger_cam"], "finger_cam", (), where) == {"finger_cam": "finger_cam"}  # never both senses
+    assert choose(["digital_front", "digit_left"], None, (), where) == {
+        "touch": "digit_left",
+        "vision": "digital_front",
+    }
     for vision, touch, says in (("cam.frnt", (), "did you mean 'cam.front'"), (None, ("x",), "unknown camera 'x'")):
         with pytest.raises(ValueError, match=says):
             choose(three, vision, touch, where)
