@@ -197,6 +197,7 @@ def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.
         assert (back.images[modality] == toy.images[modality][at]).all()
     for name in ("group", "split"):
         assert (back.column(name) == toy.column(name)[at]).all()
+    assert (back.column("id_in_pack") == toy.column("id")[at]).all()
     assert (back.column("label_label_bright") == toy.column("label_bright")[at]).all()
     features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
     assert "crc_touch" in toy.table.column_names and not {"crc_vision", "crc_touch"} & set(features)
@@ -208,6 +209,27 @@ def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.
         data = pq.read_table(tmp_path / f"set/data/chunk-000/file-{e['data/file_index']:03d}.parquet").to_pylist()
         mine = [row for row in data if row["episode_index"] == e["episode_index"]]
         assert [row["index"] for row in mine] == list(range(e["dataset_from_index"], e["dataset_to_index"]))
+
+
+def test_columns_named_like_the_formats_own_survive_it(tmp_path: Path) -> None:
+    class Named(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (s,) = super().read(item)
+            given = {"frame": 100 + item, "episode": f"e{item}", "timestamp": item / 2, "task": "press", "index": -item}
+            return [Sample(vision=s.vision, touch=s.touch, columns={**s.columns, **given, "task_in_pack": "older"})]
+
+    pack = build(Named(), tmp_path / "pack", size=32, quiet=True)
+    write_lerobot(pack, tmp_path / "set")
+    back = packed(
+        LeRobotConfig(path=tmp_path / "set", size=32, labels=("label_pattern",), group="group"), tmp_path / "b"
+    )
+    at = {name: i for i, name in enumerate(pack.column("id"))}
+    rows = [at[name] for name in back.column("id_in_pack")]
+    for name in ("frame", "episode", "index"):
+        assert back.column(f"{name}_in_pack").tolist() == [str(pack.column(name)[i]) for i in rows]
+    assert back.column("timestamp_in_pack").astype(float).tolist() == [pack.column("timestamp")[i] for i in rows]
+    assert set(back.column("task_in_pack")) == {"older"} and set(back.column("task_in_pack_in_pack")) == {"press"}
+    assert set(back.column("frame").astype(int)) <= set(range(pack.num))  # and these are the format's
 
 
 def test_export_leaves_gaps_out_and_never_overwrites(tmp_path: Path) -> None:

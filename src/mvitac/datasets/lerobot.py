@@ -190,20 +190,19 @@ def _frames(
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise ValueError(f"{root / 'data'} holds no parquet files: fetch the whole dataset")
-    renamed = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
     for file in files:
         opened = _open(file)
         for name in ("timestamp", "episode_index", "frame_index", *images):
             if name not in opened.schema_arrow.names:
                 raise ValueError(f"{file} has no column {name!r}: fetch it again")
         names = [
-            name for name in opened.schema_arrow.names if name in scalars or name in renamed or name == "timestamp"
+            name for name in opened.schema_arrow.names if name in scalars or name in RENAMED or name == "timestamp"
         ]
         for group in range(opened.num_row_groups):
             for place, values in enumerate(opened.read_row_group(group, columns=names).to_pylist()):
                 if values["frame_index"] % every:
                     continue
-                row = {renamed.get(str(name), str(name)): _text(value) for name, value in values.items()}
+                row = {RENAMED.get(str(name), str(name)): _text(value) for name, value in values.items()}
                 if "task_index" in values:
                     row["task"] = tasks.get(values["task_index"], "")
                 rows.append(row)
