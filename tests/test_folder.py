@@ -545,6 +545,10 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     for name in ("train/vision/a/1", "train/touch/a/1", "test/touch/a/2"):
         picture(tmp_path / f"half/{name}.png")
     refused(tmp_path / "half", r"vision images in some splits only \(row")
+    for side, says in (("validation", "write 'val' instead"), ("other", "take it away")):
+        for name in ("train/a/1", "test/b/2", f"{side}/a/3"):
+            picture(tmp_path / f"{side} beside/{name}.png")
+        refused(tmp_path / f"{side} beside", rf"images in folder '{side}' beside train and test: {says}")
 
 
 def test_the_command_says_it_in_one_line(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:

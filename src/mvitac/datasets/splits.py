@@ -70,12 +70,17 @@ def by_video(root: Path, numbers: Sequence[int], places: Iterable[Sequence[Place
     return "video" if any(videos) else "row", groups
 
 
+def meant(name: str) -> str | None:
+    """The split that is usually meant by ``name``, if any."""
+    near = {"validation": "val", "valid": "val", "dev": "val", "eval": "val", "training": "train"}
+    near |= {"testing": "test", "unseen": "test", "unlabeled": "unlabelled", **{split: split for split in SPLITS}}
+    return near.get(name.lower())
+
+
 def check_split_names(where: str, column: str, numbers: Sequence[int], splits: Sequence[str]) -> None:
     for number, split in zip(numbers, splits, strict=True):
         if split not in SPLITS:
-            near = {"validation": "val", "valid": "val", "dev": "val", "eval": "val", "training": "train"}
-            near |= {"testing": "test", "unseen": "test", "unlabeled": "unlabelled"}
-            wanted = near.get(split.lower()) or (split.lower() if split.lower() in SPLITS else None)
+            wanted = meant(split)
             hint = f"; write {wanted!r} instead" if wanted else f"; or split={BY_GROUP} ignores the column"
             raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}{hint}")
 
