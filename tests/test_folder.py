@@ -175,6 +175,20 @@ def test_controls_are_numbers_or_one_hot(tmp_path: Path, rows: Table) -> None:
     assert ((one_hot[:, 0] == 1) == (pack.column("side") == "test")).all()
 
 
+def test_has_touch_is_seen_not_believed(tmp_path: Path, rows: Table) -> None:
+    rows = [{**row, "has_touch": "True", "has_vision": ""} for row in rows]
+    pack = packed(config(write(rows, tmp_path / "m.csv")), tmp_path / "pack")
+    assert pack.has("touch").all() and not {"has_touch", "has_vision"} & set(pack.table.column_names)
+
+
+def test_a_control_must_not_take_the_place_of_a_column_of_the_pack(tmp_path: Path, rows: Table) -> None:
+    rows = [{**row, "group": i // 3} for i, row in enumerate(rows)]
+    with pytest.raises(
+        ValueError, match=r"control column 'group' holds numbers and has the name of a column of the pack"
+    ):
+        config(write(rows, tmp_path / "m.csv"), group="group", controls=("which=group",)).source()
+
+
 def test_a_config_survives_json(tmp_path: Path) -> None:
     run = recipe("smoke", config(tmp_path, controls=("a=b",), only=("seq<=4",), vision=""))
     assert from_json(Run, json.loads(json.dumps(to_json(run)))) == run

@@ -101,6 +101,11 @@ def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: p
     packed(table(films / "once.csv", film_rows()), tmp_path / "q", labels=("label",), group="take")
     assert len(asked) == 3 * 8
     assert Pack(tmp_path / "q").digest == Pack(tmp_path / "p").digest
+    monkeypatch.setattr(
+        rows_module, "MAX_TOGETHER_BYTES", 4 * 16 * 16 * 6
+    )  # the same by bytes: four rows of two images
+    source = FolderConfig(path=films / "once.csv", size=16, labels=("label",), group="take").source()
+    assert list(source.samples_per_item()) == [4, 4, 4] * 4
 
 
 def test_a_video_may_stand_beside_files(films: Path, tmp_path: Path) -> None:
@@ -135,7 +140,9 @@ def test_videos_that_a_row_shows_side_by_side_are_one_group(films: Path) -> None
 
 def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path, tmp_path: Path) -> None:
     rows = [
-        {"touch": f"{k}/gel.avi", "frame": i, "split": "test" if i > 8 else "train"} for k in range(4) for i in range(12)
+        {"touch": f"{k}/gel.avi", "frame": i, "split": "test" if i > 8 else "train"}
+        for k in range(4)
+        for i in range(12)
     ]
     config = FolderConfig(path=table(films / "cut.csv", rows), size=16)
     with pytest.raises(ValueError, match=r"4 of 4 groups \(video\) are on two sides, e\.g\. '0/gel\.avi'"):

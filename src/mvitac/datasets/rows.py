@@ -31,7 +31,9 @@ VERSION = 3
 CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet")
 """What the probe itself calls its controls."""
 MAX_TOGETHER = 1024
-"""Rows of one video read in one pass; more would not fit into memory at 256 px for every worker."""
+"""Rows of one video read in one pass, where their images fit into ``MAX_TOGETHER_BYTES``."""
+MAX_TOGETHER_BYTES = 600 << 20
+"""What every worker may hold of them at the stored size: 1024 rows of two gels and a camera at 256 px."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,12 +224,18 @@ class Rows(Source):
         ids = read_ids(where, manifest, numbers, rows)
         self._rows: list[Row] = []
         for i, row in enumerate(rows):
-            carried = {name: cell for name, cell in row.items() if name not in places}
+            # Which modalities a row has is seen, not believed.
+            carried = {name: cell for name, cell in row.items() if name not in (*places, "has_vision", "has_touch")}
             own: dict[str, Any] = {"id": ids[i], "group": groups[i], "touch_group": touch_groups[i], "split": splits[i]}
             own |= {f"label_{task.name}": target[i] for task, target in zip(tasks, targets, strict=True)}
             own |= {f"has_{modality}": not lacking[i] for modality, lacking in missing.items()}
             if sensor:
                 own["sensor"] = row[sensor]
+            if taken := extra.keys() & own.keys():
+                raise ValueError(
+                    f"{where}: control column {min(taken)!r} holds numbers and has the name of a column of the pack itself:"
+                    " give a copy of it under another name"
+                )
             # Column order is part of the pack's digest: ours first, then the manifest's that we do not interpret.
             carried = {k: v for k, v in carried.items() if k not in own}
             columns = {**own, **carried, **{k: v[i] for k, v in extra.items()}}
@@ -235,7 +243,8 @@ class Rows(Source):
             first = places[vision][i] if vision else None
             plain = tuple(b[numbers[i]] for b in backgrounds) if pressed else ()
             self._rows.append(Row(numbers[i], first, pressed, plain, columns))
-        self._items = bundles(self._rows)
+        row_bytes = 3 * config.size**2 * sum(bool(column) for column in (vision, *touch))
+        self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
         self._spec = DataSpec(
             name=self._title,
             vision_channels=3 if vision else 0,
@@ -319,8 +328,8 @@ class Rows(Source):
         return difference(touch[1], fit(empty, self._size))
 
 
-def bundles(rows: Sequence[Row]) -> list[list[int]]:
-    """Row indices by item: rows whose images lie in the same containers, at most ``MAX_TOGETHER``; others alone."""
+def bundles(rows: Sequence[Row], most: int) -> list[list[int]]:
+    """Row indices by item: rows whose images lie in the same containers, at most ``most``; others alone."""
     items: list[list[int]] = []
     open_items: dict[Any, list[int]] = {}
     for i, row in enumerate(rows):
@@ -329,7 +338,7 @@ def bundles(rows: Sequence[Row]) -> list[list[int]]:
             items.append([i])
             continue
         item = open_items.get(key)
-        if item is None or len(item) == MAX_TOGETHER:
+        if item is None or len(item) == most:
             item = open_items[key] = []
             items.append(item)
         item.append(i)
