@@ -380,6 +380,14 @@ def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Table) 
     assert config(file).source().items()
 
 
+def test_another_way_to_write_a_path_hides_no_leak(tmp_path: Path, rows: Table) -> None:
+    other = next(row for row in rows if row["side"] == "test")
+    first = next(row for row in rows if row["side"] == "train")
+    other["left"] = f"./left/../{first['left']}"
+    with pytest.raises(ValueError, match="leaks: 1 of 23 left images are on two sides"):
+        config(write(rows, tmp_path / "m.csv"), split="side").source()
+
+
 def test_train_and_unlabelled_are_one_side(tmp_path: Path, rows: Table) -> None:
     rows[0]["side"] = "unlabelled"
     assert config(write(rows, tmp_path / "m.csv"), split="side").source().items()

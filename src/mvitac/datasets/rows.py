@@ -5,6 +5,7 @@ Whatever can be wrong with the table is said before the first image is decoded.
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
@@ -216,7 +217,7 @@ class Rows(Source):
             check_leak(where, split, f"touch groups ({config.touch_group or group_by})", touch_groups, splits)
             for column, found in places.items():
                 there = [i for i, place in enumerate(found) if place]
-                images = [str(found[i]) for i in there]
+                images = [os.path.normpath(str(found[i])) for i in there]
                 check_leak(where, split, f"{column} images", images, [splits[i] for i in there])
         check_sides(where, split, splits, tasks, targets, len(set(groups)))
 
