@@ -68,9 +68,7 @@ def read_controls(
     return columns, {name: tuple(c for column in given for c in made[column]) for name, given in controls.items()}
 
 
-def filled(
-    where: str, numbers: Sequence[int], rows: Sequence[dict[str, str]], column: str, what: str
-) -> list[str]:
+def filled(where: str, numbers: Sequence[int], rows: Sequence[dict[str, str]], column: str, what: str) -> list[str]:
     """The cells of ``column``, none of them empty."""
     empty = [number for number, row in zip(numbers, rows, strict=True) if not row[column]]
     if empty:
