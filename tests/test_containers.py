@@ -148,6 +148,15 @@ def test_cameras_are_chosen_or_guessed() -> None:
     assert choose(three, None, (), where) == {"left": "cam.tactile_l", "right": "cam.tactile_r", "vision": "cam.front"}
     assert choose(three, "", ("cam.front",), where) == {"cam.front": "cam.front"}
     assert choose(["a", "b"], "b", ("a",), where) == {"a": "a", "b": "b"}
+    assert choose(["front", "finger_cam", "gel"], "finger_cam", (), where) == {
+        "touch": "gel",
+        "finger_cam": "finger_cam",
+    }
+    assert choose(["front", "finger_cam"], "finger_cam", (), where) == {"finger_cam": "finger_cam"}  # never both senses
+    assert choose(["digital_front", "digit_left"], None, (), where) == {
+        "touch": "digit_left",
+        "vision": "digital_front",
+    }
     for vision, touch, says in (("cam.frnt", (), "did you mean 'cam.front'"), (None, ("x",), "unknown camera 'x'")):
         with pytest.raises(ValueError, match=says):
             choose(three, vision, touch, where)
@@ -189,6 +198,7 @@ def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.
         assert (back.images[modality] == toy.images[modality][at]).all()
     for name in ("group", "split"):
         assert (back.column(name) == toy.column(name)[at]).all()
+    assert (back.column("id_in_pack") == toy.column("id")[at]).all()
     assert (back.column("label_label_bright") == toy.column("label_bright")[at]).all()
     features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
     assert "crc_touch" in toy.table.column_names and not {"crc_vision", "crc_touch"} & set(features)
@@ -200,6 +210,27 @@ def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.
         data = pq.read_table(tmp_path / f"set/data/chunk-000/file-{e['data/file_index']:03d}.parquet").to_pylist()
         mine = [row for row in data if row["episode_index"] == e["episode_index"]]
         assert [row["index"] for row in mine] == list(range(e["dataset_from_index"], e["dataset_to_index"]))
+
+
+def test_columns_named_like_the_formats_own_survive_it(tmp_path: Path) -> None:
+    class Named(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (s,) = super().read(item)
+            given = {"frame": 100 + item, "episode": f"e{item}", "timestamp": item / 2, "task": "press", "index": -item}
+            return [Sample(vision=s.vision, touch=s.touch, columns={**s.columns, **given, "task_in_pack": "older"})]
+
+    pack = build(Named(), tmp_path / "pack", size=32, quiet=True)
+    write_lerobot(pack, tmp_path / "set")
+    back = packed(
+        LeRobotConfig(path=tmp_path / "set", size=32, labels=("label_pattern",), group="group"), tmp_path / "b"
+    )
+    at = {name: i for i, name in enumerate(pack.column("id"))}
+    rows = [at[name] for name in back.column("id_in_pack")]
+    for name in ("frame", "episode", "index"):
+        assert back.column(f"{name}_in_pack").tolist() == [str(pack.column(name)[i]) for i in rows]
+    assert back.column("timestamp_in_pack").astype(float).tolist() == [pack.column("timestamp")[i] for i in rows]
+    assert set(back.column("task_in_pack")) == {"older"} and set(back.column("task_in_pack_in_pack")) == {"press"}
+    assert set(back.column("frame").astype(int)) <= set(range(pack.num))  # and these are the format's
 
 
 def test_export_leaves_gaps_out_and_never_overwrites(tmp_path: Path) -> None:
@@ -335,6 +366,24 @@ def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
     pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
     assert [level(image) for image in pack.images["touch"]] == [i for i in range(20) if i != 3]
     assert [name for name, _ in pack.meta["damaged"]] == ["row 4"]
+
+
+def test_hub_files_name_their_split_all_or_none(tmp_path: Path) -> None:
+    root = make_hub(tmp_path / "data")
+    options: dict[str, Any] = {"path": root, "size": 16, "labels": ("kind",), "group": "thing"}
+    (root / "train-00001-of-00002.parquet").rename(root / "more.parquet")
+    with pytest.raises(ValueError, match=r"the name of more\.parquet says no split, others do: begin it with train-"):
+        HubConfig(**options).source()
+    assert HubConfig(**options, split="by-group").source().spec().group_by == "thing"
+
+
+def test_hub_gaps_of_a_column_whose_name_has_dots(tmp_path: Path) -> None:
+    images = [None if i == 3 else {"bytes": png(i), "path": None} for i in range(20)]
+    rows = [{"obs.touch": image, "photo": png(i), "kind": i % 2} for i, image in enumerate(images)]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "gaps.parquet")
+    options: dict[str, Any] = {"labels": ("kind",), "vision": "photo", "touch": ("obs.touch",), "size": 16}
+    pack = packed(HubConfig(path=tmp_path / "gaps.parquet", allow_missing=True, **options), tmp_path / "pack")
+    assert pack.num == 20 and level(pack.images["vision"][~pack.has("touch")]) == 3
 
 
 def test_hub_parquet_with_gaps_or_without_images(tmp_path: Path) -> None:

@@ -218,6 +218,29 @@ def test_a_part_of_a_source_is_spread_over_it() -> None:
     assert {f.item: f for f in findings}["classes of material"].verdict == "ok"
 
 
+def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
+    rows = ["touch,label,object,split"]
+    for i in range(60):
+        noise = np.random.default_rng(i).integers(0, 255, (16, 16, 3), np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"{i}.png")
+        rows.append(f"{i}.png,c{i % 10},{i},{'train' if i < 40 else 'test'}")
+    (tmp_path / "m.csv").write_text("\n".join(rows))
+    source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), group="object", size=16).source()
+    for num, verdict in ((0, "ok"), (12, "look")):
+        findings, _ = examine_source(source, num=num, size=16, quiet=True)
+        found = {f.item: f for f in findings}["classes of label"]
+        assert found.verdict == verdict and exit_code(findings) <= ("ok", "look").index(verdict)
+    assert found.evidence.startswith("in the items examined: 10 classes") and "never seen in training" in found.evidence
+
+
+def test_paths_with_brackets_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "set [left]" / "[/red]"  # would end rich's markup
+    build(Presses(), path, size=SIDE, quiet=True)
+    for arguments in (["info"], ["check"], ["show", "--limit", "1", "--out", f"{path}.png"]):
+        assert main(["data", arguments[0], str(path), *arguments[1:]]) == 0
+        assert "set[left]/[/red]" in "".join(capsys.readouterr().out.split())  # wherever the line was broken
+
+
 def test_a_damaged_pack_names_its_row_and_training_refuses_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -243,6 +243,20 @@ def test_controls_are_numbers_or_one_hot(tmp_path: Path, rows: Table) -> None:
     assert ((one_hot[:, 0] == 1) == (pack.column("side") == "test")).all()
 
 
+def test_has_touch_is_seen_not_believed(tmp_path: Path, rows: Table) -> None:
+    rows = [{**row, "has_touch": "True", "has_vision": ""} for row in rows]
+    pack = packed(config(write(rows, tmp_path / "m.csv")), tmp_path / "pack")
+    assert pack.has("touch").all() and not {"has_touch", "has_vision"} & set(pack.table.column_names)
+
+
+def test_a_control_must_not_take_the_place_of_a_column_of_the_pack(tmp_path: Path, rows: Table) -> None:
+    rows = [{**row, "group": i // 3} for i, row in enumerate(rows)]
+    with pytest.raises(
+        ValueError, match=r"control column 'group' holds numbers and has the name of a column of the pack"
+    ):
+        config(write(rows, tmp_path / "m.csv"), group="group", controls=("which=group",)).source()
+
+
 def test_a_config_survives_json(tmp_path: Path) -> None:
     run = recipe("smoke", config(tmp_path, controls=("a=b",), only=("seq<=4",), vision=""))
     assert from_json(Run, json.loads(json.dumps(to_json(run)))) == run
@@ -434,6 +448,14 @@ def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Table) 
     assert config(file).source().items()
 
 
+def test_another_way_to_write_a_path_hides_no_leak(tmp_path: Path, rows: Table) -> None:
+    other = next(row for row in rows if row["side"] == "test")
+    first = next(row for row in rows if row["side"] == "train")
+    other["left"] = f"./left/../{first['left']}"
+    with pytest.raises(ValueError, match="leaks: 1 of 23 left images are on two sides"):
+        config(write(rows, tmp_path / "m.csv"), split="side").source()
+
+
 def test_train_and_unlabelled_are_one_side(tmp_path: Path, rows: Table) -> None:
     rows[0]["side"] = "unlabelled"
     assert config(write(rows, tmp_path / "m.csv"), split="side").source().items()
@@ -613,6 +635,10 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     for name in ("train/vision/a/1", "train/touch/a/1", "test/touch/a/2"):
         picture(tmp_path / f"half/{name}.png")
     refused(tmp_path / "half", r"vision images in some splits only \(row")
+    for side, says in (("validation", "write 'val' instead"), ("other", "take it away")):
+        for name in ("train/a/1", "test/b/2", f"{side}/a/3"):
+            picture(tmp_path / f"{side} beside/{name}.png")
+        refused(tmp_path / f"{side} beside", rf"images in folder '{side}' beside train and test: {says}")
 
 
 def test_the_command_says_it_in_one_line(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:

@@ -220,6 +220,15 @@ def test_frames_are_counted_and_spread(tmp_path: Path) -> None:
 # -- what each of them says -------------------------------------------------------------------------------------------
 
 
+def test_slip_grasp_labels_no_late_frame_where_early_ones_are_lost(tmp_path: Path) -> None:
+    make_slip_grasp(tmp_path)
+    for path in (tmp_path / "data/object001").glob("*_mm/*.jpg"):
+        if int(path.stem[-8:]) % 1000 in (*range(995, 1000), 0):  # up to the key frame
+            path.unlink()
+    rows = [row for row in SlipGraspConfig(path=tmp_path).manifest().rows if row["object"] == "001"]
+    assert len(rows) == 3 * 15 and {int(row["seq"]) for row in rows} == {*range(6, 21)}
+
+
 def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:
     pack = packs["slip_grasp"]
     assert pack.num == (3 + 4 + 3 + 4) * 21

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from mvitac import video
 from mvitac.datasets import rows as rows_module
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.places import difference
+from mvitac.doctor import examine_source
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.source import Sample
@@ -99,6 +101,11 @@ def test_every_video_is_decoded_once(films: Path, tmp_path: Path, monkeypatch: p
     packed(table(films / "once.csv", film_rows()), tmp_path / "q", labels=("label",), group="take")
     assert len(asked) == 3 * 8
     assert Pack(tmp_path / "q").digest == Pack(tmp_path / "p").digest
+    monkeypatch.setattr(
+        rows_module, "MAX_TOGETHER_BYTES", 4 * 16 * 16 * 6
+    )  # the same by bytes: four rows of two images
+    source = FolderConfig(path=films / "once.csv", size=16, labels=("label",), group="take").source()
+    assert list(source.samples_per_item()) == [4, 4, 4] * 4
 
 
 def test_a_video_may_stand_beside_files(films: Path, tmp_path: Path) -> None:
@@ -110,6 +117,41 @@ def test_a_video_may_stand_beside_files(films: Path, tmp_path: Path) -> None:
     found = [level(image) for image in pack.images["touch"]]
     assert np.allclose(found[:4], [shade(k, k + 1) for k in range(4)], atol=6)
     assert found[4:] == [200] * 4
+
+
+def test_no_video_is_split_where_no_group_is_given(films: Path, tmp_path: Path) -> None:
+    rows = [{"touch": f"{k}/gel.avi", "frame": i, "label": "ab"[k % 2]} for k in range(4) for i in range(12)]
+    rows += [{"touch": plain(films / "alone.png", 200), "frame": "", "label": "a"}]
+    pack = packed(table(films / "loose.csv", rows), tmp_path / "pack", labels=("label",), val_share=0.0)
+    videos = [rows[int(name) - 1]["touch"] for name in pack.column("id")]
+    assert len(set(zip(videos, pack.column("split"), strict=True))) == len(set(videos)) == 5
+    assert set(pack.column("group")) == {f"{k}/gel.avi" for k in range(4)} | {"000049"}
+    assert pack.spec.group_by == "video" and "frames of one video are one group" in pack.spec.notes[0]
+
+
+def test_videos_that_a_row_shows_side_by_side_are_one_group(films: Path) -> None:
+    camera, gel = "{}/camera.mp4", "{}/gel.avi"
+    pairs = [(camera.format(a), gel.format(b)) for a, b in ((0, 0), (1, 1), (0, 2), (3, 3))]
+    rows = [{"vision": v, "touch": t, "frame": i} for v, t in pairs for i in (1, 2)]
+    source = FolderConfig(path=table(films / "chain.csv", rows), size=16).source()
+    groups = {s.columns["id"]: s.columns["group"] for i in range(4) for s in source.read(i) if isinstance(s, Sample)}
+    assert len(set(groups.values())) == 3 and groups["000001"] == groups["000005"]  # both seen by camera 0
+
+
+def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path, tmp_path: Path) -> None:
+    rows = [
+        {"touch": f"{k}/gel.avi", "frame": i, "split": "test" if i > 8 else "train"}
+        for k in range(4)
+        for i in range(12)
+    ]
+    config = FolderConfig(path=table(films / "cut.csv", rows), size=16)
+    with pytest.raises(ValueError, match=r"4 of 4 groups \(video\) are on two sides, e\.g\. '0/gel\.avi'"):
+        config.source()
+    findings, _ = examine_source(replace(config, allow_leak=True).source(), size=16, quiet=True)
+    (found,) = [finding for finding in findings if finding.item == "groups across splits"]
+    assert found.verdict == "broken" and "group (video): 4 of 4 on two sides" in found.evidence
+    findings, _ = examine_source(replace(config, split="by-group").source(), size=16, quiet=True)
+    assert [finding.verdict for finding in findings if finding.item == "groups across splits"] == ["ok"]
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,10 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
-from videos import numbered, read_number, write_video
+from videos import edited, numbered, read_number, write_video
 
 from mvitac import video
+from mvitac.datasets import videos
 from mvitac.video import frames, num_frames
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "touch_and_go_sample"
@@ -85,6 +86,31 @@ def test_the_pixels_are_those_of_decoding_from_the_start(path: Path) -> None:
         plain = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     for number, image in frames(path, (0, 13, 14, 39, 41, 77, 149)):
         assert np.array_equal(image, plain[number])
+
+
+@pytest.mark.parametrize("kind", ["mpeg4", "mpeg4-reordered", "mov", "h264", "h264-open"])
+@pytest.mark.parametrize(("first", "num"), [(1, 149), (7, 60), (43, 107), (0, 33)])
+def test_a_trim_without_encoding_anew_counts_what_is_shown(
+    made: dict[str, Path], tmp_path: Path, kind: str, first: int, num: int
+) -> None:
+    if kind not in made:
+        pytest.skip("this PyAV cannot encode it")
+    path = edited(made[kind], tmp_path / "v.mp4", (first, num))
+    with av.open(str(path)) as container:
+        shown = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
+    assert [read_number(image)[0] for _, image in shown] == [*range(first, first + num)]
+    assert num_frames(path) == videos.num_frames(path) == num
+    assert np.allclose(videos.timestamps(path), [time for time, _ in shown])
+    for wanted in ([0], [1, 2, 30], range(num)):
+        found = list(frames(path, wanted))
+        assert [number for number, _ in found] == list(wanted)
+        assert all(np.array_equal(image, shown[number][1]) for number, image in found)
+
+
+def test_pieces_put_together_without_encoding_anew_are_refused(made: dict[str, Path], tmp_path: Path) -> None:
+    path = edited(made["mpeg4"], tmp_path / "v.mp4", (31, 20), (5, 10))
+    with pytest.raises(ValueError, match=r"v\.mp4 is put together from pieces by an edit list: encode it anew"):
+        num_frames(path)
 
 
 def test_a_player_that_seeks_shows_the_same_frame(path: Path) -> None:

@@ -31,7 +31,11 @@ from mvitac.record import brief
 
 @dataclass(frozen=True)
 class Packets:
-    """The packets that become frames, in the order in which they are stored and decoded."""
+    """The packets that the decoder needs, in the order in which they are stored and decoded.
+
+    Those that an edit list cuts off (a trim without re-encoding) are decoded, since others refer to them, but not shown:
+    they are no frames.
+    """
 
     dts: np.ndarray
     """[P] int64 decoding times."""
@@ -39,17 +43,24 @@ class Packets:
     """[P] int64 where they are in the file."""
     keys: np.ndarray
     """[K] int64 ascending numbers of the packets at which decoding can start."""
+    before: np.ndarray
+    """[P + 1] int64 how many frames are stored before each packet, and in all."""
     shape: tuple[int, int]
     """Height and width of the frames, as the container says."""
 
+    @property
+    def num(self) -> int:
+        """How many frames are shown."""
+        return int(self.before[-1])
+
     def start_of(self, frame: int) -> int:
-        """Number in ``keys`` of the last key packet stored no later than place ``frame``."""
-        return max(0, int(np.searchsorted(self.keys, frame, side="right")) - 1)
+        """Number in ``keys`` of the last key packet before which no more than ``frame`` frames are stored."""
+        return max(0, int(np.searchsorted(self.before[self.keys], frame, side="right")) - 1)
 
 
 def num_frames(path: str | Path) -> int:
     """How many frames the file promises; ValueError or OSError if it is no whole video."""
-    return len(_packets(path).dts)
+    return _packets(path).num
 
 
 def frame_shape(path: str | Path) -> tuple[int, int]:
@@ -72,8 +83,8 @@ def frames(
 
     def lose(why: str = "is beyond the end of what can be read: the file is cut off, fetch it again") -> None:
         frame = pending.pop()
-        if frame >= len(packets.dts):
-            why = f"is wanted, the video ends after frame {len(packets.dts) - 1}: is it the right one, and whole?"
+        if frame >= packets.num:
+            why = f"is wanted, the video ends after frame {packets.num - 1}: is it the right one, and whole?"
         if lost is None:
             raise ValueError(f"{path}: frame {frame} {why}")
         lost[frame] = why
@@ -82,12 +93,12 @@ def frames(
         shrink = VideoReformatter()  # keeps its tables from frame to frame
         key = 0
         while pending:
-            if pending[-1] >= len(packets.dts):
+            if pending[-1] >= packets.num:
                 lose()
                 continue
             key = max(key, packets.start_of(pending[-1]))
             run = _Run(container, stream, packets, key)
-            if run.first > pending[-1]:  # the key frame is shown after the frame that it was to lead to
+            if run.first > pending[-1] and key:  # the key frame is shown after the frame that it was to lead to
                 run = _Run(container, stream, packets, key - 1)
             for number, frame in run.frames():
                 while pending and pending[-1] < number:
@@ -140,18 +151,19 @@ class _Run:
             if _shown(packet) > _shown(self._ahead[0]):
                 break
         self._shown = _shown(self._ahead[0]) if self._ahead else 0
-        self.first = self.fed + max(0, sum(_shown(p) < self._shown for p in self._ahead))
-        """Which frame the key frame is."""
+        leading = sum(_shown(p) < self._shown and not p.is_discard for p in self._ahead)
+        self.first = int(packets.before[self.fed]) + leading
+        """Which frame the key frame is, or if it is cut off the first one after it."""
 
     def frames(self) -> Iterator[tuple[int, VideoFrame]]:
         """(frame number, frame) in display order, from the key frame to the end of the file."""
-        due: list[int] = []  # times of the packets fed, from the key frame on, in display order
+        due: list[int] = []  # times of the frames fed, from the key frame on, in display order
         for packet in self._all():
             if packet is not None:
                 self.fed += packet is not self._ahead[0]
                 if not self._is_next(packet):
                     self._note("the table of its frames and what is there disagree", _shown(packet))
-                if _shown(packet) >= self._shown:
+                if _shown(packet) >= self._shown and not packet.is_discard:
                     insort(due, _shown(packet))
             for frame in self._decoded(packet):
                 if frame.pts is not None and frame.pts >= self._shown:
@@ -206,7 +218,7 @@ def _from(container: InputContainer, stream: VideoStream, dts: int) -> Iterator[
     found = False
     for packet in container.demux(stream):
         found = found or packet.dts == dts
-        if found and packet.size and not packet.is_discard:
+        if found and packet.size:
             yield packet
 
 
@@ -246,13 +258,16 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
         shape = (stream.codec_context.height, stream.codec_context.width)
         table = stream.index_entries
         if "mp4" in container.format.name or ("avi" in container.format.name and len(table) == stream.frames):
-            found = [(e.timestamp, e.pos, e.is_keyframe) for e in table if e.size and not e.is_discard]
+            found = [(e.timestamp, e.pos, e.is_keyframe, e.is_discard) for e in table if e.size]
         else:
-            found = [(p.dts, p.pos, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
-    if not found or any(dts is None or place is None for dts, place, _ in found):
+            found = [(p.dts, p.pos, p.is_keyframe, p.is_discard) for p in container.demux(stream) if p.size]
+    before = np.cumsum([0, *(not cut for *_, cut in found)])
+    if not before[-1] or any(dts is None or place is None for dts, place, *_ in found):
         raise ValueError(f"{path} holds no frames that can be told apart: it is damaged, or convert it to mp4")
     dts, places = (np.array([row[i] for row in found], np.int64) for i in (0, 1))
-    keys = np.flatnonzero([key for _, _, key in found])
+    keys = np.flatnonzero([key for _, _, key, _ in found])
+    if (np.diff(dts) <= 0).any() and before[-1] < len(dts):
+        raise ValueError(f"{path} is put together from pieces by an edit list: encode it anew, ffmpeg -i IN OUT.mp4")
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
-    return Packets(dts, places, keys, shape)
+    return Packets(dts, places, keys, before, shape)

@@ -87,22 +87,21 @@ def _tell(what: str, findings: Any, strips: Any, options: Any) -> int:
     from dataclasses import asdict
 
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     from mvitac.doctor import exit_code
     from mvitac.doctor.sheet import draw
     from mvitac.record import write_atomic, write_json
 
     code = exit_code(findings)
-    console = Console()
+    console = Console(markup=False)
     table = Table(title=f"{what}: {('ok', 'look', 'broken')[code]}", title_justify="left")
     for column in ("", "item", "what was found"):
         table.add_column(column, overflow="fold")
     for finding in findings:
         told = finding.evidence + (f"\n-> {finding.advice}" if finding.advice else "")
-        colour = _COLOURS[finding.verdict]
-        table.add_row(f"[{colour}]{finding.verdict}[/]", escape(finding.item), escape(told))
+        table.add_row(Text(finding.verdict, style=_COLOURS[finding.verdict]), finding.item, told)
     console.print(table)
     if options.json:
         write_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})

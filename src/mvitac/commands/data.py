@@ -66,13 +66,13 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
         max_damaged=options.max_damaged,
         quiet=options.quiet,
     )
-    console = Console()
+    console = Console(markup=False)
     console.print(f"{pack.path}: {pack.num} samples at {pack.size} px", soft_wrap=True, highlight=False)
     if lost := pack.meta["damaged"]:
         text = f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {": ".join(lost[0])}'
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
+        console.print(text, soft_wrap=True, highlight=False)
     for note in pack.spec.notes:
-        console.print(f"note: {note}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"note: {note}", soft_wrap=True, highlight=False)
 
 
 def sheet(argv: list[str]) -> None:
@@ -104,7 +104,7 @@ def sheet(argv: list[str]) -> None:
     if options.seed < 0:
         raise ValueError(f"--seed {options.seed}: give a number >= 0")
     write_atomic(out, lambda file: draw(file, seed=options.seed))
-    Console().print(f"{out}", soft_wrap=True, highlight=False)
+    Console(markup=False).print(f"{out}", soft_wrap=True, highlight=False)
 
 
 def shard(argv: list[str]) -> None:
@@ -141,7 +141,7 @@ def shard(argv: list[str]) -> None:
 
     pack = Pack(options.pack)
     num = write_shards(pack, options.url, shard_mb=options.shard_mb, seed=options.seed, quiet=options.quiet)
-    Console().print(f"{options.url}: {pack.num} samples in {num} shards", soft_wrap=True, highlight=False)
+    Console(markup=False).print(f"{options.url}: {pack.num} samples in {num} shards", soft_wrap=True, highlight=False)
 
 
 def info(argv: list[str]) -> None:
@@ -175,7 +175,7 @@ def info(argv: list[str]) -> None:
             common = np.bincount(labels).argmax() if len(labels) else None
             cells.append("" if common is None else f"{task.classes[common]} {100 * (labels == common).mean():.1f} %")
         table.add_row(split, str(len(rows)), str(len(set(pack.column("group")[rows]))), *cells)
-    console = Console()
+    console = Console(markup=False)
     console.print(table)
     if len(gaps := [m for m in pack.spec.modalities if not pack.has(m).all()]):
         whole = int(np.logical_and.reduce([pack.has(m) for m in pack.spec.modalities]).sum())
@@ -183,7 +183,7 @@ def info(argv: list[str]) -> None:
         console.print(f"{lacking}; {whole} whole pairs", soft_wrap=True, highlight=False)
     console.print(f"source {pack.spec.source}; licence {pack.spec.licence}", soft_wrap=True, highlight=False)
     for note in pack.spec.notes:
-        console.print(f"note: {note}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"note: {note}", soft_wrap=True, highlight=False)
 
 
 def show(argv: list[str]) -> None:
@@ -235,7 +235,7 @@ def show(argv: list[str]) -> None:
     else:
         picture = sheet.to_image(pack, found, num_all, side=options.side)
         write_atomic(out, lambda file: picture.save(file, "PNG"))
-    Console().print(f"{out}: {len(found)} of {num_all} strips", soft_wrap=True, highlight=False)
+    Console(markup=False).print(f"{out}: {len(found)} of {num_all} strips", soft_wrap=True, highlight=False)
 
 
 def export_lerobot(argv: list[str]) -> None:
@@ -261,4 +261,4 @@ def export_lerobot(argv: list[str]) -> None:
     pack = Pack(options.pack)
     num = write_lerobot(pack, options.out, fps=options.fps)
     left = f"; {pack.num - num} rows that lack a modality left out" * (num < pack.num)
-    Console().print(f"{options.out}: {num} frames{left}", soft_wrap=True, highlight=False)
+    Console(markup=False).print(f"{options.out}: {num} frames{left}", soft_wrap=True, highlight=False)

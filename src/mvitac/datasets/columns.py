@@ -68,12 +68,8 @@ def read_controls(
     return columns, {name: tuple(c for column in given for c in made[column]) for name, given in controls.items()}
 
 
-def filled(
-    where: str, numbers: Sequence[int], rows: Sequence[dict[str, str]], column: str | None, what: str
-) -> list[str]:
-    """The cells of ``column``, none of them empty; without a column, every row's own number."""
-    if column is None:
-        return [f"{number:06d}" for number in numbers]
+def filled(where: str, numbers: Sequence[int], rows: Sequence[dict[str, str]], column: str, what: str) -> list[str]:
+    """The cells of ``column``, none of them empty."""
     empty = [number for number, row in zip(numbers, rows, strict=True) if not row[column]]
     if empty:
         hint = f"; write one of {', '.join(SPLITS)}" if what == "split" else ""

@@ -6,7 +6,7 @@ A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are 
     vision/0001.jpg,touch/0001.jpg,wood,table_3,train
 
 A path may name a **video**: column ``frame`` (or ``touch_frame``, ``vision_frame``, ...) then holds the frame's number,
-counted from 0, and every video is decoded once.
+counted from 0; every video is decoded once, and is one group unless a column says the groups.
 
 **Class folders** need no manifest. Files are paired by their path below the modality's folder, without the suffix:
 

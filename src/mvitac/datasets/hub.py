@@ -48,6 +48,12 @@ class HubConfig(RowsConfig):
                 for row in rows[before:]:
                     row.setdefault("split", str(side))
         names = tuple(dict.fromkeys(name for row in rows for name in row))
+        nameless = [file.name for file, side in zip(files, sides, strict=True) if not side]
+        if any(sides) and nameless and not self.split and "split" not in names:
+            raise ValueError(
+                f"{self.path}: the name of {nameless[0]} says no split, others do: begin it with train-, validation- or"
+                " test-, take it away, or split=by-group deals all rows anew"
+            )
         for column, places in found.items():
             if len(places) < len(rows):
                 raise ValueError(f"{self.path}: image column {column!r} is not in every file")
@@ -84,9 +90,10 @@ def _is_image(kind: pa.DataType) -> bool:
 
 def _mark_gaps(opened: pq.ParquetFile, group: int, column: str, places: list[Place | None], num: int) -> None:
     """None for rows whose image is null."""
-    index = [i for i, name in enumerate(opened.schema.names) if opened.schema.column(i).path.split(".")[0] == column]
-    nulls = [opened.metadata.row_group(group).column(i).statistics for i in index]
-    if all(s is not None and s.has_null_count and s.null_count == 0 for s in nulls[:1]):
+    leaves = [opened.schema.column(i).path for i in range(len(opened.schema.names))]
+    leaf = next(i for i, path in enumerate(leaves) if path in (column, f"{column}.bytes"))
+    nulls = opened.metadata.row_group(group).column(leaf).statistics
+    if nulls is not None and nulls.has_null_count and nulls.null_count == 0:
         return  # no need to read the images for it
     for place, value in enumerate(opened.read_row_group(group, columns=[column]).column(0)):
         if not value.is_valid:

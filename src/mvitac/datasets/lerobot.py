@@ -31,8 +31,10 @@ from mvitac.record import digest, read_json
 from mvitac.registry import unknown
 
 VERSION = "v3.0"
-FELT = re.compile(r"touch|tactile|gelsight|digit|gel\b|finger", re.IGNORECASE)
+FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)
 """What a camera key that shows touch is usually called."""
+RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
+"""The format's own columns -> what they are called in a pack."""
 SCALARS = {"float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool", "string"}
 
 
@@ -109,7 +111,7 @@ class LeRobotConfig(RowsConfig):
 
 def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], where: Path) -> dict[str, str]:
     """Column -> camera key: as asked for under its own name, otherwise guessed under vision, touch, left and right."""
-    felt = [key for key in cameras if FELT.search(key)]
+    felt = [key for key in cameras if FELT.search(key) and key != vision]
     seen = [key for key in cameras if key not in felt]
     for key in (*touch, vision):
         if key and key not in cameras:
@@ -188,20 +190,19 @@ def _frames(
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise ValueError(f"{root / 'data'} holds no parquet files: fetch the whole dataset")
-    renamed = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
     for file in files:
         opened = _open(file)
         for name in ("timestamp", "episode_index", "frame_index", *images):
             if name not in opened.schema_arrow.names:
                 raise ValueError(f"{file} has no column {name!r}: fetch it again")
         names = [
-            name for name in opened.schema_arrow.names if name in scalars or name in renamed or name == "timestamp"
+            name for name in opened.schema_arrow.names if name in scalars or name in RENAMED or name == "timestamp"
         ]
         for group in range(opened.num_row_groups):
             for place, values in enumerate(opened.read_row_group(group, columns=names).to_pylist()):
                 if values["frame_index"] % every:
                     continue
-                row = {renamed.get(str(name), str(name)): _text(value) for name, value in values.items()}
+                row = {RENAMED.get(str(name), str(name)): _text(value) for name, value in values.items()}
                 if "task_index" in values:
                     row["task"] = tasks.get(values["task_index"], "")
                 rows.append(row)

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from mvitac.datasets.lerobot import VERSION
+from mvitac.datasets.lerobot import RENAMED, VERSION
 from mvitac.pack import Pack
 from mvitac.record import check_place, write_json
 
@@ -26,6 +26,8 @@ ROWS_PER_GROUP = 100
 FILE_BYTES = 100 << 20
 """After which a data file is closed and the next begins, as lerobot does."""
 FILES_PER_CHUNK = 1000
+TAKEN = {"timestamp", "task_index", "task", *RENAMED, *RENAMED.values()}
+"""Names of the format's own columns, there or where ``lerobot`` reads them: a pack's column of such a name gets another."""
 NUM_FOR_STATS = 256
 """Images looked at for their mean and spread."""
 ONE_FILE = "chunk-000/file-000.parquet"
@@ -91,17 +93,18 @@ def _cameras(pack: Pack) -> dict[str, tuple[str, int]]:
     return keys
 
 
-def _carried(pack: Pack) -> dict[str, str]:
-    """Table column -> lerobot's name for its type; a column's own name must not be one of lerobot's, nor hold a /. What a
-    pack notes of its own image files stays behind."""
-    own = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
-    own |= {f"{kind}_{modality}" for kind in ("crc", "bytes") for modality in pack.spec.modalities}
-    kinds: dict[str, str] = {}
+def _carried(pack: Pack) -> dict[str, tuple[str, str]]:
+    """Feature -> table column and lerobot's name for its type; a column's own name must not hold a /. What a pack notes of
+    its own image files stays behind."""
+    own = {f"{kind}_{modality}" for kind in ("crc", "bytes") for modality in pack.spec.modalities}
+    carried: dict[str, tuple[str, str]] = {}
     for field in pack.table.schema:
         if field.name in own or "/" in field.name or field.name.startswith("has_"):
             continue
-        kind = field.type
-        kinds[field.name] = (
+        name, kind = field.name, field.type
+        while name in TAKEN or (name != field.name and name in pack.table.column_names):
+            name += "_in_pack"
+        dtype = (
             "int64"
             if pa.types.is_integer(kind)
             else "bool"
@@ -110,13 +113,15 @@ def _carried(pack: Pack) -> dict[str, str]:
             if pa.types.is_floating(kind)
             else "string"
         )
-    return kinds
+        carried[name] = (field.name, dtype)
+    return carried
 
 
 def _features(pack: Pack) -> dict[str, Any]:
     image = {"dtype": "image", "shape": [pack.size, pack.size, 3], "names": ["height", "width", "channels"]}
     indices = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
-    scalars = {**_carried(pack), "timestamp": "float32", **indices}
+    carried = {name: kind for name, (_, kind) in _carried(pack).items()}
+    scalars = {**carried, "timestamp": "float32", **indices}
     return {
         **dict.fromkeys(_cameras(pack), image),
         **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in scalars.items()},
@@ -169,8 +174,8 @@ def _tables(
             key: [{"bytes": _png(pack.images[m][row, :, :, c : c + 3]), "path": None} for row in rows[piece]]
             for key, (m, c) in _cameras(pack).items()
         }
-        for name, kind in _carried(pack).items():
-            values = pack.table.column(name).take(pa.array(rows[piece])).to_pylist()
+        for name, (column, kind) in _carried(pack).items():
+            values = pack.table.column(column).take(pa.array(rows[piece])).to_pylist()
             columns[name] = ["" if value is None else str(value) for value in values] if kind == "string" else values
         columns["timestamp"] = (piece - start) / fps
         columns["frame_index"] = piece - start
@@ -236,7 +241,7 @@ def _stats(pack: Pack, rows: np.ndarray, starts: np.ndarray, fps: int) -> dict[s
         stats[key] = summary(images, (0, 1, 2), (3, 1, 1))
     places = np.arange(len(rows))
     episodes = np.searchsorted(starts, places, side="right") - 1
-    numbers = {name: pack.column(name)[rows] for name, kind in _carried(pack).items() if kind != "string"}
+    numbers = {name: pack.column(c)[rows] for name, (c, kind) in _carried(pack).items() if kind != "string"}
     numbers |= {"index": places, "episode_index": episodes, "frame_index": places - starts[episodes]}
     numbers |= {"timestamp": numbers["frame_index"] / fps, "task_index": np.zeros(len(rows))}
     for name, values in numbers.items():

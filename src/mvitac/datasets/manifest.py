@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from mvitac.datasets.images import IMAGES
 from mvitac.datasets.places import VIDEOS, File, Frame, Place
+from mvitac.datasets.splits import meant
 from mvitac.pack import SPLITS
 from mvitac.record import digest, digest_file
 from mvitac.registry import unknown
@@ -198,6 +199,10 @@ def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bo
     image has no counterpart.
     """
     splits = [split for split in SPLITS if (root / split).is_dir()]
+    for other in sorted(root.iterdir()) if splits else ():
+        if other.name not in SPLITS and other.is_dir() and _images_below(other):
+            hint = f"write {wanted!r} instead" if (wanted := meant(other.name)) else "take it away"
+            raise ValueError(f"{root} has images in folder {other.name!r} beside {' and '.join(splits)}: {hint}")
     rows: list[dict[str, str]] = []
     for split in splits or [""]:
         base = root / split

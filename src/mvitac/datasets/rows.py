@@ -5,6 +5,7 @@ Whatever can be wrong with the table is said before the first image is decoded.
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -19,19 +20,21 @@ from mvitac.datasets.columns import filled, read_controls, read_ids, read_task
 from mvitac.datasets.manifest import Condition, Manifest
 from mvitac.datasets.named import check_files, check_present, image_columns, read_backgrounds
 from mvitac.datasets.places import Damage, Place, difference, mean_image, read_all
-from mvitac.datasets.splits import BY_GROUP, check_leak, check_sides, check_split_names, deal
+from mvitac.datasets.splits import BY_GROUP, by_video, check_leak, check_sides, check_split_names, deal
 from mvitac.pack import fit, shrink
 from mvitac.record import digest
 from mvitac.registry import to_json
 from mvitac.source import Lost, Sample, Source, one_stamp
 from mvitac.spec import DataSpec
 
-VERSION = 2
+VERSION = 3
 """Raised when the same table would give another pack."""
 CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet")
 """What the probe itself calls its controls."""
 MAX_TOGETHER = 1024
-"""Rows of one video read in one pass; more would not fit into memory at 256 px for every worker."""
+"""Rows of one video read in one pass, where their images fit into ``MAX_TOGETHER_BYTES``."""
+MAX_TOGETHER_BYTES = 600 << 20
+"""What every worker may hold of them at the stored size: 1024 rows of two gels and a camera at 256 px."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +53,8 @@ class RowsConfig(DatasetConfig, ABC):
     labels: tuple[str, ...] = ()
     """Columns that become tasks; classes are their sorted distinct values, an empty cell or NaN is unlabelled."""
     group: str | None = None
-    """Column of the unit of splits and of intervals (object, recording); default: "group" if there is one, else every
-    row is alone, which is wrong for frames of one video."""
+    """Column of the unit of splits and of intervals (object, recording); default: "group" if there is one, else the video
+    that a row's frame is of, else every row is alone."""
     touch_group: str | None = None
     """Column of near-duplicates (one touch, one grasp), kept apart in batches; default: the group."""
     split: str | None = None
@@ -199,7 +202,11 @@ class Rows(Source):
         self._sizes, files = check_files(manifest, places, backgrounds, numbers)
 
         where = str(manifest.file)
-        groups = filled(where, numbers, rows, group, "group")
+        group_by, groups = (
+            (group, filled(where, numbers, rows, group, "group"))
+            if group
+            else by_video(manifest.root, numbers, places.values())
+        )
         touch_groups = filled(where, numbers, rows, config.touch_group, "touch_group") if config.touch_group else groups
         counts = [all(condition.holds(row) for condition in label_conditions) for row in rows]
         tasks, targets = [], []
@@ -213,11 +220,11 @@ class Rows(Source):
             splits = filled(where, numbers, rows, split, "split")
             check_split_names(where, split, numbers, splits)
         if not config.allow_leak:
-            check_leak(where, split, f"groups ({group})", groups, splits)
-            check_leak(where, split, f"touch groups ({config.touch_group or group})", touch_groups, splits)
+            check_leak(where, split, f"groups ({group_by})", groups, splits)
+            check_leak(where, split, f"touch groups ({config.touch_group or group_by})", touch_groups, splits)
             for column, found in places.items():
                 there = [i for i, place in enumerate(found) if place]
-                images = [str(found[i]) for i in there]
+                images = [os.path.normpath(str(found[i])) for i in there]
                 check_leak(where, split, f"{column} images", images, [splits[i] for i in there])
         check_sides(where, split, splits, tasks, targets, len(set(groups)))
 
@@ -225,12 +232,18 @@ class Rows(Source):
         ids = read_ids(where, manifest, numbers, rows)
         self._rows: list[Row] = []
         for i, row in enumerate(rows):
-            carried = {name: cell for name, cell in row.items() if name not in places}
+            # Which modalities a row has is seen, not believed.
+            carried = {name: cell for name, cell in row.items() if name not in (*places, "has_vision", "has_touch")}
             own: dict[str, Any] = {"id": ids[i], "group": groups[i], "touch_group": touch_groups[i], "split": splits[i]}
             own |= {f"label_{task.name}": target[i] for task, target in zip(tasks, targets, strict=True)}
             own |= {f"has_{modality}": not lacking[i] for modality, lacking in missing.items()}
             if sensor:
                 own["sensor"] = row[sensor]
+            if taken := extra.keys() & own.keys():
+                raise ValueError(
+                    f"{where}: control column {min(taken)!r} holds numbers and has the name of a column of the pack itself:"
+                    " give a copy of it under another name"
+                )
             # Column order is part of the pack's digest: ours first, then the manifest's that we do not interpret.
             carried = {k: v for k, v in carried.items() if k not in own}
             columns = {**own, **carried, **{k: v[i] for k, v in extra.items()}}
@@ -238,7 +251,8 @@ class Rows(Source):
             first = places[vision][i] if vision else None
             plain = tuple(b[numbers[i]] for b in backgrounds) if pressed else ()
             self._rows.append(Row(numbers[i], first, pressed, plain, columns))
-        self._items = bundles(self._rows)
+        row_bytes = 3 * config.size**2 * sum(bool(column) for column in (vision, *touch))
+        self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
         self._stamps = [
             one_stamp((*files[place.path], *place.within()) for i in item for place in self._rows[i].places())
             for item in self._items
@@ -248,10 +262,11 @@ class Rows(Source):
             vision_channels=3 if vision else 0,
             touch_channels=3 * len(touch),
             tasks=tuple(tasks),
-            group_by=group or "row",
+            group_by=group_by,
             controls=names,
             licence=config.licence,
             source=config.source_url or "not given",
+            notes=("no column says the groups, so frames of one video are one group",) if group_by == "video" else (),
         )
 
     def spec(self) -> DataSpec:
@@ -328,8 +343,8 @@ class Rows(Source):
         return difference(touch[1], fit(empty, self._size))
 
 
-def bundles(rows: Sequence[Row]) -> list[list[int]]:
-    """Row indices by item: rows whose images lie in the same containers, at most ``MAX_TOGETHER``; others alone."""
+def bundles(rows: Sequence[Row], most: int) -> list[list[int]]:
+    """Row indices by item: rows whose images lie in the same containers, at most ``most``; others alone."""
     items: list[list[int]] = []
     open_items: dict[Any, list[int]] = {}
     for i, row in enumerate(rows):
@@ -338,7 +353,7 @@ def bundles(rows: Sequence[Row]) -> list[list[int]]:
             items.append([i])
             continue
         item = open_items.get(key)
-        if item is None or len(item) == MAX_TOGETHER:
+        if item is None or len(item) == most:
             item = open_items[key] = []
             items.append(item)
         item.append(i)

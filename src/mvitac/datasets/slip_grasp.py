@@ -78,9 +78,10 @@ def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
             raise ValueError(f"{file} line {number}: no images in object{name}/{folder}_mm: clone it whole")
         grasp = f"{name}_{folder}"
         widths[grasp] = float(width)
-        for seq, (frame, images) in enumerate(sorted(pairs.items())):
+        for frame, images in sorted(pairs.items()):
             known = {"object": name, "grasp": grasp, "width_mm": width, "success": success}
-            counted = {"frame_rel_key": str(frame - int(key)), "seq": str(seq), "frame": str(frame)}
+            away = frame - int(key)  # recordings begin five frames before the key frame, even if those were lost
+            counted = {"frame_rel_key": str(away), "seq": str(away + 5), "frame": str(frame)}
             rows.append({"vision": "", "touch": "", **images, **known, **counted})
     for row in rows:  # the outcome was driven by a sweep of the width: a control must know where in it a grasp lies
         row["width_in_sweep"] = f"{widths[row['grasp']] - sum(widths.values()) / len(widths):.3f}"

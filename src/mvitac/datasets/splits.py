@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from mvitac.datasets.places import Frame, Place
 from mvitac.pack import SPLITS
 from mvitac.registry import unknown
 from mvitac.spec import Task
@@ -45,12 +48,39 @@ def deal(
     return [dealt.get(group, "unlabelled") for group in groups]
 
 
+def by_video(root: Path, numbers: Sequence[int], places: Iterable[Sequence[Place | None]]) -> tuple[str, list[str]]:
+    """What a group is where no column names it, and every row's: frames of one video are one group, and so are videos that
+    a row shows side by side; a row of single images is alone. ``places`` has a list per image column."""
+    columns = list(places)
+    videos = [
+        [os.path.relpath(place.path, root) for column in columns if isinstance(place := column[i], Frame)]
+        for i in range(len(numbers))
+    ]
+    beside: dict[str, str] = {}
+
+    def first(video: str) -> str:
+        while (other := beside.setdefault(video, video)) != video:
+            video = other
+        return video
+
+    for shown in videos:
+        for video in shown[1:]:
+            beside[first(video)] = first(shown[0])
+    groups = [first(shown[0]) if shown else f"{number:06d}" for number, shown in zip(numbers, videos, strict=True)]
+    return "video" if any(videos) else "row", groups
+
+
+def meant(name: str) -> str | None:
+    """The split that is usually meant by ``name``, if any."""
+    near = {"validation": "val", "valid": "val", "dev": "val", "eval": "val", "training": "train"}
+    near |= {"testing": "test", "unseen": "test", "unlabeled": "unlabelled", **{split: split for split in SPLITS}}
+    return near.get(name.lower())
+
+
 def check_split_names(where: str, column: str, numbers: Sequence[int], splits: Sequence[str]) -> None:
     for number, split in zip(numbers, splits, strict=True):
         if split not in SPLITS:
-            near = {"validation": "val", "valid": "val", "dev": "val", "eval": "val", "training": "train"}
-            near |= {"testing": "test", "unseen": "test", "unlabeled": "unlabelled"}
-            wanted = near.get(split.lower()) or (split.lower() if split.lower() in SPLITS else None)
+            wanted = meant(split)
             hint = f"; write {wanted!r} instead" if wanted else f"; or split={BY_GROUP} ignores the column"
             raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}{hint}")
 

@@ -7,13 +7,14 @@ from pathlib import Path
 import av
 import av.error
 import numpy as np
+from av.packet import Packet
 
 
 def num_frames(path: Path) -> int:
-    """How many frames ``path`` holds, counted without decoding them; ValueError if it is no video or has none."""
+    """How many frames of ``path`` are shown, counted without decoding them; ValueError if it is no video or has none."""
     try:
         with av.open(str(path)) as container:
-            num = sum(packet.size > 0 for packet in container.demux(video=0))
+            num = sum(map(_is_shown, container.demux(video=0)))
     except (av.error.FFmpegError, IndexError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a video ({error}): fetch it again") from None
     if not num:
@@ -28,14 +29,19 @@ def spread(num: int, length: int, start: float = 0.0, end: float = 1.0) -> list[
 
 
 def timestamps(path: Path) -> np.ndarray:
-    """Presentation times in seconds [N] of the frames of ``path``, in the order they are decoded; nothing is decoded."""
+    """Ascending presentation times in seconds [N] of the frames that ``path`` shows; nothing is decoded."""
     try:
         with av.open(str(path)) as container:
             base = float(container.streams.video[0].time_base or 0)
-            times = [packet.pts for packet in container.demux(video=0) if packet.size > 0 and packet.pts is not None]
+            times = [packet.pts for packet in container.demux(video=0) if _is_shown(packet) and packet.pts is not None]
     except (av.error.FFmpegError, IndexError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a video ({error}): fetch it again") from None
     return np.sort(np.array(times, float)) * base
+
+
+def _is_shown(packet: Packet) -> bool:
+    """Not what an edit list cuts off (a trim without re-encoding): neither a player nor ``mvitac.video`` counts that."""
+    return packet.size > 0 and not packet.is_discard
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
