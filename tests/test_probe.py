@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +16,13 @@ from toy import toy_pack
 from mvitac import features as features_module
 from mvitac.datasets.packed import PackConfig
 from mvitac.heads import fit_paper, train_heads
-from mvitac.model import fresh
+from mvitac.model import fresh, load
 from mvitac.pack import Pack
 from mvitac.probe import cross_modal, parts, probe_all, probe_features
 from mvitac.recipes import recipe
+from mvitac.report import _as_scored, open_runs
 from mvitac.scores import interval, summarise
-from mvitac.session import Session, probe_runs
+from mvitac.session import END_TO_END, Session, _places, probe_runs
 from mvitac.tables import markdown
 from mvitac.train import train
 
@@ -220,6 +222,35 @@ def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) 
     path = train(run, tmp_path / "r", quiet=True)
     with pytest.raises(ValueError, match="trained on different data"):
         probe_runs([runs[0], path], Session())
+
+
+def test_runs_of_other_settings_are_no_seeds_of_one_another(runs: list[Path], tmp_path: Path) -> None:
+    """Two temperatures are two lines, each by its folder; what the two seeds share is one."""
+    run = load(runs[0]).run
+    colder = train(replace(run, method=replace(run.method, temperature=0.5)), tmp_path / "colder", quiet=True)
+    session = Session(probes=("knn",), tasks=("pattern",), modalities=("touch",), controls=False)
+    found = probe_runs([*runs, colder], session)["summary"]["pattern"]["touch"]
+    seeds, other = f"mvitac ({runs[0].parent.name})", "mvitac (colder)"
+    assert {source: cell["seeds"] for source, cell in found.items()} == {seeds: [0, 1], other: [0]}
+    assert [r.source for r in open_runs([colder, *runs])] == [other, seeds, seeds]
+    again = shutil.copytree(runs[0], tmp_path / "again")
+    with pytest.raises(ValueError, match="the same run"):
+        probe_runs([*runs, again], session)
+
+
+def test_runs_are_told_apart_by_the_end_of_their_path() -> None:
+    a, b, c = (Path(f"/runs/{name}") for name in "abc")
+    assert _places([[a / "seed0"], [b / "seed0"]]) == ["a/seed0", "b/seed0"]
+    assert _places([[a / "seed0", a / "seed1"], [b / "seed0", b / "seed1"]]) == ["a", "b"]
+    assert _places([[a, b], [c]]) == ["runs", "c"]
+    assert _places([[a, b], [c, Path("/runs/d")]]) == ["a, b", "c, d"]
+
+
+def test_a_report_of_an_older_result_keeps_its_names(runs: list[Path], tmp_path: Path) -> None:
+    opened = open_runs(runs)
+    older = {"records": [{"run": str(run.path), "source": "older" + END_TO_END} for run in opened], "retrieval": []}
+    assert [run.source for run in _as_scored(opened, older)] == ["older", "older"]
+    assert _as_scored(opened, {"records": [], "retrieval": []}) == opened
 
 
 def test_heads_trained_together_are_the_heads_trained_alone() -> None:
