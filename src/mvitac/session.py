@@ -102,9 +102,8 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         records += mine
         retrieval += found
     if session.controls:
-        controls, found = controls_of(
-            [m.run for m in models], pack, tasks, modalities, session.probes, session.imagenet
-        )
+        runs, specs = [m.run for m in models], [m.spec for m in models]
+        controls, found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
         records += controls
         retrieval += found
     return {
