@@ -114,18 +114,19 @@ def _train(
 
             done = at + 1
             report = done % run.log_every == 0 or done == num_steps
-            if report:
-                values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
-                _check_finite(values, done, run)
-                if log:
-                    log.step(done, values, rate, run.batch_size)
             stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
+            saving = done == num_steps or done % every == 0 or stopping
+            if report or saving:
+                values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
+                _check_finite(values, _largest(method) if saving else 0.0, done, run)
+                if log and report:
+                    log.step(done, values, rate, run.batch_size)
             if log:
                 log.advance(done)
                 if done == num_steps or (run.eval_every and done % run.eval_every == 0):
                     log.evaluation(done, evaluate(Model(method, run, pack.spec, pack.size), pack, run))
                     method.train()
-            if done == num_steps or done % every == 0 or stopping:
+            if saving:
                 checkpoint.save(out / "checkpoint.pt", run, method, step.optimiser, done, world)
             if stopping and done < num_steps:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
@@ -135,13 +136,19 @@ def _train(
     return out
 
 
-def _check_finite(values: dict[str, float], step: int, run: Run) -> None:
-    if all(math.isfinite(value) for value in values.values()):
+def _largest(method: Method) -> float:
+    """The largest weight, NaN if any is: a step may leave such behind while its own loss was still finite."""
+    return float(torch.stack([weights.detach().abs().max() for weights in method.parameters()]).max())
+
+
+def _check_finite(losses: dict[str, float], largest: float, step: int, run: Run) -> None:
+    finite = all(math.isfinite(value) for value in losses.values())
+    if finite and math.isfinite(largest):
         return
-    parts = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+    parts = ", ".join(f"{name} {value:.4g}" for name, value in losses.items())
     raise Diverged(
-        f"the loss is not finite at step {step} ({parts}): lower --optim.lr (now {run.optim.lr:g}), add --optim.warmup 0.05,"
-        " or use --precision fp32; the last checkpoint is kept"
+        f"the {'largest weight' if finite else 'loss'} is not finite at step {step} ({parts}): lower --optim.lr (now"
+        f" {run.optim.lr:g}), add --optim.warmup 0.05, or use --precision fp32; the last checkpoint is kept"
     )
 
 
