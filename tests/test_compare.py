@@ -34,7 +34,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.folds import lay_out_folds
-from mvitac.jobs import do_all, seconds_of
+from mvitac.jobs import do, do_all, seconds_of
 from mvitac.locks import Busy, alone
 from mvitac.pack import Pack
 from mvitac.packing import build

@@ -114,13 +114,15 @@ def _train(
 
             done = at + 1
             report = done % run.log_every == 0 or done == num_steps
+            if report:
+                values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
+                _check_finite(values, done, run)
+                if log:
+                    log.step(done, values, rate, run.batch_size)
             stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
             saving = done == num_steps or done % every == 0 or stopping
-            if report or saving:
-                values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
-                _check_finite(values, _largest(method) if saving else 0.0, done, run)
-                if log and report:
-                    log.step(done, values, rate, run.batch_size)
+            if saving:
+                _check_weights(method, done, run)
             if log:
                 log.advance(done)
                 if done == num_steps or (run.eval_every and done % run.eval_every == 0):
@@ -136,19 +138,22 @@ def _train(
     return out
 
 
-def _largest(method: Method) -> float:
-    """The largest weight, NaN if any is: a step may leave such behind while its own loss was still finite."""
-    return float(torch.stack([weights.detach().abs().max() for weights in method.parameters()]).max())
+def _check_finite(values: dict[str, float], step: int, run: Run) -> None:
+    if not all(math.isfinite(value) for value in values.values()):
+        parts = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+        raise _diverged(f"the loss is not finite at step {step} ({parts})", run)
 
 
-def _check_finite(losses: dict[str, float], largest: float, step: int, run: Run) -> None:
-    finite = all(math.isfinite(value) for value in losses.values())
-    if finite and math.isfinite(largest):
-        return
-    parts = ", ".join(f"{name} {value:.4g}" for name, value in losses.items())
-    raise Diverged(
-        f"the {'largest weight' if finite else 'loss'} is not finite at step {step} ({parts}): lower --optim.lr (now"
-        f" {run.optim.lr:g}), add --optim.warmup 0.05, or use --precision fp32; the last checkpoint is kept"
+def _check_weights(method: Method, step: int, run: Run) -> None:
+    """Before they are kept: a step may leave weights that are no numbers while its own loss still was one."""
+    if not torch.stack([weights.isfinite().all() for weights in method.parameters()]).all():
+        raise _diverged(f"weights are not finite after step {step}", run)
+
+
+def _diverged(what: str, run: Run) -> Diverged:
+    return Diverged(
+        f"{what}: lower --optim.lr (now {run.optim.lr:g}), add --optim.warmup 0.05, or use --precision fp32; the last"
+        " checkpoint is kept"
     )
 
 
