@@ -14,10 +14,13 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 from PIL import Image
@@ -27,14 +30,15 @@ from toy import Toy, toy_pack
 from mvitac import compare, jobs
 from mvitac.cli import main
 from mvitac.compare import cost, gather, lay_out, leaks, pairs_of
+from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.folds import lay_out_folds
-from mvitac.jobs import do_all, seconds_of
+from mvitac.jobs import do, do_all, seconds_of
 from mvitac.locks import Busy, alone
 from mvitac.pack import Pack
 from mvitac.packing import build
-from mvitac.paper_tables import lines_of, markdown, write_tables
+from mvitac.paper_tables import comma, latex, lines_of, markdown, write_tables
 from mvitac.plans import ABLATION, PLANS, TABLE1, TABLE2, Plan, Row, changed, find_plan, setting, slug
 from mvitac.recipes import RECIPES, recipe
 from mvitac.record import write_json
@@ -194,6 +198,7 @@ def test_a_plan_from_a_file(tmp_path: Path) -> None:
         ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "a"', "is there twice"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "differ only in signs"),
+        ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
         ('reference = "a"\nseeds = 0\n[[rows]]\nlabel = "a"', "seeds 0"),
     ],
 )
@@ -437,7 +442,7 @@ def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> 
 
 
 def test_leaking_splits_are_flagged(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert leaks(pack) == ""
+    assert leaks(pack, pack.spec.tasks) == ""
     real = Pack.column
 
     def column(self: Pack, name: str) -> np.ndarray:
@@ -448,7 +453,83 @@ def test_leaking_splits_are_flagged(pack: Pack, monkeypatch: pytest.MonkeyPatch)
         return values
 
     monkeypatch.setattr(Pack, "column", column)
-    assert "test instances are also in train" in leaks(pack)
+    assert "test instances are also in train" in leaks(pack, pack.spec.tasks)
+
+
+def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
+    """Every fourth row is tested: its group's other row is learned from, and half of them were pre-trained on."""
+    pattern, bright = pack.spec.tasks
+    own = copy(pack)
+    sides = np.where(np.arange(pack.num) % 4 == 0, "test", "train")
+    own.table = pack.table.append_column("split_bright", pa.array(sides))
+    task = replace(bright, split="split_bright")
+    seen = np.isin(np.flatnonzero(sides == "test"), pack.rows("train")).sum()
+    said = leaks(own, [pattern, task])
+    assert said.startswith("30 of 30 test instances of bright are also in train: this split leaks; ")
+    assert said.endswith(f"; {seen} of 30 test rows of bright were pre-trained on") and 0 < seen < 30
+    assert leaks(own, [pattern]) == ""  # nothing that is scored
+
+
+def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack: Pack) -> None:
+    out, result = done
+    work = lay_out(small(pack), pack, out, Session())
+    noted = copy(pack)
+    noted.spec = replace(pack.spec, notes=("half of it\nis the same",))
+    result = gather(replace(work, pack=noted), out, Session())
+    lines = lines_of(result)
+    assert "\nNote: half of it is the same.\n" in markdown(result, lines)
+    assert latex(result, lines).splitlines()[1] == "% Note: half of it is the same."
+    older = {key: value for key, value in result.items() if key not in ("notes", "run_commits", "run_devices")}
+    assert "Note" not in markdown(older, lines) + latex(older, lines)
+
+
+def test_tables_name_the_code_of_runs_and_tables(done: tuple[Path, dict]) -> None:
+    out, result = done
+    commits = {json.loads(file.read_text())["commit"] for file in out.rglob("run.json")}
+    assert set(result["run_commits"]) == commits and len(result["run_devices"]) == 1
+    at = {"commit": "c" * 40 + "+", "device": "here", "run_devices": ["there", "elsewhere"]}
+    lines = lines_of(result)
+    text = markdown({**result, **at, "run_commits": ["a" * 40, "b" * 40]}, lines)
+    assert f"runs at commits {'a' * 12}, {'b' * 12}; tables at {'c' * 12}+, there, elsewhere." in text
+    assert f"code {'c' * 12}+, there" in markdown({**result, **at, "run_commits": [at["commit"]]}, lines)
+    assert f"code {'c' * 12}+, here." in markdown({**result, **at, "run_commits": [], "run_devices": []}, lines)
+
+
+def test_a_control_of_one_probe_is_one_line_of_the_csv(done: tuple[Path, dict]) -> None:
+    """Pixels, border and majority are scored linearly, whatever else trunks are probed by."""
+    _, result = done
+    plan = {**result["plan"], "probes": ["linear", "knn"]}
+    near = [{**r, "probe": "knn"} for r in result["records"] if r["source"] in ("MViTac", "colder", "untrained")]
+    rows = list(csv.DictReader(comma({**result, "plan": plan, "records": result["records"] + near}).splitlines()))
+    found = [(r["row"], r["probe"], r["modality"], r["task"]) for r in rows]
+    assert len(set(found)) == len(found)
+    probes = {name: {r["probe"] for r in rows if r["row"] == name} for name in {r["row"] for r in rows}}
+    assert probes["pixels"] == probes["majority"] == probes["noise only"] == {"linear"}
+    assert probes["MViTac"] == {"linear", "knn"} and probes["supervised, touch, end to end"] == {"own"}
+
+
+def test_peak_memory_is_of_training_on_its_own_gpu(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scoring a finished run once more leaves what its training took."""
+    common = {"seeds": 1, "tasks": ("pattern",), "set": {"steps": 1, "eval_every": 0}}
+    session = Session(tasks=("pattern",), modalities=("touch",), controls=False)
+    work = lay_out(small(pack, rows=ROWS[:1], **common), pack, tmp_path, session)
+    (job,) = work.jobs
+    peak, asked = [777], []
+    cuda = SimpleNamespace(
+        reset_peak_memory_stats=asked.append, max_memory_allocated=lambda device: asked.append(device) or peak[0]
+    )
+    monkeypatch.setattr(jobs, "torch", SimpleNamespace(cuda=cuda))
+    monkeypatch.setattr(jobs, "pick_device", lambda name: torch.device("cuda:1"))
+    for peak[0] in (777, 0):
+        (job.out / "scores.json").unlink(missing_ok=True)
+        do(job, pack)
+        assert json.loads((job.out / "memory.json").read_text()) == {"peak_bytes": 777}
+    assert asked == [torch.device("cuda:1")] * 2
+
+
+def test_a_row_is_not_named_as_a_control_of_the_data(pack: Pack, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="row 'noise only' has the name of a control of this data"):
+        lay_out(small(pack, rows=(*ROWS, Row(label="noise only"))), pack, tmp_path, Session())
 
 
 # -- significance -----------------------------------------------------------------------------------------------------
@@ -552,7 +633,7 @@ def write_plan(path: Path, num_rows: int, seeds: int, steps: int) -> Path:
 
 def table(out: Path) -> tuple[str, str]:
     """The whole CSV, and the Markdown without the times it took and the commit, which may be made meanwhile."""
-    text = re.sub(r"code \w+", "code", (out / "table.md").read_text())
+    text = re.sub(r"; (code|runs at) .*", "", (out / "table.md").read_text())
     return (out / "table.csv").read_text(), text[: text.index("| cost of one run")]
 
 
@@ -713,6 +794,23 @@ def test_folds_that_cannot_be(
 ) -> None:
     assert main(["compare", "--plan", str(two_folds), "--folds", *folds, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_folds_test_a_group_once_in_a_tasks_own_split(
+    two_folds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = find_plan(str(two_folds))
+    real = type(plan.data).open
+
+    def with_own_split(self: DatasetConfig, *, quiet: bool = False) -> Pack:
+        pack = real(self, quiet=quiet)
+        pack.table = pack.table.append_column("mine", pa.array(["train", "test"] * 20))
+        pack.spec = replace(pack.spec, tasks=(replace(pack.spec.tasks[0], split="mine"),))
+        return pack
+
+    monkeypatch.setattr(type(plan.data), "open", with_own_split)
+    with pytest.raises(ValueError, match=r"both test object '1' \(column mine\): each group must be tested once"):
+        lay_out_folds(plan, tmp_path / "out", Session())
 
 
 def test_a_row_that_one_fold_does_not_allow_runs_on_none(two_folds: Path, tmp_path: Path) -> None:

@@ -9,12 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from toy import Toy, toy_pack
 
-from mvitac.controls import borders, start_weights, thumbnails
+from mvitac.controls import borders, controls_of, start_weights, starts_of, thumbnails
 from mvitac.encoders import SCRATCH, EncoderConfig
 from mvitac.heads import fit_knn, spread_out
 from mvitac.methods.moco import MoCoConfig
-from mvitac.recipes import recipe
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.recipes import recipe, with_method
+from mvitac.run import Run
+from mvitac.spec import DataSpec
 
 
 def pictures(*images: np.ndarray) -> Any:
@@ -63,3 +67,29 @@ def test_classes_never_seen_get_probability_zero() -> None:
 @pytest.mark.parametrize(("num_rows", "size"), [(30, 10), (12, 6), (1, 1)])
 def test_a_queue_is_never_more_than_half_the_rows(num_rows: int, size: int) -> None:
     assert MoCoConfig(queue=10).queue_size(num_rows) == size
+
+
+def modalities_of(runs: list[Run], spec: DataSpec) -> list[tuple[str, int]]:
+    return [(run.method.name, run.seed) for run, _ in starts_of(runs, [spec] * len(runs))]
+
+
+def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
+    """Whatever the order of the runs, the control is of one that has all the others have."""
+    base = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
+    spec, again = Toy().spec(), replace(base, seed=1)
+    touch, vision = (replace(base, method=SupervisedConfig(modalities=(m,))) for m in ("touch", "vision"))
+    apart = with_method(base, "simclr")  # both modalities, no space that they share
+    for runs in ([touch, apart, base], [base, apart, touch], [apart, touch, base]):
+        assert modalities_of(runs, spec) == [("mvitac", 0)]
+    assert modalities_of([base, again, touch], spec) == [("mvitac", 0), ("mvitac", 1)]
+    assert [run for run, _ in starts_of([touch, vision, touch], [spec] * 3)] == [touch, vision]
+
+
+def test_the_untrained_trunk_is_of_the_runs_own_data(tmp_path: Path) -> None:
+    """A classifier of ``bright`` and a method of pairs, probed on touch alone without that label."""
+    pack = toy_pack(tmp_path / "p", num=60, vision_channels=0)
+    base = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
+    runs = [replace(base, method=SupervisedConfig(tasks=("bright",))), with_method(replace(base, seed=1), "ssvtp")]
+    pack.spec, own = replace(pack.spec, tasks=pack.spec.tasks[:1]), Toy().spec()
+    records, retrieval = controls_of(runs, pack, pack.spec.tasks, ["touch"], ["knn"], specs=[own, own])
+    assert {r["seed"] for r in records if r["source"] == "untrained"} == {0, 1} and not retrieval

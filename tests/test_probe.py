@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
-from toy import toy_pack
+from toy import Toy, toy_pack
 
 from mvitac import features as features_module
 from mvitac.datasets.packed import PackConfig
 from mvitac.heads import fit_paper, train_heads
-from mvitac.model import fresh
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.model import fresh, load
 from mvitac.pack import Pack
-from mvitac.probe import cross_modal, parts, probe_all, probe_features
+from mvitac.packing import build
+from mvitac.probe import cross_modal, parts, probe_all, probe_features, probe_model
 from mvitac.recipes import recipe
+from mvitac.report import _as_scored, open_runs
+from mvitac.run import Optim
 from mvitac.scores import interval, summarise
-from mvitac.session import Session, probe_runs
+from mvitac.session import END_TO_END, Session, _places, probe_runs
+from mvitac.source import Sample
+from mvitac.spec import DataSpec
 from mvitac.tables import markdown
 from mvitac.train import train
 
@@ -143,15 +151,15 @@ def test_majority_is_the_share_of_trains_commonest_class(pack: Pack, result: dic
     assert result["summary"]["bright"]["none"]["majority"]["mean"] == pytest.approx(expected)
 
 
-def test_untrained_is_this_runs_trunk_before_training(runs: list[Path], pack: Pack) -> None:
-    from mvitac.model import fresh, load
-
-    run = load(runs[0]).run
-    a, b = fresh(run, pack.spec, 32), fresh(run, pack.spec, 32)
-    for x, y in zip(a.parameters(), b.parameters(), strict=True):
-        assert torch.equal(x, y)
-    trained = load(runs[0])
-    assert any(not torch.equal(x, y) for x, y in zip(a.parameters(), trained.parameters(), strict=True))
+def test_untrained_is_this_runs_trunk_before_training(pack: Pack, tmp_path: Path) -> None:
+    """What train() begins with: one step of next to no length leaves it where it was."""
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, eval_every=0, log_every=1)
+    still = replace(run, optim=Optim(name="sgd", lr=1e-30, warmup=0.0, weight_decay=0.0))
+    start, seed1 = fresh(run, pack.spec, 32), fresh(replace(run, seed=1), pack.spec, 32)
+    begun = dict(load(train(still, tmp_path / "still", quiet=True)).named_parameters())
+    for name, value in start.named_parameters():
+        torch.testing.assert_close(value, begun[name], rtol=0, atol=1e-20)
+    assert any(not torch.allclose(value, begun[name]) for name, value in seed1.named_parameters())
 
 
 def test_interval_of_one_seed_is_the_group_bootstrap() -> None:
@@ -186,7 +194,10 @@ def test_one_group_says_nothing_about_others() -> None:
 def test_summary_shows_a_controls_only_probe(result: dict) -> None:
     knn = summarise(result["records"], "knn")
     assert "majority" in knn["pattern"]["none"] and "pixels" in knn["pattern"]["touch"]
-    assert knn["pattern"]["touch"]["mvitac"]["mean"] != pytest.approx(-1)
+    assert knn["pattern"]["touch"]["pixels"] == result["summary"]["pattern"]["touch"]["pixels"]  # its linear one
+    wanted = {"source": "mvitac", "task": "pattern", "modality": "touch", "probe": "knn"}
+    scores = [r["accuracy"] for r in result["records"] if wanted.items() <= r.items()]
+    assert len(scores) == 2 and knn["pattern"]["touch"]["mvitac"]["mean"] == pytest.approx(np.mean(scores))
 
 
 def test_features_are_computed_once(runs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,10 +211,14 @@ def test_features_are_computed_once(runs: list[Path], monkeypatch: pytest.Monkey
     assert probe_runs(runs[:1], session)["records"] == first["records"]
 
 
-def test_retrieval_of_the_untrained_is_chance(result: dict) -> None:
-    for record in result["retrieval"]:
-        assert record["chance R@5"] == pytest.approx(5 / record["num_groups"])
-        assert 0 <= record["R@1"] <= record["R@5"] <= record["R@10"] <= 1
+def test_retrieval_of_the_untrained_is_chance(pack: Pack) -> None:
+    run = recipe("smoke", PackConfig(path=pack.path))
+    found = [r for seed in (0, 1, 2) for r in cross_modal(fresh(replace(run, seed=seed), pack.spec, 32), pack)]
+    assert len(found) == 6 and {r["num_groups"] for r in found} == {12}
+    for k in (1, 5, 10):
+        mean = np.mean([r[f"R@{k}"] for r in found])
+        assert mean == pytest.approx(k / 12, abs=0.07)
+    assert {r["chance R@5"] for r in found} == {5 / 12}
 
 
 def test_retrieval_needs_enough_groups_to_choose_from(result: dict, tmp_path: Path) -> None:
@@ -212,6 +227,59 @@ def test_retrieval_needs_enough_groups_to_choose_from(result: dict, tmp_path: Pa
     run = recipe("smoke", PackConfig(path=few.path))
     assert len(set(few.column("group")[few.rows("test")])) < 10
     assert cross_modal(fresh(run, few.spec, few.size), few) == []
+    ten = toy_pack(tmp_path / "ten")
+    test, groups = ten.rows("test"), ten.column("group").astype(str)
+    names = np.unique(groups[test])
+    groups[np.isin(groups, names[10:])] = names[0]
+    ten.table = ten.table.set_column(ten.table.schema.get_field_index("group"), "group", pa.array(groups))
+    assert len(set(groups[test])) == 10  # the best five of ten are half of them
+    assert cross_modal(fresh(run, ten.spec, ten.size), ten) == []
+
+
+def test_a_model_of_both_senses_is_probed_on_one(tmp_path: Path) -> None:
+    """Twelve test groups, enough for retrieval, but nothing to find them in."""
+    touch = toy_pack(tmp_path / "touch", vision_channels=0)
+    both = Toy().spec()
+    model = fresh(recipe("smoke", PackConfig(path=touch.path)), both, touch.size)
+    assert cross_modal(model, touch) == []
+    found = probe_model(model, touch, touch.spec.tasks[:1], ["touch"], ["knn"])
+    assert [r["modality"] for r in found] == ["touch"]
+
+
+@dataclasses.dataclass
+class Renumbered(Toy):
+    """The toy, its patterns listed in another order, as ``classes``; others have no label."""
+
+    classes: tuple[str, ...] = ("checks", "columns", "rows")
+
+    def spec(self) -> DataSpec:
+        spec = super().spec()
+        return replace(spec, tasks=(replace(spec.tasks[0], classes=self.classes),))
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        name = Toy().spec().tasks[0].classes[sample.columns["label_pattern"]]
+        label = self.classes.index(name) if name in self.classes else -1
+        return [replace(sample, columns={**sample.columns, "label_pattern": label})]
+
+
+def test_a_runs_own_classifier_answers_by_the_names_of_classes(tmp_path: Path) -> None:
+    plain = toy_pack(tmp_path / "plain", num=60)
+    run = replace(recipe("smoke", PackConfig(path=plain.path)), method=SupervisedConfig())
+    model = fresh(run, plain.spec, plain.size)
+
+    def own(pack: Pack) -> list[dict]:
+        found = probe_model(model, pack, pack.spec.tasks[:1], ["both"], ["knn"])
+        return [r for r in found if r["probe"] == "own"]
+
+    turned = build(Renumbered(num=60), tmp_path / "turned", size=32, quiet=True)
+    assert own(turned)[0]["group_correct"] == own(plain)[0]["group_correct"]
+    fewer = build(Renumbered(num=60, classes=("rows", "columns")), tmp_path / "fewer", size=32, quiet=True)
+    assert np.sum(own(fewer)[0]["confusion"]) == own(fewer)[0]["num_test"]  # asked among these two
+    more = build(
+        Renumbered(num=60, classes=("waves", *plain.spec.tasks[0].classes)), tmp_path / "m", size=32, quiet=True
+    )
+    assert own(more) == []  # it was never told of waves
 
 
 def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) -> None:
@@ -220,6 +288,35 @@ def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) 
     path = train(run, tmp_path / "r", quiet=True)
     with pytest.raises(ValueError, match="trained on different data"):
         probe_runs([runs[0], path], Session())
+
+
+def test_runs_of_other_settings_are_no_seeds_of_one_another(runs: list[Path], tmp_path: Path) -> None:
+    """Two temperatures are two lines, each by its folder; what the two seeds share is one."""
+    run = load(runs[0]).run
+    colder = train(replace(run, method=replace(run.method, temperature=0.5)), tmp_path / "colder", quiet=True)
+    session = Session(probes=("knn",), tasks=("pattern",), modalities=("touch",), controls=False)
+    found = probe_runs([*runs, colder], session)["summary"]["pattern"]["touch"]
+    seeds, other = f"mvitac ({runs[0].parent.name})", "mvitac (colder)"
+    assert {source: cell["seeds"] for source, cell in found.items()} == {seeds: [0, 1], other: [0]}
+    assert [r.source for r in open_runs([colder, *runs])] == [other, seeds, seeds]
+    again = shutil.copytree(runs[0], tmp_path / "again")
+    with pytest.raises(ValueError, match="the same run"):
+        probe_runs([*runs, again], session)
+
+
+def test_runs_are_told_apart_by_the_end_of_their_path() -> None:
+    a, b, c = (Path(f"/runs/{name}") for name in "abc")
+    assert _places([[a / "seed0"], [b / "seed0"]]) == ["a/seed0", "b/seed0"]
+    assert _places([[a / "seed0", a / "seed1"], [b / "seed0", b / "seed1"]]) == ["a", "b"]
+    assert _places([[a, b], [c]]) == ["runs", "c"]
+    assert _places([[a, b], [c, Path("/runs/d")]]) == ["a, b", "c, d"]
+
+
+def test_a_report_of_an_older_result_keeps_its_names(runs: list[Path], tmp_path: Path) -> None:
+    opened = open_runs(runs)
+    older = {"records": [{"run": str(run.path), "source": "older" + END_TO_END} for run in opened], "retrieval": []}
+    assert [run.source for run in _as_scored(opened, older)] == ["older", "older"]
+    assert _as_scored(opened, {"records": [], "retrieval": []}) == opened
 
 
 def test_heads_trained_together_are_the_heads_trained_alone() -> None:

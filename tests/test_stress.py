@@ -120,6 +120,10 @@ def test_a_leak_gives_half_of_each_test_group_away_and_nothing_else(pack: Pack) 
     given = set(leaking.train) - set(rows.train)
     assert given == set(rows.test) - set(leaking.test) and len(leaking.train) == len(rows.train)
     assert {str(name) for name in groups[sorted(given)]} == {str(name) for name in groups[leaking.test]}
+    few = Parts(rows.train[:8], rows.val, rows.test)
+    honest, leaking = (module._halved(few, groups, leaks, seed=1)[1] for leaks in (False, True))
+    assert len(leaking.train) == len(honest.train) == 8  # half of test is more than there is to replace
+    assert not set(leaking.train) & {*rows.train, *leaking.test}
     lonely = np.array([f"{i}" for i in range(len(groups))])
     assert not len(module._halved(rows, lonely, True, seed=1)[1].test)  # no group can leak: nothing to score
 

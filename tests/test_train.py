@@ -155,6 +155,15 @@ def test_not_a_number_stops_with_step_parts_and_advice(pack: Pack, tmp_path: Pat
     assert not (tmp_path / "r" / "model.safetensors").exists()
 
 
+def test_no_checkpoint_is_kept_of_weights_that_are_no_numbers(pack: Pack, tmp_path: Path) -> None:
+    """Checked before each is written, not only where losses are reported."""
+    run = smoke(pack, optim=Optim(name="sgd", lr=1e30), log_every=8, checkpoint_every=1)
+    with pytest.raises(Diverged, match=r"the last checkpoint is kept"):
+        train(run, tmp_path / "r", quiet=True)
+    kept = torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)
+    assert 1 <= kept["step"] < 8 and all(torch.isfinite(value).all() for value in kept["method"].values())
+
+
 def test_seed_decides(pack: Pack, straight: Path, tmp_path: Path) -> None:
     train(smoke(pack), tmp_path / "same", quiet=True)
     assert_equal_weights(straight, tmp_path / "same")

@@ -30,6 +30,7 @@ from mvitac.record import digest, provenance, read_json, write_json
 from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.session import Session, chosen
+from mvitac.spec import Task
 from mvitac.train import check_same
 
 
@@ -47,6 +48,8 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: Session, device: str = "
     left_out: dict[str, str] = {}
     seen: dict[str, str] = {}
     for row in plan.rows:
+        if row.label in pack.spec.controls:
+            raise ValueError(f"row {row.label!r} has the name of a control of this data: give it another label")
         if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
             left_out[row.label] = f"dataset {plan.data.name!r} has no {', '.join(missing)}"
             continue
@@ -110,13 +113,15 @@ def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
             records.append({**record, "source": job.label + record["source"].removeprefix(method)})
         retrieval += [{**found, "source": job.label} for found in scores["retrieval"]]
     controls, found = _controls(work, out, session)
+    made = [read_json(job.out / "run.json", "a run's record") for job in finished]
     rows = {row.label: row for row in work.plan.rows}
     return {
         "plan": to_json(work.plan),
         "data": work.pack.spec.name,
         "pack": work.pack.digest,
         "group_by": work.pack.spec.group_by,
-        "leaks": leaks(work.pack),
+        "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
+        "leaks": leaks(work.pack, chosen(work.pack, session)[0]),
         "records": records + controls,
         "retrieval": retrieval + found,
         "rows": [label for label in rows if label not in work.left_out],
@@ -125,6 +130,8 @@ def gather(work: Work, out: Path, session: Session) -> dict[str, Any]:
         "unfinished": [job.name for job in work.jobs if not job.done],
         "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
         "device": describe(pick_device(work.jobs[0].run.device)),
+        "run_commits": list(dict.fromkeys(record.get("commit") for record in made)),
+        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for record in made)),
         **provenance(),
     }
 
@@ -148,14 +155,20 @@ def _controls(work: Work, out: Path, session: Session) -> tuple[list[dict[str, A
     return records, retrieval
 
 
-def leaks(pack: Pack) -> str:
-    """A sentence if groups (instances, objects, recordings) lie in train and in test, else ""."""
-    groups = pack.column("group").astype(str)
-    train_groups, test_groups = (set(groups[pack.rows(split)]) for split in ("train", "test"))
-    shared = len(train_groups & test_groups)
-    if not shared:
-        return ""
-    return f"{shared} of {len(test_groups)} test {pack.spec.group_by}s are also in train: this split leaks"
+def leaks(pack: Pack, tasks: Sequence[Task]) -> str:
+    """A sentence for each split of ``tasks`` of which groups (instances, objects, recordings) lie in train and in test, and
+    for each of their own whose test rows were pre-trained on; "" if there is none."""
+    groups, said = pack.column("group").astype(str), []
+    for column in dict.fromkeys(("split", *(task.split for task in tasks))):
+        train, test = (pack.rows(split, by=column) for split in ("train", "test"))
+        own = "" if column == "split" else f" of {' and '.join(t.name for t in tasks if t.split == column)}"
+        shared, num = len(set(groups[train]) & set(groups[test])), len(set(groups[test]))
+        if shared:
+            said.append(f"{shared} of {num} test {pack.spec.group_by}s{own} are also in train: this split leaks")
+        seen = len(np.intersect1d(test, pack.rows("train", "unlabelled")))
+        if seen and column != "split":
+            said.append(f"{seen} of {len(test)} test rows{own} were pre-trained on")
+    return "; ".join(said)
 
 
 def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:

@@ -19,8 +19,11 @@ from mvitac.model import fresh
 from mvitac.pack import Pack
 from mvitac.probe import cross_modal, parts, probe_all, probe_features, probe_model, score_rows
 from mvitac.run import Run
-from mvitac.spec import Task
+from mvitac.spec import DataSpec, Task
 from mvitac.workers import in_threads
+
+CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority")
+"""Their names, from the strongest idea to the weakest; the data's own come before the last."""
 
 
 def thumbnails(pack: Pack, modality: str, rows: np.ndarray, side: int = 8) -> np.ndarray:
@@ -44,10 +47,12 @@ def controls_of(
     modalities: Sequence[str],
     probes: Sequence[str],
     imagenet: Path | None = None,
+    specs: Sequence[DataSpec] = (),
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Records of every control beside ``runs``, and the retrieval of those that have a shared space.
 
     Trunks are probed by each of ``probes``, the rest linearly; ``imagenet`` is a file of weights for one more trunk.
+    ``specs`` are what the runs were trained on, where that is not ``pack``.
     """
     records: list[dict[str, Any]] = []
     retrieval: list[dict[str, Any]] = []
@@ -78,21 +83,44 @@ def controls_of(
         add("border", None, ring)
 
     # The trunk before training, once for each seed and architecture among the runs; then the trunk they started from.
-    starts = {(run.seed, run.encoder.trunk, run.augment.seen): run for run in runs}
-    untrained = [  # weights are drawn here, one model after another: threads share torch's generator
-        fresh(replace(run, encoder=replace(run.encoder, weights=SCRATCH)), pack.spec, pack.size)
-        for run in starts.values()
-    ]
+    starts = starts_of(runs, specs or [pack.spec] * len(runs))
+    untrained = [fresh(_scratch(run), spec, pack.size) for run, spec in starts]  # one by one: threads share a generator
     scored = in_threads(
         lambda model: (probe_model(model, pack, tasks, modalities, probes), cross_modal(model, pack)), untrained
     )
-    for run, (found, ranked) in zip(starts.values(), scored, strict=True):
+    for (run, _), (found, ranked) in zip(starts, scored, strict=True):
         add("untrained", run.seed, found)
         retrieval += [{"source": "untrained", "seed": run.seed, **r} for r in ranked]
     for name in start_weights(runs, imagenet):
-        start = fresh(replace(runs[0], encoder=replace(runs[0].encoder, weights=name)), pack.spec, pack.size)
+        run, spec = starts[0]
+        start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
         add("imagenet", None, probe_model(start, pack, tasks, modalities, probes))
     return records, retrieval
+
+
+def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run, DataSpec]]:
+    """The runs whose trunks before training are the controls, with what each was trained on: one of each seed, trunk and
+    side, the first that has all modalities and heads into a shared space; further ones for modalities that it lacks."""
+
+    def parts_of(run: Run, spec: DataSpec) -> tuple[set[str], int]:
+        with torch.device("meta"):
+            method = run.method.build(spec, _scratch(run).encoder)
+        return set(method.encoders()), len(method.projectors())
+
+    built = [(run, spec, *parts_of(run, spec)) for run, spec in zip(runs, specs, strict=True)]
+    built.sort(key=lambda each: (len(each[2]), each[3]), reverse=True)
+    found: list[tuple[Run, DataSpec]] = []
+    covered: dict[tuple[int, str, int], set[str]] = {}
+    for run, spec, modalities, _ in built:
+        known = covered.setdefault((run.seed, run.encoder.trunk, run.augment.seen), set())
+        if not modalities <= known:
+            known |= modalities
+            found.append((run, spec))
+    return found
+
+
+def _scratch(run: Run) -> Run:
+    return replace(run, encoder=replace(run.encoder, weights=SCRATCH))
 
 
 def start_weights(runs: Sequence[Run], imagenet: Path | None) -> list[str]:

@@ -16,10 +16,11 @@ import numpy as np
 from mvitac.compare import gather, lay_out
 from mvitac.jobs import Work
 from mvitac.plans import Plan
+from mvitac.probe import MIN_GALLERY
 from mvitac.record import digest
 from mvitac.registry import to_json
 from mvitac.scores import pool
-from mvitac.session import Session
+from mvitac.session import Session, chosen
 
 
 def lay_out_folds(plan: Plan, out: Path, session: Session, device: str = "auto") -> list[Work]:
@@ -28,17 +29,20 @@ def lay_out_folds(plan: Plan, out: Path, session: Session, device: str = "auto")
     A row that one fold does not allow is left out of all: its other folds could not be pooled.
     """
     works: list[Work] = []
-    tested: dict[str, str] = {}
+    tested: dict[tuple[str, str], str] = {}
     for fold, part in plan.in_folds():
         assert part.data is not None
         pack = part.data.open()
-        for group in np.unique(pack.column("group").astype(str)[pack.rows("test")]).tolist() if fold else ():
-            if group in tested:
-                raise ValueError(
-                    f"folds {tested[group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}: each group must be"
-                    " tested once"
-                )
-            tested[group] = fold
+        groups = pack.column("group").astype(str)
+        for side in dict.fromkeys(("split", *(task.split for task in chosen(pack, session)[0]))) if fold else ():
+            own = "" if side == "split" else f" (column {side})"
+            for group in np.unique(groups[pack.rows("test", by=side)]).tolist():
+                if (side, group) in tested:
+                    raise ValueError(
+                        f"folds {tested[side, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}: each"
+                        " group must be tested once"
+                    )
+                tested[side, group] = fold
         work = lay_out(part, pack, out / fold, session, device)
         works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
     left_out = {label: reason for work in works for label, reason in work.left_out.items()}
@@ -61,8 +65,11 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: Session)
     results = [gather(work, out / fold, session) for work, (fold, _) in zip(works, plan.in_folds(), strict=True)]
     if len(results) == 1:
         return {**results[0], "plan": to_json(plan)}
-    # Retrieval among ten things or fewer says nothing: half of all answers or more are hits by chance.
-    retrieval = [r for result in results for r in result["retrieval"] if r["chance R@5"] < 0.5]
+    retrieval = [r for result in results for r in result["retrieval"] if r["num_groups"] >= MIN_GALLERY]
+
+    def all_of(key: str) -> list[Any]:
+        return list(dict.fromkeys(value for result in results for value in result[key]))
+
     return {
         **results[0],
         "plan": to_json(plan),
@@ -70,6 +77,7 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: Session)
         "records": pool([result["records"] for result in results]),
         "retrieval": retrieval,
         "failed": {name: error for result in results for name, error in result["failed"].items()},
+        **{key: all_of(key) for key in ("notes", "run_commits", "run_devices")},
         "unfinished": [name for result in results for name in result["unfinished"]],
         "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),
     }

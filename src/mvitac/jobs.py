@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import TaskID
 
 from mvitac.batches import training_rows
+from mvitac.device import pick_device
 from mvitac.locks import Busy, alone
 from mvitac.log import bars, last_line
 from mvitac.model import load
@@ -103,15 +104,17 @@ def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
 
 def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
     pack = pack or job.run.data.open(quiet=True)
-    if torch.cuda.is_available():
-        torch.cuda.reset_peak_memory_stats()
+    gpu = pick_device(job.run.device)
+    measured = gpu.type == "cuda" and not (job.out / "model.safetensors").exists()
+    if measured:
+        torch.cuda.reset_peak_memory_stats(gpu)
     try:
         train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
     except Diverged as error:
         write_json(job.out / "failed.json", {"error": str(error)})
         return f"diverged: {error}"
-    if torch.cuda.is_available():
-        write_json(job.out / "memory.json", {"peak_bytes": torch.cuda.max_memory_allocated()})
+    if measured:
+        write_json(job.out / "memory.json", {"peak_bytes": torch.cuda.max_memory_allocated(gpu)})
     result = probe_runs([job.out], job.session, pack)
     if job.stress:
         records = stress(load(job.out), pack, *chosen(pack, job.session))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mvitac.controls import CONTROLS
 from mvitac.plans import Plan
 from mvitac.record import write_atomic, write_json
 from mvitac.registry import from_json
@@ -20,8 +21,6 @@ from mvitac.scores import least_p, paired_difference, summarise
 from mvitac.session import END_TO_END
 from mvitac.stress import STRESSES
 from mvitac.tables import MODALITY_ORDER, PROBE_NAMES, retrieval_means
-
-CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority")
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,7 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
         f" {budget}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
-        f" code {(result['commit'] or 'unknown')[:12]}, {result['device']}.",
+        f" {_made(result)}.",
         f"95 % intervals and p: bootstrap over test {result['group_by']}s and seeds; p of the difference to {plan.reference}"
         f" on the same test rows, {least:.3f} the least it can say, not corrected for the number of rows. Controls are"
         " in italics.",
@@ -188,6 +187,7 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
             f'"printed" is the paper\'s number on {plan.printed_on}'
             + ("." if _papers(result, plan) else ", which is other data: compare orders, never values.")
         )
+    text += [f"Note: {note}." for note in result.get("notes", ())]
     if result["leaks"]:
         text.append(f"**LEAK: {result['leaks']}.**")
     text += [f"Diverged: {name} ({error})." for name, error in result["failed"].items()]
@@ -195,6 +195,18 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     if result["unfinished"]:
         text.append(f"**Not finished: {', '.join(result['unfinished'])}.**")
     return [line for part in text for line in (part, "")][:-1]
+
+
+def _made(result: dict[str, Any]) -> str:
+    """By which code, on what: the runs', and the tables' where that is another; older results know the tables' alone."""
+
+    def short(commit: str | None) -> str:
+        return f"{commit[:12]}{'+' * commit.endswith('+')}" if commit else "unknown"  # +: with changes
+
+    tables = short(result["commit"])
+    runs = list(dict.fromkeys(short(commit) for commit in result.get("run_commits", ()))) or [tables]
+    code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
+    return ", ".join([code, *(result.get("run_devices") or [result["device"]])])
 
 
 def _papers(result: dict[str, Any], plan: Plan) -> bool:
@@ -302,7 +314,10 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if plan.printed_on:
         note += f"; in brackets: printed in the paper on {plan.printed_on}"
-    return "\n".join([note, *text, r"\bottomrule", r"\end{tabular}"]) + "\n"
+    notes = [note, *(f"% Note: {said}." for said in result.get("notes", ()))]
+    if result["leaks"]:
+        notes.append(f"% LEAK: {result['leaks']}.")
+    return "\n".join([*notes, *text, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
 def _tex(text: str) -> str:
@@ -312,16 +327,24 @@ def _tex(text: str) -> str:
 
 
 def comma(result: dict[str, Any]) -> str:
-    """Every cell of every probe as one CSV line, in shares."""
+    """Every cell of every probe as one CSV line, in shares; what has one probe only, as majority has, once by that."""
     plan: Plan = from_json(Plan, result["plan"], "plan")
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     heads = ("row", "control", "probe", "modality", "task", "accuracy", "low", "high", "seeds", "printed")
     writer.writerow((*heads, "difference", "difference_low", "difference_high", "p"))
     tables = {**{probe: lines_of(result, probe) for probe in plan.probes}, **stresses_of(result)}
-    for probe, lines in tables.items():
+    scored: dict[str, dict[str, None]] = {}  # source -> the probes it was scored by
+    for record in result["records"]:
+        scored.setdefault(record["source"], {})[record["probe"]] = None
+    written: set[tuple[str, ...]] = set()
+    for table, lines in tables.items():
         for line in lines:
+            probe = table if table in scored[line.source] else next(iter(scored[line.source]))
             for task, cell in line.cells.items():
+                if (key := (line.source, probe, line.modality, task)) in written:
+                    continue
+                written.add(key)
                 values = (line.source, int(line.control), probe, line.modality, task, cell.mean, cell.low, cell.high)
                 writer.writerow((*values, cell.seeds, cell.printed, *(cell.difference or ("",) * 4)))
     return buffer.getvalue()

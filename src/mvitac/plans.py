@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from mvitac.controls import CONTROLS
 from mvitac.datasets.base import DatasetConfig
 from mvitac.probe import Probe
 from mvitac.recipes import recipe, with_method
@@ -82,6 +83,8 @@ class Plan:
             raise ValueError(f"seeds {self.seeds}: give 1 to 1000")
         labels = [row.label for row in self.rows]
         for label in labels:
+            if label in CONTROLS:
+                raise ValueError(f"row {label!r} has the name of a control: give it another label")
             if labels.count(label) > 1:
                 raise ValueError(f"row {label!r} is there twice: give each row its own label")
         if len({slug(label) for label in labels}) < len(labels):

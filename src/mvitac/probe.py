@@ -25,7 +25,7 @@ from mvitac.spec import Task
 PROBES = ("linear", "paper", "knn")
 """linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
 Probe = Literal["linear", "paper", "knn"]
-MIN_GALLERY = 10
+MIN_GALLERY = 11
 """Test groups below which retrieval is left out: the best five of so few are half of them or all."""
 
 
@@ -113,10 +113,15 @@ def probe_model(
 
     records = probe_all(matrix, pack, tasks, modalities, probes, model.run.seed)
     whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
-    for task in (task for task in tasks if task.name in model.tasks and whole in modalities):
+    learned = {task.name: task.classes for task in model.spec.tasks if task.name in model.tasks}
+    for task in (task for task in tasks if task.name in learned and whole in modalities):
+        if set(task.classes) - set(learned[task.name]):
+            continue  # it was not taught all that is asked here
         rows = parts(pack, task, whole).test
         z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
-        result = score_rows(pack, task, rows, model.classify(task.name, z).numpy())
+        # Columns by their names: this pack may list the classes in another order, or fewer of them.
+        columns = [learned[task.name].index(name) for name in task.classes]
+        result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
         records.append({"task": task.name, "modality": whole, "probe": "own", **result})
     return records
 
@@ -165,11 +170,13 @@ def _papers(
 def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
     """Retrieval over unseen groups in the shared space, both directions: R@1/5/10 with its chance and group hits at 5.
 
-    Empty without a shared space or with fewer than ``MIN_GALLERY`` test groups.
+    Empty without a shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` test groups.
     """
+    if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
+        return []
     only = pack.spec.tasks[0].only if pack.spec.tasks else None
     rows = pack.rows("test", only=only, having=pack.spec.modalities)
-    if len(model.projectors) < 2 or not len(rows):
+    if not len(rows):
         return []
     device = next(model.parameters()).device
     z = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from statistics import median
@@ -19,8 +20,7 @@ from mvitac.pack import Pack
 from mvitac.probe import cross_modal, parts
 from mvitac.record import write_atomic
 from mvitac.registry import to_json
-from mvitac.run import Run
-from mvitac.session import Session, probe_runs
+from mvitac.session import END_TO_END, Session, names_of, probe_runs
 
 
 def write_report(
@@ -52,6 +52,7 @@ def write_report(
             "the probe result is about other data than these runs: make it again with `mvitac probe --json`"
         )
     _check_scored(runs, result)
+    runs = _as_scored(runs, result)
     with console.status("drawing"):
         html = _page(Study(runs, pack, result, Path(out)))
     write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
@@ -69,12 +70,8 @@ def open_runs(paths: Sequence[Path]) -> list[Finished]:
             again = shlex.join(["mvitac", "pretrain", "--from", str(path / "run.json"), "--resume", "--out", str(path)])
             raise ValueError(f"the run in {path} is not finished: continue it with `{again}`")
     opened = [(path, *load_run(path), read_log(path / "log.jsonl"), load(path)) for path in paths]
-    several = len({run.recipe for _, run, _, _, _ in opened}) > 1
-
-    def source(run: Run) -> str:  # as probe_runs calls it
-        return f"{run.method.name} ({run.recipe})" if several else run.method.name
-
-    return [Finished(path, run, record, log, model, source(run)) for path, run, record, log, model in opened]
+    names = names_of([path for path, *_ in opened], [model for *_, model in opened])
+    return [Finished(*each, name) for each, name in zip(opened, names, strict=True)]
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
@@ -110,6 +107,13 @@ def _check_scored(runs: Sequence[Finished], result: dict[str, Any]) -> None:
     for run in runs:
         if scored and run.path.resolve() not in scored:
             raise ValueError(f"the probe result does not score {run.path}: make it again with `mvitac probe --json`")
+
+
+def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finished]:
+    """``runs`` by the names that ``result`` has for them: it may be older, or of more runs."""
+    records = [*result["retrieval"], *result["records"]]
+    names = {Path(r["run"]).resolve(): r["source"].removesuffix(END_TO_END) for r in records if "run" in r}
+    return [replace(run, source=names.get(run.path.resolve(), run.source)) for run in runs]
 
 
 # -- the page ---------------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
+from mvitac.locks import alone
 from mvitac.model import Images, Model, load
 from mvitac.pack import Pack
 from mvitac.record import check_place, digest, digest_file, read_json, write_json
@@ -97,11 +98,17 @@ def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> 
     """Index the whole pairs of ``pack`` (of ``splits``; none = all) into the new folder ``out``.
 
     In the space both modalities share if the model has one (touch finds vision and vision finds touch), else by features
-    (each finds only its own kind).
+    (each finds only its own kind). Busy if another process builds there.
     """
+    check_place(out)
+    busy = f"{out} is being written by another process: let it end, or choose another --out"
+    with alone(out, busy, wait=False):
+        return _build(model, pack, out, splits)
+
+
+def _build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...]) -> Index:
     if out.exists():
         raise ValueError(f"{out} already exists: choose another --out, or delete it first")
-    check_place(out)
     modalities = check_pack(model, pack)
     rows = pack.rows(*(splits or np.unique(pack.column("split"))), having=modalities)
     if not len(rows):

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from mvitac.controls import controls_of, start_weights
+from mvitac.datasets.packed import PackConfig
 from mvitac.encoders import build_trunk
-from mvitac.model import Model, load
+from mvitac.model import Model, load, load_run
 from mvitac.pack import Pack
 from mvitac.probe import PROBES, Probe, cross_modal, parts, probe_model
-from mvitac.record import check_place, write_json
-from mvitac.registry import unknown
+from mvitac.record import check_place, digest, write_json
+from mvitac.registry import to_json, unknown
 from mvitac.scores import summarise
 from mvitac.spec import Task
 from mvitac.workers import in_threads
@@ -60,6 +62,7 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         if [p.resolve() for p in paths].count(path.resolve()) > 1:
             raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
     models = [load(path) for path in paths]
+    names = names_of(paths, models)
     packs = [pack or model.run.data.open() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError(
@@ -83,10 +86,8 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
             build_trunk(replace(models[0].run.encoder, weights=weights), 3)
     records: list[dict[str, Any]] = []
     retrieval: list[dict[str, Any]] = []
-    several = len({m.run.recipe for m in models}) > 1
 
-    def one(path: Path, model: Model) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        source = f"{model.run.method.name} ({model.run.recipe})" if several else model.run.method.name
+    def one(path: Path, model: Model, source: str) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         own = {"source": source, "seed": model.run.seed, "run": str(path)}
         mine = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
         for record in mine:
@@ -97,13 +98,12 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         )
         return mine, found
 
-    for mine, found in in_threads(lambda pair: one(*pair), list(zip(paths, models, strict=True))):
+    for mine, found in in_threads(lambda each: one(*each), list(zip(paths, models, names, strict=True))):
         records += mine
         retrieval += found
     if session.controls:
-        controls, found = controls_of(
-            [m.run for m in models], pack, tasks, modalities, session.probes, session.imagenet
-        )
+        runs, specs = [m.run for m in models], [m.spec for m in models]
+        controls, found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
         records += controls
         retrieval += found
     return {
@@ -116,6 +116,46 @@ def probe_runs(paths: Sequence[Path], session: Session, pack: Pack | None = None
         "retrieval": retrieval,
         "summary": summarise(records, session.probes[0]),
     }
+
+
+def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
+    """What each run is called: its method, and its recipe where these differ, and its folder where runs of one such name
+    differ in more than their seed. ValueError if two differ in nothing: they would count as two seeds."""
+    several = len({model.run.recipe for model in models}) > 1
+    names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]
+    alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> settings -> seed -> folder
+    for name, path, model in zip(names, paths, models, strict=True):
+        seeds = alike.setdefault(name, {}).setdefault(_settings(path, model), {})
+        if model.run.seed in seeds:
+            raise ValueError(
+                f"{seeds[model.run.seed]} and {path} are the same run (equal settings, seed {model.run.seed}):"
+                " they would count as two seeds, give one of them"
+            )
+        seeds[model.run.seed] = path
+    where: dict[Path, str] = {}
+    for kinds in alike.values():
+        folders = [list(seeds.values()) for seeds in kinds.values()]
+        for group, place in zip(folders, _places(folders), strict=True):
+            where |= dict.fromkeys(group, f" ({place})" if len(folders) > 1 else "")
+    return [name + where[path] for name, path in zip(names, paths, strict=True)]
+
+
+def _settings(path: Path, model: Model) -> str:
+    """Whose seeds belong together: all settings but the seed, and the data by its content, wherever it lies."""
+    record = load_run(path)[1] if (path / "run.json").exists() else {}
+    data = record.get("pack") or to_json(model.run.data)
+    return digest([replace(model.run, seed=0, data=PackConfig()).digest(), data])
+
+
+def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
+    """A name for each of these groups of folders: the folder it shares, or its own; the least of the path that tells them
+    apart."""
+    whole = [[path.resolve() for path in group] for group in groups]
+    shared = [Path(os.path.commonpath(group)) for group in whole]
+    listed = [[place] for place in shared] if len(set(shared)) == len(groups) else whole
+    every = [place for group in listed for place in group]
+    num = next(n for n in range(1, 1000) if len({place.parts[-n:] for place in every}) == len(every))
+    return [", ".join("/".join(place.parts[-num:]) for place in group) for group in listed]
 
 
 def chosen(pack: Pack, session: Session) -> tuple[list[Task], list[str]]:

@@ -118,6 +118,8 @@ def _halved(rows: Parts, groups: np.ndarray, leaks: bool, seed: int) -> tuple[np
         half = len(mine) // 2
         given += mine[:half].tolist()
         scored += mine[half:].tolist() if half else []
+    if len(given) > len(rows.train):  # no more than there are to replace
+        given = rng.permutation(given)[: len(rows.train)].tolist()
     train = np.arange(len(rows.train))
     val, test = len(train) + np.arange(len(rows.val)), len(train) + len(rows.val)
     if leaks:

@@ -120,12 +120,15 @@ def _train(
                 if log:
                     log.step(done, values, rate, run.batch_size)
             stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
+            saving = done == num_steps or done % every == 0 or stopping
+            if saving:
+                _check_weights(method, done, run)
             if log:
                 log.advance(done)
                 if done == num_steps or (run.eval_every and done % run.eval_every == 0):
                     log.evaluation(done, evaluate(Model(method, run, pack.spec, pack.size), pack, run))
                     method.train()
-            if done == num_steps or done % every == 0 or stopping:
+            if saving:
                 checkpoint.save(out / "checkpoint.pt", run, method, step.optimiser, done, world)
             if stopping and done < num_steps:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
@@ -136,12 +139,21 @@ def _train(
 
 
 def _check_finite(values: dict[str, float], step: int, run: Run) -> None:
-    if all(math.isfinite(value) for value in values.values()):
-        return
-    parts = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-    raise Diverged(
-        f"the loss is not finite at step {step} ({parts}): lower --optim.lr (now {run.optim.lr:g}), add --optim.warmup 0.05,"
-        " or use --precision fp32; the last checkpoint is kept"
+    if not all(math.isfinite(value) for value in values.values()):
+        parts = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+        raise _diverged(f"the loss is not finite at step {step} ({parts})", run)
+
+
+def _check_weights(method: Method, step: int, run: Run) -> None:
+    """Before they are kept: a step may leave weights that are no numbers while its own loss still was one."""
+    if not torch.stack([weights.isfinite().all() for weights in method.parameters()]).all():
+        raise _diverged(f"weights are not finite after step {step}", run)
+
+
+def _diverged(what: str, run: Run) -> Diverged:
+    return Diverged(
+        f"{what}: lower --optim.lr (now {run.optim.lr:g}), add --optim.warmup 0.05, or use --precision fp32; the last"
+        " checkpoint is kept"
     )
 
 

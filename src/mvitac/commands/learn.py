@@ -70,7 +70,7 @@ def probe(argv: list[str]) -> None:
     from mvitac.pack import Pack
     from mvitac.record import check_place, write_json
     from mvitac.scores import summarise
-    from mvitac.session import Session, chosen, probe_runs
+    from mvitac.session import END_TO_END, Session, chosen, probe_runs
     from mvitac.stress import STRESSES, stress
     from mvitac.tables import print_retrieval, print_summary
     from mvitac.transfer import Transfer
@@ -105,13 +105,14 @@ def probe(argv: list[str]) -> None:
         pack = Transfer(Pack(options.learn_on), pack)
     result = probe_runs(options.runs, options.session, pack)
     console, worse = Console(), []
+    names = {r["run"]: r["source"].removesuffix(END_TO_END) for r in result["records"] if "run" in r}
     for i, path in enumerate(options.runs if options.stress else (), start=1):
         console.print(
             f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)} ...", highlight=False
         )
         model = load(path)
         where = pack or model.run.data.open()
-        own = {"source": model.run.method.name, "seed": model.run.seed, "run": str(path)}
+        own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
         worse += [{**own, **r} for r in stress(model, where, *chosen(where, options.session))]
     for kind in options.session.probes:
         print_summary({**result, "summary": summarise(result["records"], kind)}, console, probe=kind)
