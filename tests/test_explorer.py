@@ -98,9 +98,11 @@ def test_a_dropped_picture_is_classified_and_finds_itself(land: Landscape, pack:
     assert set(said) == {"pattern", "bright"} and sum(said["pattern"].values()) == pytest.approx(1, abs=1e-4)
 
 
-def test_fewer_rows_are_evenly_spread(artifact: Path, pack: Pack) -> None:
-    few = Landscape(mvitac.load(artifact), pack, limit=50)
-    assert len(few.rows) <= 50 and set(np.diff(few.rows)) == {3}
+def test_fewer_rows_are_of_every_class(artifact: Path, pack: Pack) -> None:
+    """Although the pack's three classes take turns, and every third row would be of one."""
+    few = Landscape(mvitac.load(artifact), pack, limit=40)
+    assert len(few.rows) == 40 and (np.diff(few.rows) > 0).all()
+    assert np.bincount(few.labels["pattern"]).min() >= 8
 
 
 def test_a_run_that_is_not_finished_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,6 +18,7 @@ import torch
 from toy import toy_pack
 
 import mvitac
+import mvitac.export as exports
 from mvitac import graph as graphs
 from mvitac.cli import main
 from mvitac.datasets.packed import PackConfig
@@ -130,6 +131,31 @@ def test_torch_export_of_touch_alone(smoke_run: Path, pack: Pack, tmp_path: Path
     found = Engine(out)(touch=images)
     np.testing.assert_allclose(found["probability_pattern"], model.predict(touch=images)["pattern"], atol=1e-4)
     assert main([*command, "--threads", "1"]) == 2  # it is already there
+
+
+def test_rows_that_check_and_calibrate_are_of_every_class(
+    model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although the pack's three classes take turns: every third test row, or the first ones, would be of one."""
+    monkeypatch.setattr(exports, "NUM_CALIBRATION", 20)
+    rows = {r.tobytes(): i for i, r in enumerate(pack.images["touch"])}
+    labels = pack.column("label_pattern")
+    ranges = [rows[touch[0].tobytes()] for _, touch in exports._examples(Graph(model), pack)]
+    assert len(set(ranges)) == 20 and set(pack.column("split")[ranges]) == {"train"}
+    assert np.bincount(labels[ranges]).min() >= 3
+    seen: list[int] = []
+
+    class Stop(Exception):
+        pass
+
+    def checked(model: Model, graph: Graph, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+        seen.extend(rows.tolist())
+        raise Stop
+
+    monkeypatch.setattr(exports, "reference", checked)
+    with pytest.raises(Stop):
+        export(model, pack, tmp_path / "x", kind="torch", num_rows=len(pack.rows("test")) // 3)
+    assert np.bincount(labels[seen], minlength=3).min() >= 1 and set(pack.column("split")[seen]) == {"test"}
 
 
 def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:

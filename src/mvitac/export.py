@@ -24,6 +24,7 @@ import torch
 
 from mvitac.artifact import preprocessing
 from mvitac.encoders import IMAGENET_MEAN, IMAGENET_STD
+from mvitac.features import sample
 from mvitac.graph import Graph
 from mvitac.model import Model
 from mvitac.pack import Pack
@@ -96,7 +97,7 @@ def export(
     rows = pack.rows("test", having=graph.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split test: an export is checked on rows nobody trained on")
-    rows = rows[:: max(1, len(rows) // num_rows)][:num_rows]
+    rows = sample(rows, num_rows)
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -141,12 +142,11 @@ def export(
 
 
 def _examples(graph: Graph, pack: Pack) -> list[list[np.ndarray]]:
-    """Single real inputs, spread over the train rows of ``pack``."""
+    """Single real inputs, a sample of the train rows of ``pack``."""
     rows = pack.rows("train", "unlabelled", having=graph.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split train: int8 takes its ranges from them")
-    rows = rows[:: max(1, len(rows) // NUM_CALIBRATION)][:NUM_CALIBRATION]
-    return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in rows]
+    return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in sample(rows, NUM_CALIBRATION)]
 
 
 def _write(graph: Graph, folder: Path, kind: Kind, examples: list[list[np.ndarray]] | None) -> None:

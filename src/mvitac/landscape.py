@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvitac.features import features
+from mvitac.features import features, sample
 from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.publish import with_readouts
@@ -32,15 +32,15 @@ class Landscape:
     """One run's rows: ``rows`` [N] pack rows, ``x[modality]`` [N, D] unit features, ``guess[task]`` [N]."""
 
     def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
-        """At most ``limit`` rows are shown, evenly spread, of those that lack no image. The probes are fitted on the run's
-        data if it has none. ValueError if the pack's images do not fit the model.
+        """At most ``limit`` rows are shown, a sample of those that lack no image. A model without probes gets them fitted on
+        ``pack``. ValueError if the pack's images do not fit the model.
         """
         names = check_pack(model, pack)
         self.model, self.pack = with_readouts(model, pack), pack
         whole = np.flatnonzero(np.all([pack.has(m) for m in names], axis=0))
         if not len(whole):
             raise ValueError(f"{pack.path} has no row with {' and '.join(names)}: there is nothing to show")
-        self.rows = whole[:: max(1, -(-len(whole) // limit))]
+        self.rows = sample(whole, limit)
         raw = {m: features(model, pack, m, self.rows) for m in names}
         self.x = {m: _unit(f) for m, f in raw.items()}
         self.modalities = (*raw, *(["both"] if len(raw) == 2 else []))
