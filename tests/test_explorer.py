@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
 from PIL import Image
+from toy import reordered
 
 import mvitac
 from mvitac.cli import main
@@ -96,6 +98,18 @@ def test_a_dropped_picture_is_classified_and_finds_itself(land: Landscape, pack:
     said, pairs = land.query(np.array(pack.images["touch"][17]), "touch", 3)
     assert pairs[0][0] == 17 and pairs[0][1] == pytest.approx(1, abs=1e-4)
     assert set(said) == {"pattern", "bright"} and sum(said["pattern"].values()) == pytest.approx(1, abs=1e-4)
+
+
+def test_a_pack_of_other_numbers_or_tasks(land: Landscape, artifact: Path, pack: Pack) -> None:
+    """The probes' answers are compared by name; a task that the pack lacks is answered all the same."""
+    other = reordered(pack)
+    other.spec = replace(other.spec, tasks=other.spec.tasks[:1])
+    found = Landscape(mvitac.load(artifact), other)
+    wrong = land.shown("all", "pattern", mistakes=True)
+    assert np.array_equal(found.shown("all", "pattern", mistakes=True), wrong)
+    assert found.describe(int(wrong[0])).partition(" · light")[0] in land.describe(int(wrong[0]))
+    picture = np.array(pack.images["touch"][17])
+    assert found.query(picture, "touch", 3)[0] == land.query(picture, "touch", 3)[0]
 
 
 def test_fewer_rows_are_of_every_class(artifact: Path, pack: Pack) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from toy import toy_pack
+from toy import reordered, toy_pack
 
 import mvitac
 import mvitac.export as exports
@@ -213,6 +213,16 @@ def test_corrupted_weights_in_the_graph_leave_no_export(
     with pytest.raises(ValueError, match="not the trained model"):
         export(model, pack, tmp_path / "x", kind="torch")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_accuracy_is_of_classes_by_name(model: Model, pack: Pack) -> None:
+    """The pack that checks may number them otherwise, and may lack a task."""
+    graph, other = Graph(model), reordered(pack)
+    found = check(model, graph, other)["accuracy"]
+    assert found == check(model, graph, pack)["accuracy"] and set(found) == {"pattern", "bright"}
+    assert found["pattern"]["original"] == 100 * model.readouts["pattern.both"].question.accuracy
+    other.spec = replace(pack.spec, tasks=pack.spec.tasks[:1])
+    assert set(check(model, graph, other)["accuracy"]) == {"pattern"}
 
 
 def test_lost_accuracy_stops_an_export(model: Model, pack: Pack) -> None:

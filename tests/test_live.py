@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,15 @@ import numpy as np
 import pytest
 from faults import Clock, Rig, World, faulty
 from PIL import Image
+from rich.console import Console
 
+from mvitac.artifact import seal
 from mvitac.cameras import Camera, Folder, Simulated, source
 from mvitac.capture import CaptureThread, Stream
 from mvitac.cli import main
+from mvitac.commands.live import _engine
 from mvitac.datasets.lerobot import LeRobotConfig
+from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.packing import build
 from mvitac.realtime import Contact, Live, LiveConfig
@@ -462,6 +467,28 @@ def test_a_window_or_why_not(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     picture[..., 0] = 200
     assert window.show(picture) and not window.show(picture) and not window.show(picture)
     assert (shown[0] == (0, 0, 200)).all()  # red, as OpenCV orders it
+
+
+def test_each_artifact_of_a_run_is_exported_for_itself(
+    artifact: Path, onnx: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once: their weights are the same, their probes are not."""
+    other = shutil.copytree(artifact, tmp_path / "other")
+    manifest = json.loads((other / "artifact.json").read_text())
+    for question in manifest["probes"]:
+        question["classes"].reverse()
+    (other / "artifact.json").write_text(json.dumps({**manifest, "digest": seal(manifest)}))
+    made: list[tuple[str, ...]] = []
+
+    def exported(model: Model, pack: Pack, out: Path, **options: Any) -> None:
+        made.append(model.classes["pattern"])
+        shutil.copytree(onnx, out)
+
+    monkeypatch.setattr("mvitac.export.export", exported)
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
+    for model in (artifact, other, artifact):
+        assert _engine(str(model), 1, Console(quiet=True)).classes.keys() == {"pattern", "bright"}
+    assert made == [("columns", "rows", "checks"), ("checks", "rows", "columns")]
 
 
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -267,8 +267,8 @@ def parity(
                 f"the export is not the trained model: {name} has cosine {values.min():.4f} on real inputs, at least"
                 f" {tolerance.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows)}"
             )
-    for task in graph.classes:
-        labels = pack.column(f"label_{task}")[rows] if f"label_{task}" in pack.table.column_names else np.full(1, -1)
+    for task, known in graph.classes.items():
+        labels = labels_of(pack, task, known, rows)
         if not (labels >= 0).any():
             continue
         name = f"probability_{task}"
@@ -281,6 +281,15 @@ def parity(
                 f" {len(rows)} here are few, or allow more, --accuracy-loss"
             )
     return report
+
+
+def labels_of(pack: Pack, task: str, classes: list[str], rows: np.ndarray) -> np.ndarray:
+    """Labels [len(rows)] of pack rows as numbers of ``classes``, by name; -1 = unlabelled, or a class not among them."""
+    own = next((t.classes for t in pack.spec.tasks if t.name == task), None)
+    if own is None:
+        return np.full(len(rows), -1)
+    numbers = np.array([*(classes.index(name) if name in classes else -1 for name in own), -1])
+    return numbers[pack.column(f"label_{task}")[rows].astype(int)]
 
 
 def explain(model: Model, modality: str, found: dict[str, np.ndarray], pack: Pack, rows: np.ndarray) -> str:

@@ -46,13 +46,17 @@ class Landscape:
         self.modalities = (*raw, *(["both"] if len(raw) == 2 else []))
         self.split = pack.column("split")[self.rows].astype(str)
         self.labels = {t.name: pack.column(f"label_{t.name}")[self.rows].astype(int) for t in pack.spec.tasks}
-        self.classes = {t.name: t.classes for t in pack.spec.tasks}
+        self.classes: dict[str, tuple[str, ...]] = {t.name: t.classes for t in pack.spec.tasks}
         self.guess: dict[str, np.ndarray] = {}
-        for task in self.classes:
+        for task in tuple(self.classes):
             readout = self.model.readouts.get(f"{task}.{self.modalities[-1]}")
             if readout:
                 joined = np.concatenate([raw[m] for m in readout.question.modalities], axis=1)
-                self.guess[task] = readout(torch.from_numpy(joined)).argmax(1).numpy()
+                # By name: the probe may be of other data, which has the classes in another order, or other classes.
+                known = readout.question.classes
+                names = self.classes[task] = tuple(dict.fromkeys((*self.classes[task], *known)))
+                found = readout(torch.from_numpy(joined)).argmax(1).numpy()
+                self.guess[task] = np.array([names.index(name) for name in known])[found]
         self._planes: dict[str, np.ndarray] = {}
 
     def plane(self, modality: str) -> np.ndarray:
@@ -135,9 +139,9 @@ class Landscape:
         given = np.concatenate([image] * num, axis=2)
         pictures: dict[str, Any] = {modality: given}
         said = {}
-        if f"{next(iter(self.classes), '')}.{modality}" in self.model.readouts:
+        if any(r.question.modality == modality for r in self.model.readouts.values()):
             for task, p in self.model.predict(**pictures).items():
-                said[task] = dict(zip(self.classes[task], p[0].tolist(), strict=True))
+                said[task] = dict(zip(self.model.classes[task], p[0].tolist(), strict=True))
         x = _unit(self.model.embed(**pictures)[modality].cpu().numpy())
         return said, self.neighbours(x, modality, k)
 

@@ -147,13 +147,18 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     from mvitac.artifact import load
     from mvitac.export import export
     from mvitac.publish import own_data, with_readouts
-    from mvitac.record import cache_dir
-    from mvitac.runtime import MANIFEST, Engine
+    from mvitac.model import safetensors_digest
+    from mvitac.record import cache_dir, digest
+    from mvitac.registry import to_json
+    from mvitac.runtime import FORMAT_VERSION, MANIFEST, Engine
 
     if (Path(model) / MANIFEST).is_file():
         return Engine(model, threads=threads)
     loaded = load(model)
-    folder = cache_dir() / "exports" / loaded.weights_digest()[:32]
+    # Artifacts of one run differ in their probes alone. A bare run has none: those fitted below are what its data makes.
+    probes = [[to_json(r.question), safetensors_digest(dict(r.state_dict()))] for r in loaded.readouts.values()]
+    key = digest([FORMAT_VERSION, loaded.weights_digest(), probes])
+    folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
         pack = own_data(loaded, "`mvitac export` it where the data is, and give that folder")
