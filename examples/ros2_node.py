@@ -95,6 +95,7 @@ class Kept:
 
     def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
         self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
+        self.difference = engine.difference
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
         self.outputs.update(self.engine(**images))

@@ -39,6 +39,7 @@ class Slow:
 
     def __init__(self, engine: Engine) -> None:
         self.engine, self.inputs, self.classes, self.meta = engine, engine.inputs, engine.classes, engine.meta
+        self.difference = engine.difference
         self.clock: Clock | None = None
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
@@ -76,6 +77,26 @@ def test_an_answer_is_the_mean_of_its_touch(engine: Engine) -> None:
     mean = np.mean(said, axis=0)
     name, confidence = world.live.answers(world.live.last)["pattern"]
     assert confidence == pytest.approx(mean.max()) and name == engine.classes["pattern"][mean.argmax()]
+
+
+def test_a_model_of_difference_images_sees_a_touch_minus_its_background(engine: Engine) -> None:
+    """In contact the middle of the picture is 80 brighter than before: 40 above one half. What is recorded is as it came."""
+    seen: list[np.ndarray] = []
+    kept: list[np.ndarray] = []
+
+    class Minus(Slow):
+        def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+            seen.append(images["touch"][0].astype(float))
+            return self.engine(**images)
+
+    slow = Minus(engine)
+    slow.difference = True
+    world = World(slow, record=lambda images, columns: kept.append(images["touch"]))
+    world.run(6)
+    assert len(seen) > 20 and np.array_equal(kept[-1], world.rigs["touch"].picture)
+    for touch in seen:
+        assert touch[8:24, 8:24].mean() == pytest.approx(168, abs=1.5)
+        assert touch[:8].mean() == pytest.approx(128, abs=1.5) and np.abs(touch[:8] - 128).max() <= 3
 
 
 def test_age_is_from_capture_to_answer(engine: Engine) -> None:
@@ -418,7 +439,7 @@ def test_the_picture_shows_frames_contact_and_answers(engine: Engine, modalities
     class Part:
         """The engine, of some of its inputs."""
 
-        inputs, classes = {m: engine.inputs[m] for m in modalities}, engine.classes
+        inputs, classes, difference = {m: engine.inputs[m] for m in modalities}, engine.classes, False
 
         def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
             zeros = {m: np.zeros((1, *shape), np.uint8) for m, shape in engine.inputs.items()}

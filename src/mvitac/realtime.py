@@ -1,8 +1,8 @@
 """Live: the newest frames in, contact, a smoothed answer per touch and its age out. No training code.
 
 Each touch sensor's background (no contact) is learned from its first frames and followed slowly while nothing is
-touched; it only decides *whether* there is contact, the model sees frames as they are. Probabilities are averaged over
-one touch and forgotten with it. Time comes from a clock that is given. Shapes: frames uint8 RGB [H, W, 3].
+touched; it decides *whether* there is contact. The model sees frames as they are, or minus that background if it learned
+from difference images. Probabilities are averaged over one touch and forgotten with it. Time comes from a clock that is given. Shapes: frames uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 from mvitac.capture import Event, Frame, Stream
+from mvitac.datasets.places import difference
 from mvitac.pack import fit
 from mvitac.runtime import Engine
 
@@ -53,25 +54,31 @@ class LiveConfig:
 class Contact:
     """Whether one touch sensor is touched: learns its background, then compares."""
 
-    def __init__(self, config: LiveConfig) -> None:
-        self.config = config
+    def __init__(self, config: LiveConfig, side: int = 0) -> None:
+        """``side``: of the picture of no contact to keep, for a model that wants it subtracted; 0 = none."""
+        self.config, self.side = config, side
         self.forget()
 
     def forget(self) -> None:
         """Calibrate anew, as after a change of resolution or a replugged sensor."""
-        self.first: list[np.ndarray] = []
+        self.first: list[tuple[np.ndarray, np.ndarray | None]] = []
         self.background: np.ndarray | None = None
+        self.picture: np.ndarray | None = None
+        """The background [side, side, 3] as the model would see it, float32."""
         self.noise = self.level = 0.0
         self.touched = self.uneasy = False
 
     def __call__(self, image: np.ndarray) -> bool | None:
         """True in contact, False without, None while calibrating. ``level`` is the change in units of the threshold."""
         small = np.asarray(Image.fromarray(image).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
+        whole = fit(image, self.side) if self.side else None
         if self.background is None:
-            self.first.append(small)
+            self.first.append((small, whole))
             if len(self.first) < self.config.calibration:
                 return None
-            frames, self.first = np.stack(self.first), []
+            frames = np.stack([small for small, _ in self.first])
+            pictures = [whole for _, whole in self.first if whole is not None]
+            self.first = []
             middle = np.median(frames, axis=0)
             changes = np.abs(frames - middle).mean((1, 2))
             self.noise = float(np.median(changes))
@@ -79,12 +86,15 @@ class Contact:
             if self.uneasy:
                 return None  # something moved: learn it again
             self.background = middle
+            self.picture = np.mean(pictures, axis=0, dtype=np.float32) if pictures else None
         change = float(np.abs(small - self.background).mean())
         threshold = max(self.config.least_change, self.config.contact * self.noise)
         self.level = change / threshold
         self.touched = self.level > (0.5 if self.touched else 1.0)
         if not self.touched:
             self.background += self.config.follow * (small - self.background)
+            if whole is not None and self.picture is not None:
+                self.picture += self.config.follow * (whole - self.picture)
         return self.touched
 
 
@@ -145,7 +155,8 @@ class Live:
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]
         """A new frame of this stream starts a prediction."""
-        self.contacts = {s.name: Contact(config) for s in streams.get("touch", ())}
+        side = engine.inputs["touch"][0] if engine.difference and "touch" in streams else 0
+        self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
         self.age = self.max_age = 0.0
@@ -188,7 +199,7 @@ class Live:
             if self.touch is None:
                 self.num_touches += 1
                 self.touch = Touch(self.num_touches, now)
-            outputs = self.engine(**{m: x[None] for m, x in images.items()})
+            outputs = self.engine(**{m: x[None] for m, x in self._wanted(images).items()})
             self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
             if self.nearest:
                 self.touch.known = self.nearest(outputs)
@@ -229,6 +240,13 @@ class Live:
                 self._heard(Event(self.clock(), name, "calibrated", f"{name} is calibrated without contact"))
         states = self.contacts.values()
         return None if any(c.background is None for c in states) else any(c.touched for c in states)
+
+    def _wanted(self, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """``images`` as the model learned from them; what is recorded stays as it came."""
+        if not (self.engine.difference and self.contacts):
+            return images
+        free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
+        return {**images, "touch": difference(images["touch"], np.rint(free).astype(np.uint8))}
 
     def _release(self, now: float) -> None:
         if self.touch is not None:

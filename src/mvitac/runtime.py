@@ -43,6 +43,8 @@ class Engine:
         self.meta = read_manifest(folder)
         self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
         self.classes: dict[str, list[str]] = self.meta["classes"]
+        self.difference: bool = self.meta["preprocessing"].get("difference", False)
+        """Whether touch is to be given as (touch - background) / 2 + 128."""
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})
