@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -18,7 +19,7 @@ from mvitac.artifact import seal
 from mvitac.cameras import Camera, Folder, Simulated, source
 from mvitac.capture import CaptureThread, Stream
 from mvitac.cli import main
-from mvitac.commands.live import _engine
+from mvitac.commands.live import _engine, view
 from mvitac.datasets.lerobot import LeRobotConfig
 from mvitac.model import Model
 from mvitac.pack import Pack
@@ -32,6 +33,13 @@ from mvitac.window import Window, draw
 @pytest.fixture(scope="module")
 def engine(onnx: Path) -> Engine:
     return Engine(onnx, threads=1)
+
+
+def shown(loop: Live) -> str:
+    """The terminal's picture, as text."""
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(view(loop))
+    return console.export_text()
 
 
 class Slow:
@@ -138,10 +146,41 @@ def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
     for fault in ("stalled", "unplugged"):
         world = World(engine)
         world.run(2.5)
-        assert world.live.touch is not None
+        assert world.live.touch is not None and "CONTACT" in shown(world.live)
         world.rigs["touch"].fault = fault
         world.run(1)
         assert world.live.touch is None and world.live.last is not None
+        assert world.live.contact is None and "CONTACT" not in shown(world.live)
+
+
+def test_a_frame_that_comes_while_others_are_taken_is_used_once(engine: Engine) -> None:
+    world = World(engine)
+    world.run(2.5)
+    [stream] = world.streams["touch"]
+    newest, before = stream.newest, world.live.num_predictions
+
+    def meanwhile(*, take: bool = True) -> Any:
+        if take:
+            stream.newest = newest  # type: ignore[method-assign]
+            stream.pump()
+        return newest(take=take)
+
+    stream.pump()
+    stream.newest = meanwhile  # type: ignore[method-assign]
+    assert world.live.tick() and not world.live.tick()
+    assert world.live.num_predictions == before + 1
+
+
+def test_a_background_is_forgotten_between_frames(engine: Engine) -> None:
+    """Not by the thread that noticed, while another compares a frame with it."""
+    world = World(engine)
+    world.run(2)
+    contact = world.live.contacts["touch"]
+    world.rigs["touch"].fault = "resolution"
+    world.streams["touch"][0].pump()  # as the capture thread does
+    assert contact.background is not None
+    world.live.tick()
+    assert contact.background is None and world.live.contact is None
 
 
 def test_minutes_of_faults(engine: Engine) -> None:

@@ -160,13 +160,14 @@ class Live:
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
         self.age = self.max_age = 0.0
-        """Seconds from capture to answer of the latest prediction, and the most of any."""
+        """Seconds from capture to answer of the latest prediction, and the most of any; of the leading modality's frames."""
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
         self.contact: bool | None = None
         self._seen = -1
         self._judged: dict[str, int] = {}
+        self._changed: set[str] = set()
         for stream in self.all:
             stream.tell = self._heard
 
@@ -176,18 +177,19 @@ class Live:
             stream.check()
         leading = self.leading.newest(take=False)
         if leading is None or leading.number == self._seen:
-            if any(stream.fault for stream in self.all):  # what cannot be seen is not known to go on
-                self._release(self.clock())
+            if any(stream.fault for stream in self.all):
+                self._lose(self.clock())
             return False
         frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
-        self._seen = leading.number
+        # A frame may have come since ``leading`` was looked at: the one that is used counts.
+        self._seen = (frames[self._leading_modality][0] or leading).number
         now = self.clock()
         for several, found in zip(self.streams.values(), frames.values(), strict=True):
             for stream, frame in zip(several, found, strict=True):
                 # An old frame is not the present: rather no answer than one about the past.
                 if frame is None or stream.fault == "frozen" or now - frame.time > stream.stale_after:
                     self.num_stale += 1
-                    self._release(now)
+                    self._lose(now)
                     return False
         self.contact = self._contact(frames.get("touch", []))
         images = {
@@ -226,6 +228,8 @@ class Live:
         """Whether any touch sensor is in contact, None while one is calibrated; without a sensor always True."""
         if not self.contacts:
             return True
+        while self._changed:
+            self.contacts[self._changed.pop()].forget()
         for name, frame in zip(self.contacts, frames, strict=True):
             if frame is None or self._judged.get(name) == frame.number:
                 continue
@@ -248,6 +252,11 @@ class Live:
         free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
         return {**images, "touch": difference(images["touch"], np.rint(free).astype(np.uint8))}
 
+    def _lose(self, now: float) -> None:
+        """What cannot be seen is neither touched nor free."""
+        self._release(now)
+        self.contact = None
+
     def _release(self, now: float) -> None:
         if self.touch is not None:
             self.touch.end = now
@@ -256,9 +265,10 @@ class Live:
     def _heard(self, event: Event) -> None:
         self.counts[event.what] += 1
         self.tell(event)
-        # Another lens, crop or gel: what was learned of the background no longer holds.
+        # Another lens, crop or gel: what was learned of the background no longer holds. The capture thread says so here
+        # before it shows the frame, and ``tick``, in its own thread, may be at work on the one before: it forgets.
         if event.what in ("resolution changed", "back") and event.stream in self.contacts:
-            self.contacts[event.stream].forget()
+            self._changed.add(event.stream)
 
     def state(self, stream: Stream) -> str:
         """What a stream is doing, in a word: its fault, "calibrating" or "good"."""

@@ -197,9 +197,11 @@ def view(loop: "Live") -> Any:
         age = f"{1000 * s.age():.0f}" if s.num_frames else "-"
         streams.add_row(s.name, f"{s.rate():.1f}", age, str(s.num_dropped), loop.state(s))
     lines: list[Any] = [streams]
-    for name, contact in loop.contacts.items():
+    for s in loop.streams.get("touch", ()):
+        contact = loop.contacts[s.name]
         bar = "#" * min(30, round(10 * contact.level))
-        lines.append(Text(f"{name:8} {'CONTACT' if contact.touched else 'free   '} {bar}"))
+        state = f"{'CONTACT' if contact.touched else 'free   '} {bar}"
+        lines.append(Text(f"{s.name:8} {'unknown' if s.fault else state}"))
     touch = loop.touch or loop.last
     for task, (name, confidence) in loop.answers(touch).items():
         sure = "" if confidence >= loop.config.min_confidence else "  unsure"
