@@ -7,9 +7,11 @@ import json
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from faults import Clock, Rig, World, faulty
 from PIL import Image
@@ -19,12 +21,12 @@ from mvitac.artifact import seal
 from mvitac.cameras import Camera, Folder, Simulated, source
 from mvitac.capture import CaptureThread, Stream
 from mvitac.cli import main
-from mvitac.commands.live import _engine, view
+from mvitac.commands.live import _engine, sources, view
 from mvitac.datasets.lerobot import LeRobotConfig
 from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.packing import build
-from mvitac.realtime import Contact, Live, LiveConfig
+from mvitac.realtime import Contact, Live, LiveConfig, neighbours
 from mvitac.recording import Recorder, finish
 from mvitac.runtime import Engine
 from mvitac.window import Window, draw
@@ -244,6 +246,43 @@ def test_streams_must_fit_the_model(engine: Engine) -> None:
         Live(engine, {**streams, "smell": streams["touch"]})
 
 
+def test_what_is_simulated_is_asked_for() -> None:
+    """All of it, where no source is given; else a forgotten camera would pass for a real one."""
+    pair, gripper = {"vision": (32, 32, 3), "touch": (32, 32, 3)}, {"touch": (32, 32, 6)}
+    assert sources(pair, None, ()) == {"vision": ("sim:0",), "touch": ("sim:0",)}
+    assert sources(gripper, None, ()) == {"touch": ("sim:0", "sim:1")}
+    assert sources(pair, "0", ("sim",)) == {"vision": ("0",), "touch": ("sim",)}
+    with pytest.raises(ValueError, match="takes vision too: give --vision SOURCE"):
+        sources(pair, None, ("2",))
+    with pytest.raises(ValueError, match="takes touch too: .*--touch sim for a simulated one"):
+        sources(pair, "0", ())
+    with pytest.raises(ValueError, match="no input for vision: leave --vision out"):
+        sources(gripper, "0", ("2", "4"))
+
+
+@pytest.mark.parametrize("wrong", [{"neighbours": 0}, {"min_confidence": 7.0}, {"min_confidence": -0.1}])
+def test_settings_that_cannot_be_are_refused_at_the_start(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="neighbours must be >= 1"):
+        LiveConfig(**wrong)
+
+
+def test_known_touches_are_compared_by_what_the_model_sees(tmp_path: Path) -> None:
+    banks = {m: np.eye(3, dtype=np.float32) for m in ("vision", "touch")}
+    index = SimpleNamespace(
+        meta={"space": "shared"},
+        banks=banks,
+        table=pa.table({"id": ["a", "b", "c"]}),
+        labels=lambda row: {"task": f"class {row}"},
+        folder=tmp_path,
+    )
+    query = np.array([[0.1, 2.0, 0.0]], np.float32)
+    for inputs, key in ((("vision",), "shared_vision"), (("vision", "touch"), "shared_touch")):
+        assert neighbours(index, 2, inputs)({key: query}) == ["b (class 1)", "a (class 0)"]
+    del banks["vision"]
+    with pytest.raises(ValueError, match="holds no vision to compare with"):
+        neighbours(index, 2, ("vision",))
+
+
 def test_sources_by_name(tmp_path: Path) -> None:
     for i in range(3):
         Image.fromarray(np.full((4, 6, 3), 10 * i, np.uint8)).save(tmp_path / f"{i}.png")
@@ -444,6 +483,16 @@ def test_a_recording_of_a_gripper_is_packed_again_as_it_was(tmp_path: Path) -> N
         assert np.array_equal(images, np.stack([pair[modality] for pair in kept]))
 
 
+def test_a_gap_is_not_made_up_for(tmp_path: Path) -> None:
+    """At most fps pairs a second: also at the start, and after a gap."""
+    recorder = Recorder(tmp_path / "pack", {"touch": 3}, fps=1.0)
+    image = np.zeros((16, 16, 3), np.uint8)
+    for i in [*range(0, 70), *range(130, 200)]:  # 30 frames a second
+        recorder({"touch": image}, {"time": i / 30, "contact": True, "touch_number": 1})
+    kept = [columns["time"] for _, columns in recorder.waiting]
+    assert kept == pytest.approx([0, 1, 2, 130 / 30, 160 / 30, 190 / 30])
+
+
 def test_a_rate_that_cannot_be_recorded(tmp_path: Path) -> None:
     for form, fps, says in (("lerobot", 2.5, "fps 2.5: .* whole number"), ("pack", 0.0, "more than 0")):
         with pytest.raises(ValueError, match=says):
@@ -471,6 +520,13 @@ def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
     assert np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
     with pytest.raises(ValueError, match="no unfinished recording"):
         finish(tmp_path / "other")
+
+
+def test_a_recording_that_nothing_came_of_is_not_in_the_way(tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    Recorder(out, {"touch": 3})  # killed before its first part
+    assert finish(out) == 0 and not list(tmp_path.iterdir())
+    assert Recorder(out, {"touch": 3}).close() == 0 and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("modalities", [("vision", "touch"), ("touch",)])
@@ -565,5 +621,6 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     shown = capsys.readouterr().out
     assert "has no more frames" in shown and "touch: 24 frames" in shown
     assert summary["touches"] >= 1 and "touch 1 (" in shown  # also of a touch that the end of the files cut short
+    assert main([*command, "--json", str(tmp_path)]) == 2 and "is a folder" in capsys.readouterr().err
     for wrong in (["--stale", "0"], ["--seconds", "-1"]):
         assert main([*command, *wrong]) == 2 and "more than 0" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,6 +49,8 @@ class LiveConfig:
             raise ValueError(f"calibration {self.calibration}: give at least 2 frames")
         if not (self.contact > 0 and self.least_change >= 0 and 0 <= self.follow < 1):
             raise ValueError("contact must be > 0, least_change >= 0 and follow in [0, 1)")
+        if not (self.neighbours >= 1 and 0 <= self.min_confidence <= 1):
+            raise ValueError("neighbours must be >= 1 (leave --index out for none) and min_confidence in [0, 1]")
 
 
 class Contact:
@@ -297,10 +299,16 @@ class Live:
         }
 
 
-def neighbours(index: Any, k: int, modality: str = "touch") -> Callable[[dict[str, np.ndarray]], list[str]]:
-    """``Live``'s ``nearest`` from a ``retrieval.Index``: "id (label, ...)" of the k nearest known touches."""
+def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str, np.ndarray]], list[str]]:
+    """``Live``'s ``nearest`` from a ``retrieval.Index``: "id (label, ...)" of the k nearest known touches.
+
+    By touch, or by vision where the engine's ``inputs`` have no touch. ValueError if the index does not hold it.
+    """
     from mvitac.retrieval import nearest
 
+    modality = "touch" if "touch" in inputs else "vision"
+    if modality not in index.banks:
+        raise ValueError(f"{index.folder} holds no {modality} to compare with: index a pack that has it")
     key = f"shared_{modality}" if index.meta["space"] == "shared" else f"embedding_{modality}"
 
     def find(outputs: dict[str, np.ndarray]) -> list[str]:
