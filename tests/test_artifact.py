@@ -25,7 +25,7 @@ from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.model import pack_features
 from mvitac.pack import Pack
 from mvitac.probe import parts
-from mvitac.publish import fit_readouts, push
+from mvitac.publish import card, fit_readouts, push
 from mvitac.record import digest_file
 from mvitac.retrieval import check_pack
 from mvitac.session import Session, probe_runs
@@ -102,6 +102,18 @@ def test_publish_command_and_card(smoke_run: Path, tmp_path: Path, capsys: pytes
     assert "columns, rows, checks" in text and "majority %" in text and "tests/toy.py" in text
     assert main(["publish", str(smoke_run), str(out)]) == 2
     assert "already exists" in capsys.readouterr().err
+
+
+def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:
+    model, manifest = mvitac.load(artifact), read_manifest(artifact)
+    assert "Encoders and probes: toy, by tests/toy.py. Licence: none." in card(model, manifest)
+    assert "pre-trained without labels" in card(model, manifest)
+    manifest["data"] = {"name": "other", "licence": "CC-BY", "source": "others"}
+    model.tasks = ("pattern",)  # as a supervised method leaves behind
+    text = card(model, manifest)
+    assert "# mvitac on toy" in text and "with linear probes on other." in text
+    assert "Encoders: toy, by tests/toy.py. Licence: none." in text and "Probes: other, by others. Licence: CC-BY." in text
+    assert "under: none, and CC-BY" in text and "without labels" not in text
 
 
 def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
