@@ -121,14 +121,20 @@ def test_int8_reports_what_it_keeps_and_runs(openvino: Path, pack: Pack, model: 
     assert cosines(found["embedding_touch"], model.embed(**images)["touch"].numpy()).min() > 0.9
 
 
-def test_torch_export_of_touch_alone(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+def test_torch_export_of_touch_alone(
+    smoke_run: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """From a run: the probes are fitted on the way; one modality: its own probe answers."""
     out = tmp_path / "touch"
     command = ["export", str(smoke_run), "--format", "torch", "--modality", "touch", "--out", str(out)]
     assert main([*command, "--threads", "1"]) == 0
     model = with_readouts(mvitac.load(smoke_run), pack)
     images = pack.images["touch"][:3]
-    found = Engine(out)(touch=images)
+    used: list[int] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "set_num_threads", used.append)
+        found = Engine(out, threads=3)(touch=images)
+    assert used == [3, torch.get_num_threads()] * 2  # with the inputs that travel with it, then with ours
     np.testing.assert_allclose(found["probability_pattern"], model.predict(touch=images)["pattern"], atol=1e-4)
     assert main([*command, "--threads", "1"]) == 2  # it is already there
 

@@ -191,9 +191,10 @@ def load(path: str | Path) -> Model:
     # The file holds every weight, so the frame needs none of its own, and must not reach for the network.
     frame = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
     # Shapes before memory: a header of a few bytes may name a network that is larger than this machine.
-    with torch.device("meta"):
-        check_tensors(file, fresh(frame, spec, stored).state_dict(), tensors)
-    model = fresh(frame, spec, stored)
+    with torch.random.fork_rng(devices=[]):  # the caller's chance is not ours to draw from
+        with torch.device("meta"):
+            check_tensors(file, fresh(frame, spec, stored).state_dict(), tensors)
+        model = fresh(frame, spec, stored)
     model.run = run
     model.load_state_dict(tensors)
     return model

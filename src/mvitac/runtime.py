@@ -143,10 +143,15 @@ def _torch(path: Path, precision: str, threads: int) -> Call:
             os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = forced
 
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        with torch.inference_mode():
-            return [
-                x.numpy() for x in module(*(torch.tensor(a) for a in arrays))
-            ]  # a copy: memory-mapped images are read-only
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            with torch.inference_mode():
+                return [
+                    x.numpy() for x in module(*(torch.tensor(a) for a in arrays))
+                ]  # a copy: memory-mapped images are read-only
+        finally:
+            torch.set_num_threads(before)
 
     return call
 
