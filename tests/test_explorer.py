@@ -34,7 +34,7 @@ def decode(text: str) -> dict[str, Any]:
     value = json.loads(text)
     value["xy"] = np.frombuffer(base64.b64decode(value["xy"]), "<u2").reshape(2, -1)
     value["row"] = np.frombuffer(base64.b64decode(value["row"]), "<i4")
-    value["colour"] = np.frombuffer(base64.b64decode(value["colour"]), np.uint8)
+    value["colour"] = np.frombuffer(base64.b64decode(value["colour"]), "<u2")
     return value
 
 
@@ -45,6 +45,17 @@ def test_points_carry_place_colour_and_row(land: Landscape, pack: Pack) -> None:
     names = [value["legend"][c][0] for c in value["colour"]]
     assert names == [pack.spec.tasks[0].classes[i] for i in pack.column("label_pattern")[rows]]
     np.testing.assert_allclose(value["xy"].T / 65535, land.plane("both")[rows], atol=1e-4)
+
+
+def test_more_classes_than_a_byte_counts(land: Landscape, monkeypatch: pytest.MonkeyPatch) -> None:
+    used = np.arange(300)
+    monkeypatch.setattr(land, "classes", {"pattern": [f"class {i}" for i in used]})
+    monkeypatch.setattr(land, "rows", used)
+    monkeypatch.setattr(land, "labels", {"pattern": used})
+    monkeypatch.setattr(land, "plane", lambda modality: np.zeros((300, 2)))
+    monkeypatch.setattr(land, "shown", lambda *a, **k: used)
+    value = decode(land.points("both", "label", "all", "pattern"))
+    assert [value["legend"][c][0] for c in value["colour"]] == [f"class {i}" for i in used]
 
 
 def test_twenty_colours_are_told_apart() -> None:

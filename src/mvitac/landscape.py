@@ -99,7 +99,7 @@ class Landscape:
         return json.dumps(
             {
                 "xy": _base64(xy),
-                "colour": _base64(np.searchsorted(used, values[index]).astype(np.uint8)),
+                "colour": _base64(np.searchsorted(used, values[index]).astype("<u2")),
                 "row": _base64(index.astype("<i4")),
                 "legend": legend,
             }
