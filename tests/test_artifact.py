@@ -112,7 +112,9 @@ def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Pat
     model.tasks = ("pattern",)  # as a supervised method leaves behind
     text = card(model, manifest)
     assert "# mvitac on toy" in text and "with linear probes on other." in text
-    assert "Encoders: toy, by tests/toy.py. Licence: none." in text and "Probes: other, by others. Licence: CC-BY." in text
+    assert (
+        "Encoders: toy, by tests/toy.py. Licence: none." in text and "Probes: other, by others. Licence: CC-BY." in text
+    )
     assert "under: none, and CC-BY" in text and "without labels" not in text
 
 

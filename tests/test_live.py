@@ -254,7 +254,7 @@ def test_what_is_simulated_is_asked_for() -> None:
     assert sources(pair, "0", ("sim",)) == {"vision": ("0",), "touch": ("sim",)}
     with pytest.raises(ValueError, match="takes vision too: give --vision SOURCE"):
         sources(pair, None, ("2",))
-    with pytest.raises(ValueError, match="takes touch too: .*--touch sim for a simulated one"):
+    with pytest.raises(ValueError, match=r"takes touch too: .*--touch sim for a simulated one"):
         sources(pair, "0", ())
     with pytest.raises(ValueError, match="no input for vision: leave --vision out"):
         sources(gripper, "0", ("2", "4"))

@@ -2,7 +2,8 @@
 
 Each touch sensor's background (no contact) is learned from its first frames and followed slowly while nothing is
 touched; it decides *whether* there is contact. The model sees frames as they are, or minus that background if it learned
-from difference images. Probabilities are averaged over one touch and forgotten with it. Time comes from a clock that is given. Shapes: frames uint8 RGB [H, W, 3].
+from difference images. Probabilities are averaged over one touch and forgotten with it. Time comes from a clock that is
+given. Shapes: frames uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations

@@ -147,13 +147,15 @@ def live(argv: list[str]) -> None:
 def sources(
     inputs: Mapping[str, Sequence[int]], vision: str | None, touch: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """What to open by modality, where an engine takes ``inputs`` (shapes [S, S, C] by modality): what was given, or simulated
+    """What to open by modality, for an engine's ``inputs`` (shapes [S, S, C] by modality): what was given, or simulated
     sensors if nothing was. ValueError if one of them is left out: what is simulated must not pass for real."""
     given = {m: texts for m, texts in (("vision", (vision,) if vision else ()), ("touch", tuple(touch))) if texts}
     if not given:
         return {m: tuple(f"sim:{i}" for i in range(shape[2] // 3)) for m, shape in inputs.items()}
     for modality in inputs.keys() - given.keys():
-        raise ValueError(f"the model takes {modality} too: give --{modality} SOURCE (--{modality} sim for a simulated one)")
+        raise ValueError(
+            f"the model takes {modality} too: give --{modality} SOURCE (--{modality} sim for a simulated one)"
+        )
     for modality in given.keys() - inputs.keys():
         raise ValueError(f"the model has no input for {modality}: leave --{modality} out")
     return given
@@ -163,8 +165,8 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     """An export as it is; anything else exported once, into the cache."""
     from mvitac.artifact import load
     from mvitac.export import export
-    from mvitac.publish import own_data, with_readouts
     from mvitac.model import safetensors_digest
+    from mvitac.publish import own_data, with_readouts
     from mvitac.record import cache_dir, digest
     from mvitac.registry import to_json
     from mvitac.runtime import FORMAT_VERSION, MANIFEST, Engine
