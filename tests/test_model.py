@@ -34,11 +34,11 @@ def model(run: Path) -> Model:
     return mvitac.load(run)
 
 
-def test_loading_draws_nothing_from_the_callers_chance(run: Path) -> None:
+def test_loading_draws_nothing_from_the_callers_chance(smoke_run: Path) -> None:
     torch.manual_seed(5)
     expected = torch.rand(2)
     torch.manual_seed(5)
-    mvitac.load(run)
+    mvitac.load(smoke_run)
     assert torch.equal(torch.rand(2), expected)
 
 
