@@ -311,7 +311,9 @@ def test_foreign_inputs_are_named(onnx: Path, pack: Pack) -> None:
         engine(vision=one[:, :16], touch=one)
 
 
-def test_impossible_requests_are_refused_first(model: Model, pack: Pack, tmp_path: Path) -> None:
+def test_impossible_requests_are_refused_first(
+    model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for options, message in (
         ({"kind": "torch", "int8": True}, "--int8 is for onnx and openvino"),
         ({"kind": "onnx", "precision": "bf16"}, "--format openvino"),
@@ -319,8 +321,13 @@ def test_impossible_requests_are_refused_first(model: Model, pack: Pack, tmp_pat
     ):
         with pytest.raises(ValueError, match=message):
             export(model, pack, tmp_path / "x", **options)
-    with pytest.raises(ValueError, match="cannot check this model"):
-        export(model, toy_pack(tmp_path / "p", size=40), tmp_path / "x")
+    larger = toy_pack(tmp_path / "p", size=40)
+    for options in ({"pack": larger}, {"pack": pack, "int8": True, "calibrate": larger}):
+        with pytest.raises(ValueError, match="p cannot check this model"):
+            export(model, out=tmp_path / "x", **options)
+    monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))
+    with pytest.raises(ValueError, match="at 32 px minus their background"):
+        export(model, pack, tmp_path / "x")
 
 
 def test_running_an_onnx_export_needs_no_torch() -> None:

@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,7 @@ from mvitac.graph import Graph
 from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.record import check_place, digest, digest_file, provenance, write_atomic, write_json
+from mvitac.retrieval import has_difference
 from mvitac.runtime import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST, Call, cosines, open_engine
 
 Kind = Literal["torch", "onnx", "openvino"]
@@ -83,15 +85,17 @@ def export(
         raise ValueError("--precision bf16 is a mode of openvino without --int8: give --format openvino")
     check_place(out)
     graph = Graph(model, modalities)
-    for modality, (_, _, channels) in graph.inputs.items():
+    for given, (modality, (_, _, channels)) in product((pack, calibrate or pack), graph.inputs.items()):
+        minus = modality == "touch" and model.spec.difference
         if (
-            modality not in pack.spec.modalities
-            or pack.spec.channels(modality) != channels
-            or pack.size != model.stored
+            modality not in given.spec.modalities
+            or given.spec.channels(modality) != channels
+            or given.size != model.stored
+            or (minus and not has_difference(given))
         ):
             raise ValueError(
-                f"{pack.path} cannot check this model: it needs {modality} images of {channels} channels"
-                f" at {model.stored} px, as the training data has"
+                f"{given.path} cannot check this model: it needs {modality} images of {channels} channels"
+                f" at {model.stored} px{' minus their background' * minus}, as the training data has"
             )
     tolerance = tolerance or TOLERANCES["int8" if int8 else precision]
     rows = pack.rows("test", having=graph.modalities)
