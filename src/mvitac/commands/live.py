@@ -149,7 +149,8 @@ def sources(
 ) -> dict[str, tuple[str, ...]]:
     """What to open by modality, for an engine's ``inputs`` (shapes [S, S, C] by modality): what was given, or simulated
     sensors if nothing was. ValueError if one of them is left out: what is simulated must not pass for real."""
-    given = {m: texts for m, texts in (("vision", (vision,) if vision else ()), ("touch", tuple(touch))) if texts}
+    given: dict[str, tuple[str, ...]] = {"vision": (vision,) if vision else (), "touch": tuple(touch)}
+    given = {modality: texts for modality, texts in given.items() if texts}
     if not given:
         return {m: tuple(f"sim:{i}" for i in range(shape[2] // 3)) for m, shape in inputs.items()}
     for modality in inputs.keys() - given.keys():
