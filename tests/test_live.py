@@ -614,7 +614,7 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
         for i in range(24):
             image = pack.images[m][0] if i < 12 else 255 - pack.images[m][0]
             Image.fromarray(image ^ np.uint8(i % 2)).save(tmp_path / m / f"{i:03d}.png")
-    command = ["live", str(onnx), "--vision", f"{tmp_path / 'vision'}@200", "--touch", f"{tmp_path / 'touch'}@200"]
+    command = ["live", str(onnx), "--vision", f"{tmp_path / 'vision'}@20", "--touch", f"{tmp_path / 'touch'}@20"]
     assert main([*command, "--calibration", "2", "--stale", "60", "--json", str(tmp_path / "s.json")]) == 0
     summary = json.loads((tmp_path / "s.json").read_text())
     assert summary["streams"]["touch"]["frames"] == 24 and summary["events"]["ended"] == 2
