@@ -113,7 +113,7 @@ def _check_scored(runs: Sequence[Finished], result: dict[str, Any]) -> None:
 
 
 def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finished]:
-    """``runs`` by the names that ``result`` has for them: it may be older, or of more runs."""
+    """``runs`` by the names that ``result`` has for them: it may be older."""
     records = [*result["retrieval"], *result["records"]]
     names = {Path(r["run"]).resolve(): r["source"].removesuffix(END_TO_END) for r in records if "run" in r}
     return [replace(run, source=names.get(run.path.resolve(), run.source)) for run in runs]
