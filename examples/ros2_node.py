@@ -95,6 +95,7 @@ class Kept:
 
     def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
         self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
+        self.difference = engine.difference
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
         self.outputs.update(self.engine(**images))
@@ -114,7 +115,7 @@ def main() -> None:
             parser.error(f"the model takes {takes} {modality} topic(s): give --{modality} TOPIC as many times")
 
     import rclpy  # pyright: ignore[reportMissingImports]
-    from rclpy.qos import qos_profile_sensor_data  # pyright: ignore[reportMissingImports]
+    from rclpy.qos import QoSProfile, ReliabilityPolicy  # pyright: ignore[reportMissingImports]
     from sensor_msgs.msg import Image  # pyright: ignore[reportMissingImports]
     from std_msgs.msg import Float32MultiArray, String  # pyright: ignore[reportMissingImports]
 
@@ -130,12 +131,11 @@ def main() -> None:
         publisher.publish(message(data=value))
 
     node = Node(engine, publish, warn=ros.get_logger().warning)
+    # A queue of one: the five of the usual profile of sensors would come oldest first, and pass for new.
+    newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     for modality, topics in (("vision", options.vision), ("touch", options.touch)):
         for which, topic in enumerate(topics):
-            # Sensor data QoS: best effort, newest first; an old frame is of no use to us.
-            ros.create_subscription(
-                Image, topic, lambda m, k=modality, i=which: node.image(k, m, i), qos_profile_sensor_data
-            )
+            ros.create_subscription(Image, topic, lambda m, k=modality, i=which: node.image(k, m, i), newest)
     ros.create_timer(0.1, node.tick)
     try:
         rclpy.spin(ros)

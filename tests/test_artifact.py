@@ -6,6 +6,7 @@ import json
 import pickle
 import shutil
 from collections.abc import Callable
+from copy import copy as copied
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,14 +18,16 @@ import safetensors.torch
 import torch
 
 import mvitac
-from mvitac.artifact import read_manifest, seal
+from mvitac.artifact import preprocessing, read_manifest, seal
 from mvitac.cli import main
 from mvitac.datasets.packed import PackConfig
+from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.model import pack_features
 from mvitac.pack import Pack
 from mvitac.probe import parts
-from mvitac.publish import fit_readouts, push
+from mvitac.publish import card, fit_readouts, push
 from mvitac.record import digest_file
+from mvitac.retrieval import check_pack
 from mvitac.session import Session, probe_runs
 
 
@@ -99,6 +102,41 @@ def test_publish_command_and_card(smoke_run: Path, tmp_path: Path, capsys: pytes
     assert "columns, rows, checks" in text and "majority %" in text and "tests/toy.py" in text
     assert main(["publish", str(smoke_run), str(out)]) == 2
     assert "already exists" in capsys.readouterr().err
+
+
+def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:
+    model, manifest = mvitac.load(artifact), read_manifest(artifact)
+    assert "Encoders and probes: toy, by tests/toy.py. Licence: none." in card(model, manifest)
+    assert "pre-trained without labels" in card(model, manifest)
+    manifest["data"] = {"name": "other", "licence": "CC-BY", "source": "others"}
+    model.tasks = ("pattern",)  # as a supervised method leaves behind
+    text = card(model, manifest)
+    assert "# mvitac on toy" in text and "with linear probes on other." in text
+    assert (
+        "Encoders: toy, by tests/toy.py. Licence: none." in text and "Probes: other, by others. Licence: CC-BY." in text
+    )
+    assert "under: none, and CC-BY" in text and "without labels" not in text
+
+
+def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+    """By model and card, also of a model whose file is from before its header said so; raw packs are not taken for them."""
+    model = mvitac.load(smoke_run)
+    assert preprocessing(model)["background"].startswith("none is subtracted") and check_pack(model, pack)
+    for data, spec in (
+        (MaterialsConfig(difference=True), model.spec),
+        (model.run.data, replace(model.spec, difference=True)),
+    ):
+        other = mvitac.load(smoke_run)
+        other.run, other.spec = replace(model.run, data=data), spec
+        other.save(tmp_path / "model.safetensors")
+        found = mvitac.load(tmp_path / "model.safetensors")
+        given = preprocessing(found)
+        assert found.spec.difference and given["difference"] and given["background"].startswith("subtracted: touch is")
+        with pytest.raises(ValueError, match="the model was trained on difference images"):
+            check_pack(found, pack)
+        old = copied(pack)
+        old.meta = {**pack.meta, "fingerprint": {"options": {"difference": True}}}
+        assert check_pack(found, old) == ("vision", "touch")
 
 
 def test_a_pickle_is_never_opened(copy: Path, tmp_path: Path) -> None:

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from toy import toy_pack
+from toy import reordered, toy_pack
 
 import mvitac
+import mvitac.export as exports
 from mvitac import graph as graphs
 from mvitac.cli import main
 from mvitac.datasets.packed import PackConfig
@@ -120,16 +121,47 @@ def test_int8_reports_what_it_keeps_and_runs(openvino: Path, pack: Pack, model: 
     assert cosines(found["embedding_touch"], model.embed(**images)["touch"].numpy()).min() > 0.9
 
 
-def test_torch_export_of_touch_alone(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+def test_torch_export_of_touch_alone(
+    smoke_run: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """From a run: the probes are fitted on the way; one modality: its own probe answers."""
     out = tmp_path / "touch"
     command = ["export", str(smoke_run), "--format", "torch", "--modality", "touch", "--out", str(out)]
     assert main([*command, "--threads", "1"]) == 0
     model = with_readouts(mvitac.load(smoke_run), pack)
     images = pack.images["touch"][:3]
-    found = Engine(out)(touch=images)
+    used: list[int] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "set_num_threads", used.append)
+        found = Engine(out, threads=3)(touch=images)
+    assert used == [3, torch.get_num_threads()] * 2  # with the inputs that travel with it, then with ours
     np.testing.assert_allclose(found["probability_pattern"], model.predict(touch=images)["pattern"], atol=1e-4)
     assert main([*command, "--threads", "1"]) == 2  # it is already there
+
+
+def test_rows_that_check_and_calibrate_are_of_every_class(
+    model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although the pack's three classes take turns: every third test row, or the first ones, would be of one."""
+    monkeypatch.setattr(exports, "NUM_CALIBRATION", 20)
+    rows = {r.tobytes(): i for i, r in enumerate(pack.images["touch"])}
+    labels = pack.column("label_pattern")
+    ranges = [rows[touch[0].tobytes()] for _, touch in exports._examples(Graph(model), pack)]
+    assert len(set(ranges)) == 20 and set(pack.column("split")[ranges]) == {"train"}
+    assert np.bincount(labels[ranges]).min() >= 3
+    seen: list[int] = []
+
+    class Stop(Exception):
+        pass
+
+    def checked(model: Model, graph: Graph, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+        seen.extend(rows.tolist())
+        raise Stop
+
+    monkeypatch.setattr(exports, "reference", checked)
+    with pytest.raises(Stop):
+        export(model, pack, tmp_path / "x", kind="torch", num_rows=len(pack.rows("test")) // 3)
+    assert np.bincount(labels[seen], minlength=3).min() >= 1 and set(pack.column("split")[seen]) == {"test"}
 
 
 def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:
@@ -187,6 +219,16 @@ def test_corrupted_weights_in_the_graph_leave_no_export(
     with pytest.raises(ValueError, match="not the trained model"):
         export(model, pack, tmp_path / "x", kind="torch")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_accuracy_is_of_classes_by_name(model: Model, pack: Pack) -> None:
+    """The pack that checks may number them otherwise, and may lack a task."""
+    graph, other = Graph(model), reordered(pack)
+    found = check(model, graph, other)["accuracy"]
+    assert found == check(model, graph, pack)["accuracy"] and set(found) == {"pattern", "bright"}
+    assert found["pattern"]["original"] == 100 * model.readouts["pattern.both"].question.accuracy
+    other.spec = replace(pack.spec, tasks=pack.spec.tasks[:1])
+    assert set(check(model, graph, other)["accuracy"]) == {"pattern"}
 
 
 def test_lost_accuracy_stops_an_export(model: Model, pack: Pack) -> None:
@@ -269,7 +311,9 @@ def test_foreign_inputs_are_named(onnx: Path, pack: Pack) -> None:
         engine(vision=one[:, :16], touch=one)
 
 
-def test_impossible_requests_are_refused_first(model: Model, pack: Pack, tmp_path: Path) -> None:
+def test_impossible_requests_are_refused_first(
+    model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for options, message in (
         ({"kind": "torch", "int8": True}, "--int8 is for onnx and openvino"),
         ({"kind": "onnx", "precision": "bf16"}, "--format openvino"),
@@ -277,8 +321,13 @@ def test_impossible_requests_are_refused_first(model: Model, pack: Pack, tmp_pat
     ):
         with pytest.raises(ValueError, match=message):
             export(model, pack, tmp_path / "x", **options)
-    with pytest.raises(ValueError, match="cannot check this model"):
-        export(model, toy_pack(tmp_path / "p", size=40), tmp_path / "x")
+    larger = toy_pack(tmp_path / "p", size=40)
+    for options in ({"pack": larger}, {"pack": pack, "int8": True, "calibrate": larger}):
+        with pytest.raises(ValueError, match="p cannot check this model"):
+            export(model, out=tmp_path / "x", **options)
+    monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))
+    with pytest.raises(ValueError, match="at 32 px minus their background"):
+        export(model, pack, tmp_path / "x")
 
 
 def test_running_an_onnx_export_needs_no_torch() -> None:

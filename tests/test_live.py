@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from faults import Clock, Rig, World, faulty
 from PIL import Image
+from rich.console import Console
 
+from mvitac.artifact import seal
 from mvitac.cameras import Camera, Folder, Simulated, source
 from mvitac.capture import CaptureThread, Stream
 from mvitac.cli import main
+from mvitac.commands.live import _engine, sources, view
 from mvitac.datasets.lerobot import LeRobotConfig
+from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.packing import build
-from mvitac.realtime import Contact, Live, LiveConfig
+from mvitac.realtime import Contact, Live, LiveConfig, neighbours
 from mvitac.recording import Recorder, finish
 from mvitac.runtime import Engine
 from mvitac.window import Window, draw
@@ -29,11 +37,19 @@ def engine(onnx: Path) -> Engine:
     return Engine(onnx, threads=1)
 
 
+def shown(loop: Live) -> str:
+    """The terminal's picture, as text."""
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(view(loop))
+    return console.export_text()
+
+
 class Slow:
     """The engine, taking 4 ms of the fake clock."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine, self.inputs, self.classes, self.meta = engine, engine.inputs, engine.classes, engine.meta
+        self.difference = engine.difference
         self.clock: Clock | None = None
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
@@ -71,6 +87,26 @@ def test_an_answer_is_the_mean_of_its_touch(engine: Engine) -> None:
     mean = np.mean(said, axis=0)
     name, confidence = world.live.answers(world.live.last)["pattern"]
     assert confidence == pytest.approx(mean.max()) and name == engine.classes["pattern"][mean.argmax()]
+
+
+def test_a_model_of_difference_images_sees_a_touch_minus_its_background(engine: Engine) -> None:
+    """In contact the middle of the picture is 80 brighter than before: 40 above one half. What is recorded is as it came."""
+    seen: list[np.ndarray] = []
+    kept: list[np.ndarray] = []
+
+    class Minus(Slow):
+        def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+            seen.append(images["touch"][0].astype(float))
+            return self.engine(**images)
+
+    slow = Minus(engine)
+    slow.difference = True
+    world = World(slow, record=lambda images, columns: kept.append(images["touch"]))
+    world.run(6)
+    assert len(seen) > 20 and np.array_equal(kept[-1], world.rigs["touch"].picture)
+    for touch in seen:
+        assert touch[8:24, 8:24].mean() == pytest.approx(168, abs=1.5)
+        assert touch[:8].mean() == pytest.approx(128, abs=1.5) and np.abs(touch[:8] - 128).max() <= 3
 
 
 def test_age_is_from_capture_to_answer(engine: Engine) -> None:
@@ -112,10 +148,41 @@ def test_a_touch_ends_with_its_stream(engine: Engine) -> None:
     for fault in ("stalled", "unplugged"):
         world = World(engine)
         world.run(2.5)
-        assert world.live.touch is not None
+        assert world.live.touch is not None and "CONTACT" in shown(world.live)
         world.rigs["touch"].fault = fault
         world.run(1)
         assert world.live.touch is None and world.live.last is not None
+        assert world.live.contact is None and "CONTACT" not in shown(world.live)
+
+
+def test_a_frame_that_comes_while_others_are_taken_is_used_once(engine: Engine) -> None:
+    world = World(engine)
+    world.run(2.5)
+    [stream] = world.streams["touch"]
+    newest, before = stream.newest, world.live.num_predictions
+
+    def meanwhile(*, take: bool = True) -> Any:
+        if take:
+            stream.newest = newest  # type: ignore[method-assign]
+            stream.pump()
+        return newest(take=take)
+
+    stream.pump()
+    stream.newest = meanwhile  # type: ignore[method-assign]
+    assert world.live.tick() and not world.live.tick()
+    assert world.live.num_predictions == before + 1
+
+
+def test_a_background_is_forgotten_between_frames(engine: Engine) -> None:
+    """Not by the thread that noticed, while another compares a frame with it."""
+    world = World(engine)
+    world.run(2)
+    contact = world.live.contacts["touch"]
+    world.rigs["touch"].fault = "resolution"
+    world.streams["touch"][0].pump()  # as the capture thread does
+    assert contact.background is not None
+    world.live.tick()
+    assert contact.background is None and world.live.contact is None
 
 
 def test_minutes_of_faults(engine: Engine) -> None:
@@ -177,6 +244,43 @@ def test_streams_must_fit_the_model(engine: Engine) -> None:
         Live(engine, {"vision": streams["vision"]})
     with pytest.raises(ValueError, match="no input for smell"):
         Live(engine, {**streams, "smell": streams["touch"]})
+
+
+def test_what_is_simulated_is_asked_for() -> None:
+    """All of it, where no source is given; else a forgotten camera would pass for a real one."""
+    pair, gripper = {"vision": (32, 32, 3), "touch": (32, 32, 3)}, {"touch": (32, 32, 6)}
+    assert sources(pair, None, ()) == {"vision": ("sim:0",), "touch": ("sim:0",)}
+    assert sources(gripper, None, ()) == {"touch": ("sim:0", "sim:1")}
+    assert sources(pair, "0", ("sim",)) == {"vision": ("0",), "touch": ("sim",)}
+    with pytest.raises(ValueError, match="takes vision too: give --vision SOURCE"):
+        sources(pair, None, ("2",))
+    with pytest.raises(ValueError, match=r"takes touch too: .*--touch sim for a simulated one"):
+        sources(pair, "0", ())
+    with pytest.raises(ValueError, match="no input for vision: leave --vision out"):
+        sources(gripper, "0", ("2", "4"))
+
+
+@pytest.mark.parametrize("wrong", [{"neighbours": 0}, {"min_confidence": 7.0}, {"min_confidence": -0.1}])
+def test_settings_that_cannot_be_are_refused_at_the_start(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="neighbours must be >= 1"):
+        LiveConfig(**wrong)
+
+
+def test_known_touches_are_compared_by_what_the_model_sees(tmp_path: Path) -> None:
+    banks = {m: np.eye(3, dtype=np.float32) for m in ("vision", "touch")}
+    index = SimpleNamespace(
+        meta={"space": "shared"},
+        banks=banks,
+        table=pa.table({"id": ["a", "b", "c"]}),
+        labels=lambda row: {"task": f"class {row}"},
+        folder=tmp_path,
+    )
+    query = np.array([[0.1, 2.0, 0.0]], np.float32)
+    for inputs, key in ((("vision",), "shared_vision"), (("vision", "touch"), "shared_touch")):
+        assert neighbours(index, 2, inputs)({key: query}) == ["b (class 1)", "a (class 0)"]
+    del banks["vision"]
+    with pytest.raises(ValueError, match="holds no vision to compare with"):
+        neighbours(index, 2, ("vision",))
 
 
 def test_sources_by_name(tmp_path: Path) -> None:
@@ -379,6 +483,16 @@ def test_a_recording_of_a_gripper_is_packed_again_as_it_was(tmp_path: Path) -> N
         assert np.array_equal(images, np.stack([pair[modality] for pair in kept]))
 
 
+def test_a_gap_is_not_made_up_for(tmp_path: Path) -> None:
+    """At most fps pairs a second: also at the start, and after a gap."""
+    recorder = Recorder(tmp_path / "pack", {"touch": 3}, fps=1.0)
+    image = np.zeros((16, 16, 3), np.uint8)
+    for i in [*range(0, 70), *range(130, 200)]:  # 30 frames a second
+        recorder({"touch": image}, {"time": i / 30, "contact": True, "touch_number": 1})
+    kept = [columns["time"] for _, columns in recorder.waiting]
+    assert kept == pytest.approx([0, 1, 2, 130 / 30, 160 / 30, 190 / 30])
+
+
 def test_a_rate_that_cannot_be_recorded(tmp_path: Path) -> None:
     for form, fps, says in (("lerobot", 2.5, "fps 2.5: .* whole number"), ("pack", 0.0, "more than 0")):
         with pytest.raises(ValueError, match=says):
@@ -408,12 +522,19 @@ def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
         finish(tmp_path / "other")
 
 
+def test_a_recording_that_nothing_came_of_is_not_in_the_way(tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    Recorder(out, {"touch": 3})  # killed before its first part
+    assert finish(out) == 0 and not list(tmp_path.iterdir())
+    assert Recorder(out, {"touch": 3}).close() == 0 and not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("modalities", [("vision", "touch"), ("touch",)])
 def test_the_picture_shows_frames_contact_and_answers(engine: Engine, modalities: tuple[str, ...]) -> None:
     class Part:
         """The engine, of some of its inputs."""
 
-        inputs, classes = {m: engine.inputs[m] for m in modalities}, engine.classes
+        inputs, classes, difference = {m: engine.inputs[m] for m in modalities}, engine.classes, False
 
         def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
             zeros = {m: np.zeros((1, *shape), np.uint8) for m, shape in engine.inputs.items()}
@@ -464,6 +585,28 @@ def test_a_window_or_why_not(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert (shown[0] == (0, 0, 200)).all()  # red, as OpenCV orders it
 
 
+def test_each_artifact_of_a_run_is_exported_for_itself(
+    artifact: Path, onnx: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once: their weights are the same, their probes are not."""
+    other = shutil.copytree(artifact, tmp_path / "other")
+    manifest = json.loads((other / "artifact.json").read_text())
+    for question in manifest["probes"]:
+        question["classes"].reverse()
+    (other / "artifact.json").write_text(json.dumps({**manifest, "digest": seal(manifest)}))
+    made: list[tuple[str, ...]] = []
+
+    def exported(model: Model, pack: Pack, out: Path, **options: Any) -> None:
+        made.append(model.classes["pattern"])
+        shutil.copytree(onnx, out)
+
+    monkeypatch.setattr("mvitac.export.export", exported)
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
+    for model in (artifact, other, artifact):
+        assert _engine(str(model), 1, Console(quiet=True)).classes.keys() == {"pattern", "bright"}
+    assert made == [("columns", "rows", "checks"), ("checks", "rows", "columns")]
+
+
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Threads, files and the terminal view together; ends when the files do."""
     for m in ("vision", "touch"):
@@ -471,12 +614,13 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
         for i in range(24):
             image = pack.images[m][0] if i < 12 else 255 - pack.images[m][0]
             Image.fromarray(image ^ np.uint8(i % 2)).save(tmp_path / m / f"{i:03d}.png")
-    command = ["live", str(onnx), "--vision", f"{tmp_path / 'vision'}@200", "--touch", f"{tmp_path / 'touch'}@200"]
+    command = ["live", str(onnx), "--vision", f"{tmp_path / 'vision'}@20", "--touch", f"{tmp_path / 'touch'}@20"]
     assert main([*command, "--calibration", "2", "--stale", "60", "--json", str(tmp_path / "s.json")]) == 0
     summary = json.loads((tmp_path / "s.json").read_text())
     assert summary["streams"]["touch"]["frames"] == 24 and summary["events"]["ended"] == 2
     shown = capsys.readouterr().out
     assert "has no more frames" in shown and "touch: 24 frames" in shown
     assert summary["touches"] >= 1 and "touch 1 (" in shown  # also of a touch that the end of the files cut short
+    assert main([*command, "--json", str(tmp_path)]) == 2 and "is a folder" in capsys.readouterr().err
     for wrong in (["--stale", "0"], ["--seconds", "-1"]):
         assert main([*command, *wrong]) == 2 and "more than 0" in capsys.readouterr().err

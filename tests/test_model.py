@@ -34,6 +34,14 @@ def model(run: Path) -> Model:
     return mvitac.load(run)
 
 
+def test_loading_draws_nothing_from_the_callers_chance(smoke_run: Path) -> None:
+    torch.manual_seed(5)
+    expected = torch.rand(2)
+    torch.manual_seed(5)
+    mvitac.load(smoke_run)
+    assert torch.equal(torch.rand(2), expected)
+
+
 def test_embed_equals_the_probes_features(model: Model, pack: Pack) -> None:
     rows = np.array([3, 50, 119])
     for modality in ("vision", "touch"):

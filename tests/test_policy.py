@@ -157,7 +157,9 @@ class FakeRos:
             "rclpy": SimpleNamespace(
                 init=lambda args: None, create_node=lambda name: self, spin=self.spin, shutdown=lambda: None
             ),
-            "rclpy.qos": SimpleNamespace(qos_profile_sensor_data="best effort"),
+            "rclpy.qos": SimpleNamespace(
+                QoSProfile=lambda **given: given, ReliabilityPolicy=SimpleNamespace(BEST_EFFORT="best effort")
+            ),
             "sensor_msgs.msg": SimpleNamespace(Image=message),
             "std_msgs.msg": SimpleNamespace(Float32MultiArray=message, String=message),
         }
@@ -166,6 +168,7 @@ class FakeRos:
         return SimpleNamespace(publish=lambda m: self.sent.append((topic, m.data)))
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
+        assert qos == {"depth": 1, "reliability": "best effort"}  # a queue would hand over old frames as new ones
         self.callbacks[topic] = callback
 
     def create_timer(self, period: float, callback: Any) -> None:

@@ -302,6 +302,8 @@ def test_mistakes_end_in_one_line(
     other = train(smoke(pack, seed=7), tmp_path / "other", quiet=True)
     with pytest.raises(ValueError, match=r"does not score .*other"):
         write_report([other], tmp_path, result=result, quiet=True)
+    with pytest.raises(ValueError, match=r"scores .*run1 too: show that run as well"):
+        write_report([materials / "run0"], tmp_path, result=result, quiet=True)
     (tmp_path / "odd.json").write_text("[1]")
     assert main(["report", str(other), "--probe", str(tmp_path / "odd.json"), "--quiet"]) == 2
     assert "not a probe result" in capsys.readouterr().err

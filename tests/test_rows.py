@@ -316,6 +316,7 @@ def pressed(root: Path) -> Table:
 def test_backgrounds_by_row(tmp_path: Path) -> None:
     rows = pressed(tmp_path)
     pack = packed(table(tmp_path / "m.csv", rows), tmp_path / "p", labels=("label",), difference=True)
+    assert pack.spec.difference
     for i, name in enumerate(pack.column("id")):
         number = int(name) - 1
         assert (pack.images["touch"][i] == (rows[number]["value"] - 50 - number + 256) // 2).all()

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.registry import from_json, to_json
 from mvitac.sim import gel
 from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, area_resize, background, press, pressure, relax, render
 from mvitac.sim.materials import CLASSES, draw_instance, touch
 from mvitac.sim.relief import KINDS, Relief, draw_tables, noise
 from mvitac.source import Sample
+from mvitac.spec import DataSpec
 
 LIST = "import sys; from mvitac.sim.materials import touch; import hashlib; p = touch(3, 7, 2, 1, size=32); "
 PRINT = "print(hashlib.sha256(p['vision'].tobytes() + p['touch'].tobytes()).hexdigest())"
@@ -74,6 +76,9 @@ def test_the_held_out_sensor_is_never_drawn_otherwise():
 def test_difference_images_are_of_the_same_sensor_before_contact():
     plain, differing = (MaterialsConfig(num=60, size=32, difference=d).source() for d in (False, True))
     assert "difference" not in plain.fingerprint(), "packs made before there was a choice stay known"
+    assert "difference" not in to_json(plain.spec()) and from_json(DataSpec, to_json(plain.spec())) == plain.spec()
+    assert to_json(differing.spec())["difference"] is True
+    assert from_json(DataSpec, to_json(differing.spec())) == differing.spec() == replace(plain.spec(), difference=True)
     assert differing.fingerprint() != plain.fingerprint()
     reached = []
     for item in (0, 23, 47):

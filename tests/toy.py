@@ -5,11 +5,13 @@ The three patterns (columns, rows, checks) stay themselves under a horizontal fl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import copy
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from mvitac.pack import Pack
 from mvitac.packing import build
@@ -86,6 +88,16 @@ class Counting(Toy):
     def read(self, item: int) -> list[Sample]:
         self.seen.append(item)
         return super().read(item)
+
+
+def reordered(pack: Pack) -> Pack:
+    """``pack``, its patterns numbered the other way round."""
+    other = copy.copy(pack)
+    first, *rest = pack.spec.tasks
+    other.spec = replace(pack.spec, tasks=(replace(first, classes=first.classes[::-1]), *rest))
+    at, labels = pack.table.column_names.index("label_pattern"), NUM_CLASSES - 1 - pack.column("label_pattern")
+    other.table = pack.table.set_column(at, "label_pattern", pa.array(labels))
+    return other
 
 
 def toy_pack(path: Path, size: int = 32, **kwargs: Any) -> Pack:

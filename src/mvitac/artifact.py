@@ -36,6 +36,11 @@ PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".npy", ".npz", ".
 """Files that some program may unpickle; an artifact has none, so one that does was tampered with."""
 MAX_HEADER, MAX_MANIFEST = 4 << 20, 1 << 20
 """Bytes: a ResNet's safetensors header takes some 20 kB; a header of gigabytes is an attack on memory."""
+AS_GIVEN = "none is subtracted: tactile images are used as the sensor gives them"
+SUBTRACTED = (
+    "subtracted: touch is (touch - background) / 2 + 128, the background being what the sensor shows without contact;"
+    " `mvitac live` learns it and does this, whoever calls the model or its export does it first"
+)
 HUB_ID = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(@(?P<revision>[\w./-]+))?")
 
 
@@ -103,7 +108,8 @@ def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]
         "resize": "squash to stored (Pillow bilinear), then to size (antialiased bilinear)",
         "mean": list(IMAGENET_MEAN),
         "std": list(IMAGENET_STD),
-        "background": "none is subtracted: tactile images are used as the sensor gives them",
+        "difference": model.spec.difference,
+        "background": SUBTRACTED if model.spec.difference else AS_GIVEN,
         "sensors": list(sensors),
     }
 

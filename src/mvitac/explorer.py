@@ -108,7 +108,7 @@ def page(lands: dict[str, Landscape]) -> Any:
             with gr.Column(min_width=240):
                 given = gr.Image(label="your picture", type="numpy", image_mode="RGB", sources=["upload", "clipboard"])
                 kind = gr.Radio(list(first.x), value=next(iter(first.x)), label="it is a picture of")
-                ask = gr.Button("Query and classify")
+                ask = gr.Button("Query and classify" + (f" by {next(iter(lands))}" if len(lands) > 1 else ""))
             with gr.Column(min_width=240):
                 said = gr.Markdown()
                 alike = gr.Gallery(label="most alike", columns=3, height=320, object_fit="contain")

@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,10 +25,12 @@ import torch
 
 from mvitac.artifact import preprocessing
 from mvitac.encoders import IMAGENET_MEAN, IMAGENET_STD
+from mvitac.features import sample
 from mvitac.graph import Graph
 from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.record import check_place, digest, digest_file, provenance, write_atomic, write_json
+from mvitac.retrieval import has_difference
 from mvitac.runtime import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST, Call, cosines, open_engine
 
 Kind = Literal["torch", "onnx", "openvino"]
@@ -82,21 +85,23 @@ def export(
         raise ValueError("--precision bf16 is a mode of openvino without --int8: give --format openvino")
     check_place(out)
     graph = Graph(model, modalities)
-    for modality, (_, _, channels) in graph.inputs.items():
+    for given, (modality, (_, _, channels)) in product((pack, calibrate or pack), graph.inputs.items()):
+        minus = modality == "touch" and model.spec.difference
         if (
-            modality not in pack.spec.modalities
-            or pack.spec.channels(modality) != channels
-            or pack.size != model.stored
+            modality not in given.spec.modalities
+            or given.spec.channels(modality) != channels
+            or given.size != model.stored
+            or (minus and not has_difference(given))
         ):
             raise ValueError(
-                f"{pack.path} cannot check this model: it needs {modality} images of {channels} channels"
-                f" at {model.stored} px, as the training data has"
+                f"{given.path} cannot check this model: it needs {modality} images of {channels} channels"
+                f" at {model.stored} px{' minus their background' * minus}, as the training data has"
             )
     tolerance = tolerance or TOLERANCES["int8" if int8 else precision]
     rows = pack.rows("test", having=graph.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split test: an export is checked on rows nobody trained on")
-    rows = rows[:: max(1, len(rows) // num_rows)][:num_rows]
+    rows = sample(rows, num_rows)
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -141,12 +146,11 @@ def export(
 
 
 def _examples(graph: Graph, pack: Pack) -> list[list[np.ndarray]]:
-    """Single real inputs, spread over the train rows of ``pack``."""
+    """Single real inputs, a sample of the train rows of ``pack``."""
     rows = pack.rows("train", "unlabelled", having=graph.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no rows in split train: int8 takes its ranges from them")
-    rows = rows[:: max(1, len(rows) // NUM_CALIBRATION)][:NUM_CALIBRATION]
-    return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in rows]
+    return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in sample(rows, NUM_CALIBRATION)]
 
 
 def _write(graph: Graph, folder: Path, kind: Kind, examples: list[list[np.ndarray]] | None) -> None:
@@ -267,8 +271,8 @@ def parity(
                 f"the export is not the trained model: {name} has cosine {values.min():.4f} on real inputs, at least"
                 f" {tolerance.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows)}"
             )
-    for task in graph.classes:
-        labels = pack.column(f"label_{task}")[rows] if f"label_{task}" in pack.table.column_names else np.full(1, -1)
+    for task, known in graph.classes.items():
+        labels = labels_of(pack, task, known, rows)
         if not (labels >= 0).any():
             continue
         name = f"probability_{task}"
@@ -281,6 +285,15 @@ def parity(
                 f" {len(rows)} here are few, or allow more, --accuracy-loss"
             )
     return report
+
+
+def labels_of(pack: Pack, task: str, classes: list[str], rows: np.ndarray) -> np.ndarray:
+    """Labels [len(rows)] of pack rows as numbers of ``classes``, by name; -1 = unlabelled, or a class not among them."""
+    own = next((t.classes for t in pack.spec.tasks if t.name == task), None)
+    if own is None:
+        return np.full(len(rows), -1)
+    numbers = np.array([*(classes.index(name) if name in classes else -1 for name in own), -1])
+    return numbers[pack.column(f"label_{task}")[rows].astype(int)]
 
 
 def explain(model: Model, modality: str, found: dict[str, np.ndarray], pack: Pack, rows: np.ndarray) -> str:

@@ -9,6 +9,14 @@ from mvitac.pack import Pack
 from mvitac.record import cache_dir, digest, write_atomic
 
 
+def sample(rows: np.ndarray, num: int) -> np.ndarray:
+    """At most ``num`` of ``rows``, in their order, the same ones at every call.
+
+    By chance: packs take their classes in turn, and every n-th row would be of the same few.
+    """
+    return np.sort(np.random.default_rng(0).choice(rows, min(num, len(rows)), replace=False))
+
+
 def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:
     """Features [len(rows), D] float32, computed once and cached by weights, data, rows and side (``Model.features``)."""
     device = next(model.parameters()).device

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mvitac import diagnostics, figures, page
 from mvitac.evidence import Study
-from mvitac.features import features
+from mvitac.features import features, sample
 
 NUM_MAP, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
 
@@ -74,7 +74,7 @@ def embed_2d(values: np.ndarray) -> np.ndarray:
 def feature_maps(study: Study) -> str:
     """A plane per modality, of the first run's features."""
     split, rows = study.rows()
-    rows = np.sort(np.random.default_rng(0).choice(rows, min(NUM_MAP, len(rows)), replace=False))
+    rows = sample(rows, NUM_MAP)
     if len(rows) < 8:
         return ""
     task = study.pack.spec.tasks[0] if study.pack.spec.tasks else None
@@ -115,7 +115,7 @@ def gallery(study: Study) -> str:
     groups = torch.from_numpy(np.unique(names, return_inverse=True)[1])
     labels = study.labels(rows)
     classes: tuple[str, ...] = pack.spec.tasks[0].classes if pack.spec.tasks else ()
-    chosen = np.sort(np.random.default_rng(0).choice(len(rows), min(NUM_QUERIES, len(rows)), replace=False))
+    chosen = sample(np.arange(len(rows)), NUM_QUERIES)
     by, halves = pack.spec.group_by, []
 
     def shown(modality: str, row: int) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvitac.features import features
+from mvitac.features import features, sample
 from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.publish import with_readouts
@@ -32,27 +32,31 @@ class Landscape:
     """One run's rows: ``rows`` [N] pack rows, ``x[modality]`` [N, D] unit features, ``guess[task]`` [N]."""
 
     def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
-        """At most ``limit`` rows are shown, evenly spread, of those that lack no image. The probes are fitted on the run's
-        data if it has none. ValueError if the pack's images do not fit the model.
+        """At most ``limit`` rows are shown, a sample of those that lack no image. A model without probes gets them fitted on
+        ``pack``. ValueError if the pack's images do not fit the model.
         """
         names = check_pack(model, pack)
         self.model, self.pack = with_readouts(model, pack), pack
         whole = np.flatnonzero(np.all([pack.has(m) for m in names], axis=0))
         if not len(whole):
             raise ValueError(f"{pack.path} has no row with {' and '.join(names)}: there is nothing to show")
-        self.rows = whole[:: max(1, -(-len(whole) // limit))]
+        self.rows = sample(whole, limit)
         raw = {m: features(model, pack, m, self.rows) for m in names}
         self.x = {m: _unit(f) for m, f in raw.items()}
         self.modalities = (*raw, *(["both"] if len(raw) == 2 else []))
         self.split = pack.column("split")[self.rows].astype(str)
         self.labels = {t.name: pack.column(f"label_{t.name}")[self.rows].astype(int) for t in pack.spec.tasks}
-        self.classes = {t.name: t.classes for t in pack.spec.tasks}
+        self.classes: dict[str, tuple[str, ...]] = {t.name: t.classes for t in pack.spec.tasks}
         self.guess: dict[str, np.ndarray] = {}
-        for task in self.classes:
+        for task in tuple(self.classes):
             readout = self.model.readouts.get(f"{task}.{self.modalities[-1]}")
             if readout:
                 joined = np.concatenate([raw[m] for m in readout.question.modalities], axis=1)
-                self.guess[task] = readout(torch.from_numpy(joined)).argmax(1).numpy()
+                # By name: the probe may be of other data, which has the classes in another order, or other classes.
+                known = readout.question.classes
+                names = self.classes[task] = tuple(dict.fromkeys((*self.classes[task], *known)))
+                found = readout(torch.from_numpy(joined)).argmax(1).numpy()
+                self.guess[task] = np.array([names.index(name) for name in known])[found]
         self._planes: dict[str, np.ndarray] = {}
 
     def plane(self, modality: str) -> np.ndarray:
@@ -95,7 +99,7 @@ class Landscape:
         return json.dumps(
             {
                 "xy": _base64(xy),
-                "colour": _base64(np.searchsorted(used, values[index]).astype(np.uint8)),
+                "colour": _base64(np.searchsorted(used, values[index]).astype("<u2")),
                 "row": _base64(index.astype("<i4")),
                 "legend": legend,
             }
@@ -135,9 +139,9 @@ class Landscape:
         given = np.concatenate([image] * num, axis=2)
         pictures: dict[str, Any] = {modality: given}
         said = {}
-        if f"{next(iter(self.classes), '')}.{modality}" in self.model.readouts:
+        if any(r.question.modality == modality for r in self.model.readouts.values()):
             for task, p in self.model.predict(**pictures).items():
-                said[task] = dict(zip(self.classes[task], p[0].tolist(), strict=True))
+                said[task] = dict(zip(self.model.classes[task], p[0].tolist(), strict=True))
         x = _unit(self.model.embed(**pictures)[modality].cpu().numpy())
         return said, self.neighbours(x, modality, k)
 

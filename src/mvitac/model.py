@@ -86,7 +86,8 @@ class Model(nn.Module):
 
         Each argument is one image or several: uint8 arrays [H, W, C] or [N, H, W, C], uint8 tensors [C, H, W] or
         [N, C, H, W], PIL images, or a list of these. A two-sensor touch image has 6 channels (left, then right). Any
-        size: images are resized as the pack resized the training data. ValueError names what does not fit.
+        size: images are resized as the pack resized the training data. Where ``spec.difference``, touch is not what the
+        sensor gives but (touch - background) / 2 + 128 (``datasets.places.difference``). ValueError names what does not fit.
         """
         given = {m: v for m, v in (("vision", vision), ("touch", touch)) if v is not None}
         if not given:
@@ -183,14 +184,17 @@ def load(path: str | Path) -> Model:
         run = Run.load(json.loads(header["run"]))
         spec: DataSpec = from_json(DataSpec, json.loads(header["spec"]), "spec")
         stored = int(from_json(int, json.loads(header["stored"]), "stored"))
+        # A model from before its header said so.
+        spec = replace(spec, difference=spec.difference or bool(getattr(run.data, "difference", False)))
     except (KeyError, ValueError) as error:
         raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
     # The file holds every weight, so the frame needs none of its own, and must not reach for the network.
     frame = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
     # Shapes before memory: a header of a few bytes may name a network that is larger than this machine.
-    with torch.device("meta"):
-        check_tensors(file, fresh(frame, spec, stored).state_dict(), tensors)
-    model = fresh(frame, spec, stored)
+    with torch.random.fork_rng(devices=[]):  # the caller's chance is not ours to draw from
+        with torch.device("meta"):
+            check_tensors(file, fresh(frame, spec, stored).state_dict(), tensors)
+        model = fresh(frame, spec, stored)
     model.run = run
     model.load_state_dict(tensors)
     return model

@@ -22,7 +22,10 @@ STATE = "observation.state"
 
 
 class ObservationEncoder(nn.Module):
-    """Features [B, D] (or [B, T, D]) of an observation, in the order of ``keys``, with the robot's state at the end."""
+    """Features [B, D] (or [B, T, D]) of an observation, in the order of ``keys``, with the robot's state at the end.
+
+    Touch is what the model learned from: where ``model.spec.difference``, (touch - background) / 2 + one half.
+    """
 
     mean: Tensor
     std: Tensor

@@ -108,6 +108,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
                 "source": pack.spec.source,
                 "digest": pack.digest,
             },
+            "trained_on": {key: getattr(model.spec, key) for key in ("name", "licence", "source")},
         }
         write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
@@ -121,20 +122,25 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
 
 def card(model: Model, manifest: dict[str, Any]) -> str:
     """The model card (Markdown with the Hub's front matter)."""
-    data, given = manifest["data"], manifest["preprocessing"]
+    data, given, learned = manifest["data"], manifest["preprocessing"], manifest["trained_on"]
     run = model.run
+    sets = {"Encoders and probes": learned}
+    if learned != {key: data[key] for key in learned}:
+        sets = {"Encoders": learned, "Probes": data}
+    licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
     lines = [
         "---",
         "library_name: mvitac",
         "tags: [tactile, robotics, self-supervised, visual-tactile]",
         "license: other",
-        f"license_name: {json.dumps('weights: as their owner says; trained on data under: ' + data['licence'])}",
+        f"license_name: {json.dumps('weights: as their owner says; trained on data under: ' + licences)}",
         "---",
         "",
-        f"# {run.method.name} on {data['name']}",
+        f"# {run.method.name} on {learned['name']}",
         "",
-        f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}), pre-trained without labels by"
-        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes.",
+        f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}),"
+        f" {'trained with labels' if model.tasks else 'pre-trained without labels'} by"
+        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes on {data['name']}.",
         "",
         "```python",
         "import mvitac",
@@ -165,7 +171,7 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
         "",
         "## Data",
         "",
-        f"{data['name']}, by {data['source']}. Licence: {data['licence']}.",
+        *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
         "The whole configuration, library versions and commit are in run.json.",
         "",
     ]

@@ -1,15 +1,16 @@
 """Live: the newest frames in, contact, a smoothed answer per touch and its age out. No training code.
 
 Each touch sensor's background (no contact) is learned from its first frames and followed slowly while nothing is
-touched; it only decides *whether* there is contact, the model sees frames as they are. Probabilities are averaged over
-one touch and forgotten with it. Time comes from a clock that is given. Shapes: frames uint8 RGB [H, W, 3].
+touched; it decides *whether* there is contact. The model sees frames as they are, or minus that background if it learned
+from difference images. Probabilities are averaged over one touch and forgotten with it. Time comes from a clock that is
+given. Shapes: frames uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from mvitac.capture import Event, Frame, Stream
+from mvitac.datasets.places import difference
 from mvitac.pack import fit
 from mvitac.runtime import Engine
 
@@ -48,30 +50,38 @@ class LiveConfig:
             raise ValueError(f"calibration {self.calibration}: give at least 2 frames")
         if not (self.contact > 0 and self.least_change >= 0 and 0 <= self.follow < 1):
             raise ValueError("contact must be > 0, least_change >= 0 and follow in [0, 1)")
+        if not (self.neighbours >= 1 and 0 <= self.min_confidence <= 1):
+            raise ValueError("neighbours must be >= 1 (leave --index out for none) and min_confidence in [0, 1]")
 
 
 class Contact:
     """Whether one touch sensor is touched: learns its background, then compares."""
 
-    def __init__(self, config: LiveConfig) -> None:
-        self.config = config
+    def __init__(self, config: LiveConfig, side: int = 0) -> None:
+        """``side``: of the picture of no contact to keep, for a model that wants it subtracted; 0 = none."""
+        self.config, self.side = config, side
         self.forget()
 
     def forget(self) -> None:
         """Calibrate anew, as after a change of resolution or a replugged sensor."""
-        self.first: list[np.ndarray] = []
+        self.first: list[tuple[np.ndarray, np.ndarray | None]] = []
         self.background: np.ndarray | None = None
+        self.picture: np.ndarray | None = None
+        """The background [side, side, 3] as the model would see it, float32."""
         self.noise = self.level = 0.0
         self.touched = self.uneasy = False
 
     def __call__(self, image: np.ndarray) -> bool | None:
         """True in contact, False without, None while calibrating. ``level`` is the change in units of the threshold."""
         small = np.asarray(Image.fromarray(image).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
+        whole = fit(image, self.side) if self.side else None
         if self.background is None:
-            self.first.append(small)
+            self.first.append((small, whole))
             if len(self.first) < self.config.calibration:
                 return None
-            frames, self.first = np.stack(self.first), []
+            frames = np.stack([small for small, _ in self.first])
+            pictures = [whole for _, whole in self.first if whole is not None]
+            self.first = []
             middle = np.median(frames, axis=0)
             changes = np.abs(frames - middle).mean((1, 2))
             self.noise = float(np.median(changes))
@@ -79,12 +89,15 @@ class Contact:
             if self.uneasy:
                 return None  # something moved: learn it again
             self.background = middle
+            self.picture = np.mean(pictures, axis=0, dtype=np.float32) if pictures else None
         change = float(np.abs(small - self.background).mean())
         threshold = max(self.config.least_change, self.config.contact * self.noise)
         self.level = change / threshold
         self.touched = self.level > (0.5 if self.touched else 1.0)
         if not self.touched:
             self.background += self.config.follow * (small - self.background)
+            if whole is not None and self.picture is not None:
+                self.picture += self.config.follow * (whole - self.picture)
         return self.touched
 
 
@@ -145,17 +158,19 @@ class Live:
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]
         """A new frame of this stream starts a prediction."""
-        self.contacts = {s.name: Contact(config) for s in streams.get("touch", ())}
+        side = engine.inputs["touch"][0] if engine.difference and "touch" in streams else 0
+        self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
         self.age = self.max_age = 0.0
-        """Seconds from capture to answer of the latest prediction, and the most of any."""
+        """Seconds from capture to answer of the latest prediction, and the most of any; of the leading modality's frames."""
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
         self.contact: bool | None = None
         self._seen = -1
         self._judged: dict[str, int] = {}
+        self._changed: set[str] = set()
         for stream in self.all:
             stream.tell = self._heard
 
@@ -165,18 +180,19 @@ class Live:
             stream.check()
         leading = self.leading.newest(take=False)
         if leading is None or leading.number == self._seen:
-            if any(stream.fault for stream in self.all):  # what cannot be seen is not known to go on
-                self._release(self.clock())
+            if any(stream.fault for stream in self.all):
+                self._lose(self.clock())
             return False
         frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
-        self._seen = leading.number
+        # A frame may have come since ``leading`` was looked at: the one that is used counts.
+        self._seen = (frames[self._leading_modality][0] or leading).number
         now = self.clock()
         for several, found in zip(self.streams.values(), frames.values(), strict=True):
             for stream, frame in zip(several, found, strict=True):
                 # An old frame is not the present: rather no answer than one about the past.
                 if frame is None or stream.fault == "frozen" or now - frame.time > stream.stale_after:
                     self.num_stale += 1
-                    self._release(now)
+                    self._lose(now)
                     return False
         self.contact = self._contact(frames.get("touch", []))
         images = {
@@ -188,7 +204,7 @@ class Live:
             if self.touch is None:
                 self.num_touches += 1
                 self.touch = Touch(self.num_touches, now)
-            outputs = self.engine(**{m: x[None] for m, x in images.items()})
+            outputs = self.engine(**{m: x[None] for m, x in self._wanted(images).items()})
             self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
             if self.nearest:
                 self.touch.known = self.nearest(outputs)
@@ -215,6 +231,8 @@ class Live:
         """Whether any touch sensor is in contact, None while one is calibrated; without a sensor always True."""
         if not self.contacts:
             return True
+        while self._changed:
+            self.contacts[self._changed.pop()].forget()
         for name, frame in zip(self.contacts, frames, strict=True):
             if frame is None or self._judged.get(name) == frame.number:
                 continue
@@ -230,6 +248,18 @@ class Live:
         states = self.contacts.values()
         return None if any(c.background is None for c in states) else any(c.touched for c in states)
 
+    def _wanted(self, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """``images`` as the model learned from them; what is recorded stays as it came."""
+        if not (self.engine.difference and self.contacts):
+            return images
+        free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
+        return {**images, "touch": difference(images["touch"], np.rint(free).astype(np.uint8))}
+
+    def _lose(self, now: float) -> None:
+        """What cannot be seen is neither touched nor free."""
+        self._release(now)
+        self.contact = None
+
     def _release(self, now: float) -> None:
         if self.touch is not None:
             self.touch.end = now
@@ -238,9 +268,10 @@ class Live:
     def _heard(self, event: Event) -> None:
         self.counts[event.what] += 1
         self.tell(event)
-        # Another lens, crop or gel: what was learned of the background no longer holds.
+        # Another lens, crop or gel: what was learned of the background no longer holds. The capture thread says so here
+        # before it shows the frame, and ``tick``, in its own thread, may be at work on the one before: it forgets.
         if event.what in ("resolution changed", "back") and event.stream in self.contacts:
-            self.contacts[event.stream].forget()
+            self._changed.add(event.stream)
 
     def state(self, stream: Stream) -> str:
         """What a stream is doing, in a word: its fault, "calibrating" or "good"."""
@@ -269,10 +300,16 @@ class Live:
         }
 
 
-def neighbours(index: Any, k: int, modality: str = "touch") -> Callable[[dict[str, np.ndarray]], list[str]]:
-    """``Live``'s ``nearest`` from a ``retrieval.Index``: "id (label, ...)" of the k nearest known touches."""
+def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str, np.ndarray]], list[str]]:
+    """``Live``'s ``nearest`` from a ``retrieval.Index``: "id (label, ...)" of the k nearest known touches.
+
+    By touch, or by vision where the engine's ``inputs`` have no touch. ValueError if the index does not hold it.
+    """
     from mvitac.retrieval import nearest
 
+    modality = "touch" if "touch" in inputs else "vision"
+    if modality not in index.banks:
+        raise ValueError(f"{index.folder} holds no {modality} to compare with: index a pack that has it")
     key = f"shared_{modality}" if index.meta["space"] == "shared" else f"embedding_{modality}"
 
     def find(outputs: dict[str, np.ndarray]) -> list[str]:

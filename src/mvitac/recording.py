@@ -62,10 +62,14 @@ class Recorder:
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
         """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch_number."""
-        if columns["time"] < self._next:
+        time = columns["time"]
+        if time < self._next:
             return
-        # Counted from the last due time, not from this pair's: else every delay would lower the rate.
-        self._next = max(self._next + self.every, columns["time"])
+        # Counted from the last due time, not from this pair's: else every delay would lower the rate. But what was missed
+        # (at the start, in a gap) is not made up for.
+        self._next += self.every
+        if time >= self._next:
+            self._next = time + self.every
         self.waiting.append((images, columns))
         if len(self.waiting) == SPOOL:
             self._flush()
@@ -84,15 +88,15 @@ class Recorder:
     def close(self) -> int:
         """Write what is left and make the pack or dataset; how many pairs it has (0: nothing is made)."""
         self._flush()
-        if not self.num:
-            shutil.rmtree(self.spool)
-            return 0
         return finish(self.out)
 
 
 def finish(out: Path) -> int:
-    """Make ``out`` of its spool, which is then deleted; returns how many pairs it has."""
+    """Make ``out`` of its spool, which is then deleted; returns how many pairs it has (0: nothing is made)."""
     spool = Recorded(out.with_name(out.name + ".spool"))
+    if not spool.files:  # a crash came before the first of them
+        shutil.rmtree(spool.path)
+        return 0
     if spool.form == "lerobot":
         packed = spool.path / "pack"
         shutil.rmtree(packed, ignore_errors=True)
@@ -118,8 +122,6 @@ class Recorded(Source):
         return from_json(DataSpec, self._spec, "spec")
 
     def size(self) -> int:
-        if not self.files:
-            raise ValueError(f"{self.path} holds no pairs: there is nothing to finish")
         return next(len(s.touch if s.touch is not None else s.vision) for s in self.read(0))  # type: ignore[arg-type]
 
     def items(self) -> Sequence[str]:

@@ -57,10 +57,16 @@ def default(kind: type[T], name: str) -> T:
     return find(kind, name)()
 
 
+LATER = {"later": True}
+"""Metadata of a field that joined a format later: it is written only where it is not at its default, so that whatever does
+without it keeps its bytes and digests."""
+
+
 def to_json(config: Any) -> Any:
     """A (nested) config dataclass as JSON-ready values; a registered one carries its ``name``."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        fields = {f.name: to_json(getattr(config, f.name)) for f in dataclasses.fields(config)}
+        said = [f for f in dataclasses.fields(config) if f.metadata != LATER or getattr(config, f.name) != f.default]
+        fields = {f.name: to_json(getattr(config, f.name)) for f in said}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
         return {str(key): to_json(value) for key, value in config.items()}

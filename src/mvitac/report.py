@@ -104,13 +104,16 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
 def _check_scored(runs: Sequence[Finished], result: dict[str, Any]) -> None:
     """Refuse numbers of other runs than those shown."""
     scored = {Path(r["run"]).resolve() for r in [*result["records"], *result["retrieval"]] if "run" in r}
-    for run in runs:
-        if scored and run.path.resolve() not in scored:
-            raise ValueError(f"the probe result does not score {run.path}: make it again with `mvitac probe --json`")
+    shown = {run.path.resolve(): run.path for run in runs}
+    again = "make it again with `mvitac probe --json`"
+    for path in shown.keys() - scored if scored else ():
+        raise ValueError(f"the probe result does not score {shown[path]}: {again}")
+    for path in scored - shown.keys():  # its means are of all its runs, and it calls them by what tells those apart
+        raise ValueError(f"the probe result scores {path} too: show that run as well, or {again}")
 
 
 def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finished]:
-    """``runs`` by the names that ``result`` has for them: it may be older, or of more runs."""
+    """``runs`` by the names that ``result`` has for them: it may be older."""
     records = [*result["retrieval"], *result["records"]]
     names = {Path(r["run"]).resolve(): r["source"].removesuffix(END_TO_END) for r in records if "run" in r}
     return [replace(run, source=names.get(run.path.resolve(), run.source)) for run in runs]

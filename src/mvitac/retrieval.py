@@ -83,9 +83,21 @@ def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
                 f"{pack.path} has {pack.spec.channels(modality)} channels of {modality}, the model was trained with"
                 f" {model.spec.channels(modality)}: pack the data alike"
             )
+    if "touch" in names and model.spec.difference and not has_difference(pack):
+        raise ValueError(
+            f"{pack.path} has touch as the sensor gives it, the model was trained on difference images: pack the data"
+            " with --difference"
+        )
     if not names:
         raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
     return names
+
+
+def has_difference(pack: Pack) -> bool:
+    """Whether touch is stored minus its background; packs from before their description said so tell by how they were
+    asked for."""
+    asked = pack.meta.get("fingerprint") or {}
+    return pack.spec.difference or bool((asked.get("options") or asked).get("difference"))
 
 
 def describe(pack: Pack, rows: np.ndarray) -> pa.Table:

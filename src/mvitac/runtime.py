@@ -43,6 +43,8 @@ class Engine:
         self.meta = read_manifest(folder)
         self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
         self.classes: dict[str, list[str]] = self.meta["classes"]
+        self.difference: bool = self.meta["preprocessing"].get("difference", False)
+        """Whether touch is to be given as (touch - background) / 2 + 128."""
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})
@@ -141,10 +143,15 @@ def _torch(path: Path, precision: str, threads: int) -> Call:
             os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = forced
 
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        with torch.inference_mode():
-            return [
-                x.numpy() for x in module(*(torch.tensor(a) for a in arrays))
-            ]  # a copy: memory-mapped images are read-only
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            with torch.inference_mode():
+                return [
+                    x.numpy() for x in module(*(torch.tensor(a) for a in arrays))
+                ]  # a copy: memory-mapped images are read-only
+        finally:
+            torch.set_num_threads(before)
 
     return call
 

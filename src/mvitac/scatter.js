@@ -10,8 +10,8 @@ function load() {
   const given = JSON.parse(props.value || "{}");
   if (given.row === undefined) return;
   const xy = new Uint16Array(bytes(given.xy).buffer);
-  data = { x: xy.subarray(0, xy.length / 2), y: xy.subarray(xy.length / 2), colour: bytes(given.colour),
-           row: new Int32Array(bytes(given.row).buffer), legend: given.legend };
+  data = { x: xy.subarray(0, xy.length / 2), y: xy.subarray(xy.length / 2),
+           colour: new Uint16Array(bytes(given.colour).buffer), row: new Int32Array(bytes(given.row).buffer), legend: given.legend };
   legend.replaceChildren(...given.legend.map(([name, colour]) => {
     const item = document.createElement("span"), dot = document.createElement("i");
     dot.style.background = colour;

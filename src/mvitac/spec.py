@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mvitac.registry import LATER
+
 MODALITIES = ("vision", "touch")
 
 
@@ -39,6 +41,8 @@ class DataSpec:
     """Who owns it and where it is found."""
     notes: tuple[str, ...] = ()
     """What must be said beside every result, e.g. what the two sides of a published split share."""
+    difference: bool = field(default=False, metadata=LATER)
+    """Whether touch is stored as (touch - background) / 2 + 128; False also of what was written before this was said."""
 
     def __post_init__(self) -> None:
         if not (self.vision_channels or self.touch_channels):

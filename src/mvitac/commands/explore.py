@@ -25,7 +25,7 @@ def explore(argv: list[str]) -> None:
         on: Path | None = None
         """Show this pack instead of the data of the first run."""
         rows: int = 20_000
-        """Most rows to show, evenly spread."""
+        """Most rows to show; of more, a sample."""
         host: str = "127.0.0.1"
         """Address to listen on; 0.0.0.0 lets everybody on the network in."""
         port: int | None = None

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,10 +46,10 @@ def live(argv: list[str]) -> None:
 
         model: tyro.conf.Positional[str]
         """An export's folder (fastest); or a run, an artifact, owner/name on the Hub, which is exported first."""
-        vision: str = "sim"
+        vision: str | None = None
         """The camera."""
-        touch: tuple[str, ...] = ("sim",)
-        """The touch sensor, or both of a gripper: left right."""
+        touch: tuple[str, ...] = ()
+        """The touch sensor, or both of a gripper: left right. Without any source, all of them are simulated."""
         index: Path | None = None
         """Show the nearest known touches from this index."""
         record: Path | None = None
@@ -75,25 +76,26 @@ def live(argv: list[str]) -> None:
             raise ValueError(f"{name} {seconds:g}: give seconds, more than 0")
     if options.json:
         check_place(options.json)
+        if options.json.is_dir():
+            raise ValueError(f"--json {options.json} is a folder: give a file's name")
     console = Console()
     window = Window() if options.window else None
     engine = _engine(options.model, options.threads, console)
     index = Index(options.index) if options.index else None
     if index and index.meta["weights"] != engine.meta["weights"]:
         raise ValueError(f"{options.index} was made with another model: index the pack again with {options.model}")
-    given = {"vision": (options.vision,), "touch": options.touch}
     streams = {}
-    for modality in engine.inputs:
-        names = (
-            [modality] if len(given[modality]) == 1 else [f"{modality} {i + 1}" for i in range(len(given[modality]))]
-        )
-        pairs = zip(names, given[modality], strict=True)
+    for modality, texts in sources(engine.inputs, options.vision, options.touch).items():
+        names = [modality] if len(texts) == 1 else [f"{modality} {i + 1}" for i in range(len(texts))]
+        pairs = zip(names, texts, strict=True)
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
+    if not (options.vision or options.touch):
+        console.print("no --vision, no --touch: all sensors are simulated", highlight=False)
     recorder = None
     if options.record:
         channels = {m: s[2] for m, s in engine.inputs.items()}
         recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
-    nearest = neighbours(index, options.live.neighbours) if index else None
+    nearest = neighbours(index, options.live.neighbours, engine.inputs) if index else None
     # What happened is printed above the picture, so that it stays in the scrollback and in a log file.
     loop = Live(
         engine,
@@ -134,26 +136,49 @@ def live(argv: list[str]) -> None:
     loop.finish()
     _speak(loop, console, spoken)
     summary = loop.summary()
-    if recorder:
-        num = recorder.close()
-        console.print(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded", soft_wrap=True)
     _conclude(summary, console)
     if options.json:
         write_json(options.json, summary)
+    if recorder:  # last, for it may fail (a full disk)
+        num = recorder.close()
+        console.print(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded", soft_wrap=True)
+
+
+def sources(
+    inputs: Mapping[str, Sequence[int]], vision: str | None, touch: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """What to open by modality, for an engine's ``inputs`` (shapes [S, S, C] by modality): what was given, or simulated
+    sensors if nothing was. ValueError if one of them is left out: what is simulated must not pass for real."""
+    given: dict[str, tuple[str, ...]] = {"vision": (vision,) if vision else (), "touch": tuple(touch)}
+    given = {modality: texts for modality, texts in given.items() if texts}
+    if not given:
+        return {m: tuple(f"sim:{i}" for i in range(shape[2] // 3)) for m, shape in inputs.items()}
+    for modality in inputs.keys() - given.keys():
+        raise ValueError(
+            f"the model takes {modality} too: give --{modality} SOURCE (--{modality} sim for a simulated one)"
+        )
+    for modality in given.keys() - inputs.keys():
+        raise ValueError(f"the model has no input for {modality}: leave --{modality} out")
+    return given
 
 
 def _engine(model: str, threads: int, console: Any) -> "Engine":
     """An export as it is; anything else exported once, into the cache."""
     from mvitac.artifact import load
     from mvitac.export import export
+    from mvitac.model import safetensors_digest
     from mvitac.publish import own_data, with_readouts
-    from mvitac.record import cache_dir
-    from mvitac.runtime import MANIFEST, Engine
+    from mvitac.record import cache_dir, digest
+    from mvitac.registry import to_json
+    from mvitac.runtime import FORMAT_VERSION, MANIFEST, Engine
 
     if (Path(model) / MANIFEST).is_file():
         return Engine(model, threads=threads)
     loaded = load(model)
-    folder = cache_dir() / "exports" / loaded.weights_digest()[:32]
+    # Artifacts of one run differ in their probes alone. A bare run has none: those fitted below are what its data makes.
+    probes = [[to_json(r.question), safetensors_digest(dict(r.state_dict()))] for r in loaded.readouts.values()]
+    key = digest([FORMAT_VERSION, loaded.weights_digest(), probes])
+    folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
         pack = own_data(loaded, "`mvitac export` it where the data is, and give that folder")
@@ -192,9 +217,11 @@ def view(loop: "Live") -> Any:
         age = f"{1000 * s.age():.0f}" if s.num_frames else "-"
         streams.add_row(s.name, f"{s.rate():.1f}", age, str(s.num_dropped), loop.state(s))
     lines: list[Any] = [streams]
-    for name, contact in loop.contacts.items():
+    for s in loop.streams.get("touch", ()):
+        contact = loop.contacts[s.name]
         bar = "#" * min(30, round(10 * contact.level))
-        lines.append(Text(f"{name:8} {'CONTACT' if contact.touched else 'free   '} {bar}"))
+        state = f"{'CONTACT' if contact.touched else 'free   '} {bar}"
+        lines.append(Text(f"{s.name:8} {'unknown' if s.fault else state}"))
     touch = loop.touch or loop.last
     for task, (name, confidence) in loop.answers(touch).items():
         sure = "" if confidence >= loop.config.min_confidence else "  unsure"

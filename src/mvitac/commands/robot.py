@@ -74,7 +74,8 @@ def export(argv: list[str]) -> None:
         int8: bool = False
         """8-bit weights and activations, ranges from train rows of the pack (onnx, openvino)."""
         on: Path | None = None
-        """Pack whose test rows check the export (default: the data the model was trained on)."""
+        """Pack whose test rows check the export, and to which the probes of a run are fitted; an artifact keeps its own
+        (default: the data the model was trained on)."""
         calibrate: Path | None = None
         """Pack whose train rows set the ranges of int8 (default: the same)."""
         modality: Literal["both", "vision", "touch"] = "both"

@@ -267,6 +267,7 @@ class Rows(Source):
             licence=config.licence,
             source=config.source_url or "not given",
             notes=("no column says the groups, so frames of one video are one group",) if group_by == "video" else (),
+            difference=config.difference,
         )
 
     def spec(self) -> DataSpec:

@@ -83,6 +83,7 @@ class Materials(Source):
             group_by="instance",
             licence=LICENCE,
             source=f"mvitac.sim.materials version {materials.VERSION}",
+            difference=self.config.difference,
         )
 
     def items(self) -> list[str]:
