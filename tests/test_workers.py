@@ -9,11 +9,13 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from mvitac.model import load
 from mvitac.pack import Pack
 from mvitac.session import Session, probe_runs
 from mvitac.workers import in_threads, side_by_side
@@ -65,9 +67,11 @@ def test_probes_do_not_depend_on_it(
     def scores(threads: int) -> object:
         torch.set_num_threads(threads)
         monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / str(threads)))
-        return probe_runs([smoke_run, shutil.copytree(smoke_run, tmp_path / f"run{threads}")], Session(), pack)[
-            "summary"
-        ]
+        model = load(smoke_run)
+        model.run = replace(model.run, seed=1)
+        other = shutil.copytree(smoke_run, tmp_path / f"run{threads}")
+        model.save(other / "model.safetensors")
+        return probe_runs([smoke_run, other], Session(), pack)["summary"]
 
     assert scores(2) == scores(1)
 

@@ -35,7 +35,7 @@ class Graph(nn.Module):
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.modalities})
         self.projectors = nn.ModuleDict({m: p for m, p in model.projectors.items() if m in self.modalities})
         self.readouts = nn.ModuleList([r for r in model.readouts.values() if r.question.modality == asked])
-        self.classes = {r.question.task: list(r.question.classes) for r in self.readouts}  # type: ignore[union-attr]
+        self.classes: dict[str, list[str]] = {r.question.task: list(r.question.classes) for r in self.readouts}  # type: ignore[union-attr]
         self.inputs = {m: (model.stored, model.stored, model.spec.channels(m)) for m in self.modalities}
         self.outputs = tuple(
             [f"embedding_{m}" for m in self.modalities]

@@ -89,7 +89,7 @@ class Contact:
             if self.uneasy:
                 return None  # something moved: learn it again
             self.background = middle
-            self.picture = np.mean(pictures, axis=0, dtype=np.float32) if pictures else None
+            self.picture = np.stack(pictures).mean(0, dtype=np.float32) if pictures else None
         change = float(np.abs(small - self.background).mean())
         threshold = max(self.config.least_change, self.config.contact * self.noise)
         self.level = change / threshold

@@ -57,7 +57,7 @@ def modern(data: DatasetConfig) -> Run:
     - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away. From scratch,
       too, 8 points of category (one seed).
     - BatchNorm in the heads (SimCLR v2, MoCo v3): keeps the embeddings from collapsing early at small batches.
-      Level (three seeds: without it +1.2, p .57).
+      Level (three seeds: without it +1.2, p .61).
     - momentum .99 rising to 1 (BYOL, MoCo v3) for the methods that have one: the keys settle as the queries do.
       Level from 0 to .999 (one seed).
     - one-per-touch batches: consecutive frames of one touch are near-duplicates, and as negatives they teach nonsense.
