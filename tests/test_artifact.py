@@ -22,7 +22,7 @@ from mvitac.artifact import preprocessing, read_manifest, seal
 from mvitac.cli import main
 from mvitac.datasets.packed import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.model import pack_features
+from mvitac.model import pack_features, subtracted
 from mvitac.pack import Pack
 from mvitac.probe import parts
 from mvitac.publish import card, fit_readouts, push
@@ -137,6 +137,15 @@ def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path)
         old = copied(pack)
         old.meta = {**pack.meta, "fingerprint": {"options": {"difference": True}}}
         assert check_pack(found, old) == ("vision", "touch")
+
+
+def test_predict_subtracts_the_background(copy: Path, pack: Pack) -> None:
+    model = mvitac.load(copy)
+    model.spec = replace(model.spec, difference=True)
+    press, free = pack.images["touch"][3], pack.images["touch"][4]
+    expected = model.predict(touch=subtracted([press], [free]))["pattern"]
+    assert torch.equal(model.predict(touch=press, background=free)["pattern"], expected)
+    assert not torch.equal(model.predict(touch=press)["pattern"], expected)
 
 
 def test_a_pickle_is_never_opened(copy: Path, tmp_path: Path) -> None:

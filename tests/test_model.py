@@ -14,6 +14,7 @@ from toy import toy_pack
 import mvitac
 from mvitac.augment import plain_view
 from mvitac.datasets.packed import PackConfig
+from mvitac.datasets.places import difference
 from mvitac.model import Model, pack_features
 from mvitac.pack import Pack
 from mvitac.recipes import recipe
@@ -81,6 +82,26 @@ def test_embed_resizes_as_the_pack_does(model: Model) -> None:
     large = np.random.default_rng(0).integers(0, 255, (100, 80, 3), dtype=np.uint8)
     small = np.asarray(Image.fromarray(large).resize((32, 32), Image.Resampling.BILINEAR))
     assert torch.equal(model.embed(vision=large)["vision"], model.embed(vision=small)["vision"])
+
+
+def test_background_is_subtracted_before_resizing(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    free, press = (rng.integers(0, 255, (2, 80, 100, 3), dtype=np.uint8) for _ in range(2))
+    with pytest.raises(ValueError, match="was not trained on difference images"):
+        model.embed(touch=press, background=free)
+    monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))
+    expected = model.embed(touch=[difference(press[0], free[0]), difference(press[1], free[1])])["touch"]
+    assert torch.equal(model.embed(touch=press, background=free)["touch"], expected)
+    of_one = model.embed(touch=[difference(press[0], free[0]), difference(press[1], free[0])])["touch"]
+    assert torch.equal(model.embed(touch=press, background=Image.fromarray(free[0]))["touch"], of_one)
+    assert not torch.equal(of_one[1], expected[1])
+    for wrong, says in [
+        ({"touch": press, "background": [*free, *free]}, "got 4 images for 2 of touch"),
+        ({"touch": press, "background": free[:, :40]}, "image is 100 x 80, its background 100 x 40"),
+        ({"vision": press, "background": free}, "there is no touch"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            model.embed(**wrong)
 
 
 def test_shared_space_is_normalised(model: Model, pack: Pack) -> None:

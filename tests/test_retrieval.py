@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from test_policy import load_example
 import mvitac
 from mvitac.cli import main
 from mvitac.locks import Busy
+from mvitac.model import Model
 from mvitac.pack import Pack
 from mvitac.retrieval import Index, build, nearest
 
@@ -93,6 +95,34 @@ def test_find_command_draws_what_it_found(
     (tmp_path / "bad.png").write_text("no picture")
     assert main(["find", str(tmp_path / "bad.png"), "--in", str(index)]) == 2
     assert "cannot be read as a picture" in capsys.readouterr().err
+
+
+def test_find_subtracts_the_background(
+    index: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A touch that minus its background is row 11 finds row 11 when both files are given."""
+    row = pack.images["touch"][11].astype(int)
+    free = np.where(row < 128, 255, 0).astype(np.uint8)  # so that 2 (row - 128) + free fits into a byte
+    raw = 2 * (row - 128) + free
+    Image.fromarray(raw.astype(np.uint8)).save(tmp_path / "raw.png")
+    Image.fromarray(free).save(tmp_path / "free.png")
+    command = ["find", str(tmp_path / "raw.png"), "--in", str(index), "--to", "touch", "--k", "1"]
+    background = ["--background", str(tmp_path / "free.png")]
+    assert main([*command, *background]) == 2
+    assert "was not trained on difference images" in capsys.readouterr().err
+    plain = Index.model
+
+    def model(self: Index) -> Model:
+        found = plain(self)
+        found.spec = replace(found.spec, difference=True)
+        return found
+
+    monkeypatch.setattr(Index, "model", model)
+    assert main([*command, *background]) == 0
+    shown = capsys.readouterr().out
+    assert "1.000" in shown and pack.column("id")[11] in shown
+    assert main(command) == 0
+    assert "1.000" not in capsys.readouterr().out
 
 
 def test_embed_command_writes_both_formats(artifact: Path, pack: Pack, tmp_path: Path) -> None:

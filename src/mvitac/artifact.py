@@ -39,7 +39,8 @@ MAX_HEADER, MAX_MANIFEST = 4 << 20, 1 << 20
 AS_GIVEN = "none is subtracted: tactile images are used as the sensor gives them"
 SUBTRACTED = (
     "subtracted: touch is (touch - background) / 2 + 128, the background being what the sensor shows without contact;"
-    " `mvitac live` learns it and does this, whoever calls the model or its export does it first"
+    " `mvitac live` learns it and does this, `embed` and `predict` do it given background=..., whoever calls an export"
+    " does it first"
 )
 HUB_ID = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(@(?P<revision>[\w./-]+))?")
 

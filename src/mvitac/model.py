@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from mvitac.allocator import keep_freed_memory
 from mvitac.augment import plain_view
+from mvitac.datasets.places import difference
 from mvitac.encoders import SCRATCH
 from mvitac.methods.base import Method
 from mvitac.pack import Pack, fit
@@ -80,36 +81,50 @@ class Model(nn.Module):
         return self.classifiers[self.tasks.index(task)](joined).softmax(dim=1)
 
     def embed(
-        self, *, vision: Images | None = None, touch: Images | None = None, shared: bool = False
+        self,
+        *,
+        vision: Images | None = None,
+        touch: Images | None = None,
+        background: Images | None = None,
+        shared: bool = False,
     ) -> dict[str, Tensor]:
         """Embed raw images: features [N, D] by modality, or with ``shared`` the L2-normalised common space [N, E].
 
         Each argument is one image or several: uint8 arrays [H, W, C] or [N, H, W, C], uint8 tensors [C, H, W] or
         [N, C, H, W], PIL images, or a list of these. A two-sensor touch image has 6 channels (left, then right). Any
-        size: images are resized as the pack resized the training data. Where ``spec.difference``, touch is not what the
-        sensor gives but (touch - background) / 2 + 128 (``datasets.places.difference``). ValueError names what does not fit.
+        size: images are resized as the pack resized the training data. A model of difference images
+        (``spec.difference``) also wants ``background``, the sensor without contact: one image, or one for each touch;
+        without it touch is taken as (touch - background) / 2 + 128 already. ValueError names what does not fit.
         """
         given = {m: v for m, v in (("vision", vision), ("touch", touch)) if v is not None}
         if not given:
             raise ValueError("embed: give vision=..., touch=..., or both")
+        if background is not None and (touch is None or not self.spec.difference):
+            why = "there is no touch" if touch is None else "this model was not trained on difference images of touch"
+            raise ValueError(f"background has no use here, {why}: leave it out")
         device = next(self.parameters()).device
         result = {}
         for modality, value in given.items():
             if modality not in self.encoders:
                 raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
-            arrays = [fit(a, self.stored) for a in to_arrays(value, self.spec.channels(modality), modality)]
+            arrays = to_arrays(value, self.spec.channels(modality), modality)
+            if modality == "touch" and background is not None:
+                arrays = subtracted(arrays, to_arrays(background, self.spec.channels("touch"), "background"))
+            arrays = [fit(a, self.stored) for a in arrays]
             images = torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).to(device)
             features = self.features(modality, images, for_heads=shared)
             result[modality] = self.project(modality, features) if shared else features
         return result
 
-    def predict(self, *, vision: Images | None = None, touch: Images | None = None) -> dict[str, Tensor]:
+    def predict(
+        self, *, vision: Images | None = None, touch: Images | None = None, background: Images | None = None
+    ) -> dict[str, Tensor]:
         """Class probabilities [N, K] by task, from the probes that a published artifact carries.
 
         Given both modalities, the probe on both answers. ``classes`` names the columns. ValueError as for ``embed``, and
         where there is no probe.
         """
-        given = self.embed(vision=vision, touch=touch)
+        given = self.embed(vision=vision, touch=touch, background=background)
         asked = "both" if len(given) == 2 else next(iter(given))
         if len({len(x) for x in given.values()}) > 1:
             raise ValueError(f"predict: got {len(given['vision'])} vision and {len(given['touch'])} touch images")
@@ -266,6 +281,15 @@ def to_arrays(value: Images, channels: int, what: str) -> list[np.ndarray]:
     if not arrays:
         raise ValueError(f"{what}: no images given")
     return arrays
+
+
+def subtracted(touch: list[np.ndarray], background: list[np.ndarray]) -> list[np.ndarray]:
+    """Difference images of ``touch``, each minus its own ``background`` or all minus the only one."""
+    if len(background) not in (1, len(touch)):
+        raise ValueError(
+            f"background: got {len(background)} images for {len(touch)} of touch: give one, or one for each"
+        )
+    return [difference(image, background[i % len(background)]) for i, image in enumerate(touch)]
 
 
 def check_modality(spec: DataSpec, modality: str) -> None:

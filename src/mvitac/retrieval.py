@@ -195,8 +195,20 @@ class Index:
         """The model that embedded the rows, to embed queries."""
         return load(self.folder / "model.safetensors")
 
-    def find(self, model: Model, images: Images, source: str, target: str, k: int = 5) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and cosines [Q, k] of the ``target`` images nearest to ``images`` of modality ``source``."""
+    def find(
+        self,
+        model: Model,
+        images: Images,
+        source: str,
+        target: str,
+        k: int = 5,
+        *,
+        background: Images | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and cosines [Q, k] of the ``target`` images nearest to ``images`` of modality ``source``.
+
+        ``background`` as for ``Model.embed``: what the touch sensor shows without contact.
+        """
         for name in (source, target):
             if name not in self.banks:
                 raise unknown("modality", name, self.banks)
@@ -206,7 +218,7 @@ class Index:
                 f"{self.folder} has no space that vision and touch share (its method trains none):"
                 f" search {source} -> {source}"
             )
-        x = model.embed(**{source: images}, shared=shared)[source]
+        x = model.embed(**{source: images}, background=background, shared=shared)[source]
         x = torch.nn.functional.normalize(x, dim=1).cpu().numpy()
         return nearest(self.banks[target], x, k)
 

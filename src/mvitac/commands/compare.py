@@ -102,8 +102,8 @@ def compare(argv: list[str]) -> None:
     session = Session(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities, imagenet=options.imagenet)
     if not options.dry_run:
         check_place(options.out / "plan.json")
-    console = Console()
-    say = lambda text: console.print(text, soft_wrap=True, highlight=False, markup=False)  # noqa: E731
+    console = Console(markup=False)
+    say = lambda text: console.print(text, soft_wrap=True, highlight=False)  # noqa: E731
     works = lay_out_folds(plan, options.out, session, options.device)
     work = together(works)
     for line in forecast(work):

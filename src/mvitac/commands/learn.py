@@ -53,7 +53,7 @@ def pretrain(argv: list[str]) -> None:
       --sink tensorboard|wandb|trackio   also log there (extras; none by default)
     """
     options = parse(Options, rest, "pretrain")
-    console = Console()
+    console = Console(markup=False)
     with open_sinks(chosen.get("--sink"), options.out, options.run) as sinks:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, sinks=sinks)
     console.print(f"trained: {out}\nnext: mvitac probe {out}", soft_wrap=True, highlight=False)
@@ -104,7 +104,7 @@ def probe(argv: list[str]) -> None:
             raise ValueError("--learn-on says what probes learn from: say with --on which pack they are scored on")
         pack = Transfer(Pack(options.learn_on), pack)
     result = probe_runs(options.runs, options.session, pack)
-    console, worse = Console(), []
+    console, worse = Console(markup=False), []
     names = {r["run"]: r["source"].removesuffix(END_TO_END) for r in result["records"] if "run" in r}
     for i, path in enumerate(options.runs if options.stress else (), start=1):
         console.print(
@@ -151,7 +151,7 @@ def demo(argv: list[str]) -> None:
         run: Annotated[Run, tyro.conf.arg(name="")] = recipe("demo")
 
     options = parse(Options, argv, "demo")
-    run_demo(options.run, options.out, options.seeds, Console())
+    run_demo(options.run, options.out, options.seeds, Console(markup=False))
 
 
 def report(argv: list[str]) -> None:
@@ -179,4 +179,4 @@ def report(argv: list[str]) -> None:
     result = read_json(options.probe, "a probe result") if options.probe else None
     out = options.out or (options.runs[0] / "report" if len(options.runs) == 1 else Path("runs") / "report")
     written = write_report(options.runs, out, result=result, quiet=options.quiet)
-    Console().print(f"written: {written}", soft_wrap=True, highlight=False)
+    Console(markup=False).print(f"written: {written}", soft_wrap=True, highlight=False)

@@ -31,7 +31,7 @@ def live(argv: list[str]) -> None:
     from mvitac.window import Window, draw
 
     if argv[:1] == ["--finish"] and len(argv) == 2:
-        Console().print(f"{argv[1]}: {finish(Path(argv[1]))} pairs", soft_wrap=True, highlight=False)
+        Console(markup=False).print(f"{argv[1]}: {finish(Path(argv[1]))} pairs", soft_wrap=True, highlight=False)
         return
 
     @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ def live(argv: list[str]) -> None:
         check_place(options.json)
         if options.json.is_dir():
             raise ValueError(f"--json {options.json} is a folder: give a file's name")
-    console = Console()
+    console = Console(markup=False)
     window = Window() if options.window else None
     engine = _engine(options.model, options.threads, console)
     index = Index(options.index) if options.index else None

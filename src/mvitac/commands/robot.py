@@ -33,7 +33,7 @@ def publish(argv: list[str]) -> None:
 
     options = parse(Options, argv, "publish")
     out = publish(options.run, options.out, Pack(options.on) if options.on else None)
-    console = Console()
+    console = Console(markup=False)
     table = Table(title=f"{out}: what its probes know", title_justify="left")
     for column in ("task", "from", "accuracy %", "majority %"):
         table.add_column(column)
@@ -118,4 +118,4 @@ def export(argv: list[str]) -> None:
         table.add_row(f"{name}, least cosine", "", f"{values['min']:.5f}")
     table.add_row("size, MB", "", f"{report['size_mb']}")
     table.add_row("latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"]))
-    Console().print(table)
+    Console(markup=False).print(table)

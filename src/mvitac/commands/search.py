@@ -1,11 +1,16 @@
 """``mvitac embed``, ``index`` and ``find``: embeddings of whole packs, and the nearest of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from mvitac.options import parse
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +62,7 @@ def embed(argv: list[str]) -> None:
             table = table.append_column(m, pa.FixedSizeListArray.from_arrays(x.reshape(-1), x.shape[1]))
         write_atomic(options.out, lambda file: pq.write_table(table, file))
     shapes = ", ".join(f"{m} {x.shape}" for m, x in found.items())
-    Console().print(f"{options.out}: {shapes}", soft_wrap=True, highlight=False)
+    Console(markup=False).print(f"{options.out}: {shapes}", soft_wrap=True, highlight=False)
 
 
 def index(argv: list[str]) -> None:
@@ -80,7 +85,26 @@ def index(argv: list[str]) -> None:
     options = parse(Options, argv, "index")
     made = build(load(options.model), Pack(options.pack), options.out, options.splits)
     shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
-    Console().print(f"{options.out}: {shapes}, space: {made.meta['space']}", soft_wrap=True, highlight=False)
+    Console(markup=False).print(
+        f"{options.out}: {shapes}, space: {made.meta['space']}", soft_wrap=True, highlight=False
+    )
+
+
+def _picture(files: Sequence[Path]) -> "np.ndarray":
+    """One RGB picture [H, W, 3 x files], the files' side by side in channels at the first one's size."""
+    import numpy as np
+    from PIL import Image
+
+    from mvitac.record import brief
+
+    parts: list[Image.Image] = []
+    for file in files:
+        try:
+            with Image.open(file) as opened:
+                parts.append(opened.convert("RGB"))
+        except Exception as error:  # Pillow has a kind for each damage
+            raise ValueError(f"{file} cannot be read as a picture ({brief(error)}): give another") from None
+    return np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
 
 
 def find(argv: list[str]) -> None:
@@ -94,7 +118,7 @@ def find(argv: list[str]) -> None:
     from rich.table import Table
 
     from mvitac.pack import Pack
-    from mvitac.record import brief, check_place, write_atomic
+    from mvitac.record import check_place, write_atomic
     from mvitac.retrieval import Index
 
     @dataclass(frozen=True, kw_only=True)
@@ -109,6 +133,9 @@ def find(argv: list[str]) -> None:
         """What the picture is."""
         target: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="to")] = "vision"
         """What to compare it with."""
+        background: tuple[Path, ...] = ()
+        """For a model of difference images: the touch sensor without contact, as many files as the picture. Without it the
+        picture is a difference image already."""
         k: int = 5
         """How many to find."""
         picture: Path | None = None
@@ -119,15 +146,9 @@ def find(argv: list[str]) -> None:
         check_place(options.picture)
     index = Index(options.index)
     model = index.model()
-    try:
-        parts = []
-        for path in options.image:
-            with Image.open(path) as opened:
-                parts.append(opened.convert("RGB"))
-        query = np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
-    except Exception as error:  # Pillow has a kind for each damage
-        raise ValueError(f"{options.image[0]} cannot be read as a picture ({brief(error)}): give another") from None
-    rows, scores = index.find(model, query, options.source, options.target, options.k)
+    query = _picture(options.image)
+    free = _picture(options.background) if options.background else None
+    rows, scores = index.find(model, query, options.source, options.target, options.k, background=free)
     table = Table(title=f"{options.source} -> {options.target} in {options.index}", title_justify="left")
     for column in ("cosine", "id", "group", *index.meta["classes"]):
         table.add_column(column)
@@ -135,7 +156,7 @@ def find(argv: list[str]) -> None:
         labels = index.labels(row)
         own = [str(index.table.column(name)[row]) for name in ("id", "group")]
         table.add_row(f"{score:.3f}", *own, *(labels.get(task, "") for task in index.meta["classes"]))
-    Console().print(table)
+    Console(markup=False).print(table)
     if options.picture:
         pack = Pack(index.meta["pack"], verify=False)
         if pack.digest != index.meta["pack_digest"]:
