@@ -40,6 +40,30 @@ def test_threads_wait_briefly_unless_told_otherwise(given: dict[str, str], expec
     assert out.stdout.split()[-1] == str(expected)
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_leaves_is_no_error(unbuffered: str) -> None:
+    """As in `mvitac --help | true`: nothing on stderr, and the exit code of what SIGPIPE ends."""
+    inlet, outlet = os.pipe()
+    os.close(inlet)
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run(
+        [sys.executable, "-m", "mvitac", "--help"], stdout=outlet, stderr=subprocess.PIPE, env=environment
+    )
+    os.close(outlet)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_a_pipe_of_its_own_that_breaks_is_one(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(arguments: list[str]) -> int:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr("mvitac.cli._run", broken)
+    assert main(["probe"]) == 2
+    assert "Broken pipe" in capsys.readouterr().err
+
+
 def test_help_names_every_command_in_80_columns() -> None:
     assert all(len(line) <= 80 for line in HELP.splitlines())
     for name in COMMANDS:

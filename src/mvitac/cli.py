@@ -72,28 +72,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     _wait_briefly()
     arguments = list(sys.argv[1:] if argv is None else argv)
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(HELP, end="")
-        return 0
-    if arguments[0] == "--version":
-        from mvitac import __version__
-
-        print(__version__)
-        return 0
     try:
-        name, rest = arguments[0], arguments[1:]
-        _check_once(rest)
-        if name == "data" and rest:
-            if rest[0] in ("-h", "--help"):
-                print(HELP, end="")
-                return 0
-            name, rest = f"data {rest[0]}", rest[1:]
-        if name not in COMMANDS:
-            from mvitac.registry import unknown
-
-            raise unknown("command", name, COMMANDS)
-        module, function = COMMANDS[name].split(":")
-        return getattr(importlib.import_module(f"mvitac.commands.{module}"), function)(rest) or 0
+        code = _run(arguments)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError as error:
+        if _reader_left():
+            return 141  # as a shell says of what SIGPIPE ended
+        print(f"mvitac: error: {one_line(error)}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
     except (ValueError, OSError, MemoryError) as error:
@@ -107,6 +94,43 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"mvitac: error: {one_line(MemoryError())}", file=sys.stderr)
             return 2
         raise
+
+
+def _run(arguments: list[str]) -> int:
+    """The command that ``arguments`` name, done; its exit code."""
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(HELP, end="")
+        return 0
+    if arguments[0] == "--version":
+        from mvitac import __version__
+
+        print(__version__)
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    _check_once(rest)
+    if name == "data" and rest:
+        if rest[0] in ("-h", "--help"):
+            print(HELP, end="")
+            return 0
+        name, rest = f"data {rest[0]}", rest[1:]
+    if name not in COMMANDS:
+        from mvitac.registry import unknown
+
+        raise unknown("command", name, COMMANDS)
+    module, function = COMMANDS[name].split(":")
+    return getattr(importlib.import_module(f"mvitac.commands.{module}"), function)(rest) or 0
+
+
+def _reader_left() -> bool:
+    """Whether nobody reads what is printed any more (``mvitac ... | head``); what is left of it then goes nowhere."""
+    import select
+
+    out = select.poll()
+    out.register(1, 0)
+    left = any(event & select.POLLERR for _, event in out.poll(0))
+    if left:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return left
 
 
 def _wait_briefly() -> None:

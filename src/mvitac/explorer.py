@@ -106,7 +106,10 @@ def page(lands: dict[str, Landscape]) -> Any:
         }
         with gr.Row():
             with gr.Column(min_width=240):
-                given = gr.Image(label="your picture", type="numpy", image_mode="RGB", sources=["upload", "clipboard"])
+                wants = (
+                    "your picture (of touch: minus its background)" if first.model.spec.difference else "your picture"
+                )
+                given = gr.Image(label=wants, type="numpy", image_mode="RGB", sources=["upload", "clipboard"])
                 kind = gr.Radio(list(first.x), value=next(iter(first.x)), label="it is a picture of")
                 ask = gr.Button("Query and classify" + (f" by {next(iter(lands))}" if len(lands) > 1 else ""))
             with gr.Column(min_width=240):

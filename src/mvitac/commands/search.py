@@ -142,6 +142,8 @@ def find(argv: list[str]) -> None:
         """Also draw the query and what was found into this PNG (needs the indexed pack where it was)."""
 
     options = parse(Options, argv, "find")
+    if not options.image:
+        raise ValueError("say what to find: mvitac find IMAGE --in INDEX")
     if options.picture:
         check_place(options.picture)
     index = Index(options.index)
