@@ -146,7 +146,12 @@ def experiment(model: Model, pack: Pack, seeds: int, candidates: int) -> dict[st
                 strict=True,
             )
         )
-        for ours, theirs in (("both", "vision"), ("both", "touch"), ("both", "first grasp"))
+        for ours, theirs in (
+            ("both", "vision"),
+            ("both", "touch"),
+            ("both", "random weights, both"),
+            ("both", "first grasp"),
+        )
     }
     facts = {
         "seeds": seeds,

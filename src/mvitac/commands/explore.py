@@ -1,6 +1,7 @@
 """``mvitac explore``: a local page that shows what a run knows."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from mvitac.options import parse
@@ -36,6 +37,7 @@ def explore(argv: list[str]) -> None:
         raise ValueError(f"{len(options.runs)} runs given: give one, or two to compare")
     if options.rows < 3:
         raise ValueError(f"--rows {options.rows}: give at least 3")
+    say = partial(Console(markup=False).print, soft_wrap=True, highlight=False)
     models = [load(run) for run in options.runs]
     pack = Pack(options.on) if options.on else own_data(models[0], "show another pack, --on PACK")
     try:
@@ -45,12 +47,15 @@ def explore(argv: list[str]) -> None:
         names = [Path(run).name if options.runs.count(run) == 1 else f"{run} {i}" for i, run in enumerate(options.runs)]
         if len(set(names)) < len(names):
             names = list(options.runs)
-        lands = {name: Landscape(m, pack, limit=options.rows) for name, m in zip(names, models, strict=True)}
+        lands = {}
+        for name, model in zip(names, models, strict=True):
+            say(f"{name}: features of up to {min(options.rows, pack.num)} pairs, and its probes")
+            lands[name] = Landscape(model, pack, limit=options.rows)
         blocks = page(lands)
     except ModuleNotFoundError as error:
         if error.name != "gradio":
             raise
         raise ValueError("the explorer needs gradio: pip install 'mvitac[explore]'") from None
     where = f"http://{options.host}:{options.port or 7860}"
-    Console().print(f"explorer: {where} (or the next free port; Ctrl-C ends it)", soft_wrap=True, highlight=False)
+    say(f"explorer: {where} (or the next free port; Ctrl-C ends it)")
     serve(blocks, host=options.host, port=options.port)
