@@ -46,7 +46,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         for source in sources_of(task):
             table.add_row(source, *(cell(task, source, m) for m in modalities))
         console.print(table)
-    console.print(f"[dim]95 % intervals: bootstrap over test {result['group_by']}s and seeds.[/dim]")
+    console.print(f"95 % intervals: bootstrap over test {result['group_by']}s and seeds.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
 
