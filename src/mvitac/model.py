@@ -121,8 +121,8 @@ class Model(nn.Module):
     ) -> dict[str, Tensor]:
         """Class probabilities [N, K] by task, from the probes that a published artifact carries.
 
-        Given both modalities, the probe on both answers. ``classes`` names the columns. ValueError as for ``embed``, and
-        where there is no probe.
+        Images and ``background`` are as for ``embed``. Given both modalities, the probe on both answers. ``classes`` names
+        the columns. ValueError as for ``embed``, and where there is no probe.
         """
         given = self.embed(vision=vision, touch=touch, background=background)
         asked = "both" if len(given) == 2 else next(iter(given))
