@@ -10,7 +10,7 @@ import argparse
 
 import numpy as np
 
-from mvitac.scores import interval, paired_difference
+from mvitac.evaluation.scores import interval, paired_difference
 
 SETTINGS = (
     # groups, rows in each, standard deviation of the methods' difference over groups, of each method over seeds

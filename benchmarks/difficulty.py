@@ -15,14 +15,15 @@ from pathlib import Path
 from rich.console import Console
 
 from mvitac.datasets.simulated import SimulatedConfig
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.recipes import recipe
-from mvitac.record import provenance, write_json
 from mvitac.registry import default
+from mvitac.report.tables import print_summary
 from mvitac.run import Optim
-from mvitac.session import Session, probe_runs
-from mvitac.tables import print_summary
-from mvitac.train import train
+from mvitac.system.files import write_json
+from mvitac.system.provenance import provenance
+from mvitac.training.loop import train
 
 MARGIN, CEILING = 0.20, 0.97
 
@@ -48,7 +49,7 @@ def main() -> None:
         train(replace(run, seed=seed), options.out / f"{options.data}-{options.world}-{seed}", resume=True)
         for seed in range(options.seeds)
     ]
-    result = probe_runs(paths, Session())
+    result = probe_runs(paths, ProbeConfig())
     console = Console()
     print_summary(result, console)
     verdicts = {}

@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from mvitac.gel_colours import GelMirror
-from mvitac.pack import Pack
-from mvitac.sim.gel import SENSORS, press, render
+from mvitac.data.pack import Pack
+from mvitac.sim.gel import press, render
 from mvitac.sim.materials import CLASSES, draw_instance
+from mvitac.sim.sensors import SENSORS
+from mvitac.transforms.gel_flip import GelMirror
 
 WIDTH_MM = 12.8
 SHOWN = "gravel"

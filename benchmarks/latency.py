@@ -22,16 +22,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.encoders import EncoderConfig
-from mvitac.export import Tolerance, export
-from mvitac.graph import Graph
+from mvitac.deploy.engine import Call, Engine, cosines
+from mvitac.deploy.export import Tolerance, export
+from mvitac.deploy.export_module import ExportModule
 from mvitac.model import fresh
-from mvitac.pack import Pack
-from mvitac.packing import build
+from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe
-from mvitac.record import provenance
-from mvitac.runtime import Call, Engine, cosines
+from mvitac.system.provenance import provenance
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "ONNX Runtime fp32": {"kind": "onnx"},
@@ -79,9 +79,9 @@ def main() -> None:
         augment=replace(base.augment, size=options.size),
     )
     model = fresh(run, pack.spec, options.size)
-    from mvitac.publish import with_readouts  # after the threads are set
+    from mvitac.deploy.publish import with_readouts  # after the threads are set
 
-    graph = Graph(with_readouts(model, pack))
+    graph = ExportModule(with_readouts(model, pack))
     calls: dict[str, Call] = {"eager": in_torch(graph)}
     if not options.no_compile:
         calls["torch.compile"] = in_torch(torch.compile(graph, dynamic=False))

@@ -14,12 +14,12 @@ from functools import partial
 import torch
 
 from benchmarks.floor import clock
-from mvitac.augment import ViewAugment, random_view
-from mvitac.batch import Views
-from mvitac.encoders import SCRATCH, EncoderConfig
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Views
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.recipes import recipe
-from mvitac.spec import DataSpec
-from mvitac.step import Step
+from mvitac.training.step import Step
+from mvitac.transforms.random_views import ViewAugment, random_view
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ Sources are made by code in their owners' layouts: Touch and Go as extracted fra
 Kinect 540 x 960, gzip). For each:
 
 - ``bare``: a loop that decodes and resizes every image, in as many processes as packing gets
-- ``pack``: ``mvitac.packing.build``, the whole way to a finished, sealed pack on disk; ratio = bare time / pack time
+- ``pack``: ``mvitac.data.build.build``, the whole way to a finished, sealed pack on disk; ratio = bare time / pack time
 - ``bare, every frame`` (mp4): from the first to the last listed frame, where ``bare`` seeks each touch
 - ``owners`` (mp4; needs OpenCV): seek both videos to each listed frame, write both as JPEG, read them back, resize
 
@@ -35,12 +35,13 @@ import numpy as np
 from av.video.reformatter import Interpolation, VideoReformatter
 from PIL import Image
 
-from mvitac.datasets.calandra import PHASES, CalandraConfig
-from mvitac.datasets.touch_and_go import TouchAndGoConfig
-from mvitac.pack import fit
-from mvitac.packing import build
-from mvitac.record import provenance, write_json
-from mvitac.source import Source
+from mvitac.data.build import build
+from mvitac.data.images import fit
+from mvitac.data.source import Source
+from mvitac.datasets.calandra.reader import PHASES, CalandraConfig
+from mvitac.datasets.touch_and_go.reader import TouchAndGoConfig
+from mvitac.system.files import write_json
+from mvitac.system.provenance import provenance
 
 TOUCH, NUM_PICTURES = 30, 48
 STEMS = ("video", "gelsight")

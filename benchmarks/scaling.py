@@ -12,11 +12,11 @@ import torch
 import torch.distributed as dist
 
 from benchmarks.speed import Scale, interleave, our_run
-from mvitac.batch import Views
-from mvitac.device import pick_device
-from mvitac.distributed import World, join, local_device, synchronise_norms
-from mvitac.spec import DataSpec
-from mvitac.step import Step
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Views
+from mvitac.system.device import pick_device
+from mvitac.system.distributed import World, join, local_device, synchronise_norms
+from mvitac.training.step import Step
 
 
 def main() -> None:

@@ -25,10 +25,15 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.record import provenance
+from mvitac.system.provenance import provenance
 
 OURS = "mvitac"
-ENGINES = {OURS: "mvitac.retrieval", "scikit-learn": "sklearn.neighbors", "faiss": "faiss", "usearch": "usearch.index"}
+ENGINES = {
+    OURS: "mvitac.deploy.search",
+    "scikit-learn": "sklearn.neighbors",
+    "faiss": "faiss",
+    "usearch": "usearch.index",
+}
 """Engine -> the module it needs."""
 
 
@@ -40,7 +45,7 @@ def installed() -> list[str]:
 def searcher(name: str, bank: np.ndarray, k: int, threads: int) -> Callable[[np.ndarray], np.ndarray]:
     """A function from unit queries [Q, E] to the rows [Q, k] of ``bank`` [N, E] nearest by cosine, exactly, best first."""
     if name == OURS:
-        from mvitac.retrieval import nearest
+        from mvitac.deploy.search import nearest
 
         return lambda queries: nearest(bank, queries, k)[0]
     if name == "scikit-learn":

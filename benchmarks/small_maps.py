@@ -1,4 +1,4 @@
-"""A step of the demo recipe with its small convolutions as products and as convolutions (``small_maps.py``), in turn.
+"""A step of the demo recipe with its small convolutions as products and as convolutions (``nn/small_conv.py``), in turn.
 
     python -m benchmarks.small_maps [--threads 1 2] [--rounds 9] [--json FILE]
 
@@ -14,13 +14,14 @@ from pathlib import Path
 import torch
 
 from benchmarks.speed import interleave
-from mvitac import small_maps
-from mvitac.allocator import keep_freed_memory
-from mvitac.batch import Views
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Views
+from mvitac.nn import small_conv
 from mvitac.recipes import recipe
-from mvitac.record import provenance, write_json
-from mvitac.spec import DataSpec
-from mvitac.step import Step
+from mvitac.system.files import write_json
+from mvitac.system.malloc import keep_freed_memory
+from mvitac.system.provenance import provenance
+from mvitac.training.step import Step
 
 CPU = torch.device("cpu")
 
@@ -58,10 +59,10 @@ def variants(precision: str) -> dict:
     step = Step(run, method.train(), CPU)
 
     def take(most: int) -> None:
-        small_maps.MAX_PIXELS = most
+        small_conv.MAX_PIXELS = most
         step([lambda: batch], lr=1e-4, seed=0, progress=0.5)
 
-    as_shipped = small_maps.MAX_PIXELS
+    as_shipped = small_conv.MAX_PIXELS
     return {"convolutions": lambda: take(0), "products": lambda: take(as_shipped)}
 
 

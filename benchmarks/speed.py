@@ -35,24 +35,26 @@ from rich.table import Table
 from benchmarks import lightly_parts
 from benchmarks.floor import Floor, clock, peak
 from benchmarks.typical import TypicalStep, typical_batches, write_jpegs
-from mvitac import augment
-from mvitac.allocator import keep_freed_memory
-from mvitac.augment import ViewAugment, draw
-from mvitac.batch import Views
-from mvitac.batches import feed_parts
-from mvitac.device import describe
-from mvitac.distributed import World
-from mvitac.encoders import SCRATCH, EncoderConfig
-from mvitac.heads import EPOCHS, train_heads
-from mvitac.model import Model, pack_features
-from mvitac.pack import Pack
-from mvitac.packing import build
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec
+from mvitac.evaluation.classifiers import EPOCHS, train_heads
+from mvitac.evaluation.features import pack_features
+from mvitac.methods.base import Views
+from mvitac.model import Model
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.recipes import recipe
-from mvitac.record import provenance, write_json
 from mvitac.run import Run
-from mvitac.source import Sample, Source
-from mvitac.spec import DataSpec
-from mvitac.step import Step
+from mvitac.system.device import describe
+from mvitac.system.distributed import World
+from mvitac.system.files import write_json
+from mvitac.system.malloc import keep_freed_memory
+from mvitac.system.provenance import provenance
+from mvitac.training.step import Step
+from mvitac.training.views import feed_parts
+from mvitac.transforms import random_views
+from mvitac.transforms.random_views import ViewAugment, draw
 
 PAPER_PAIRS, PAPER_EPOCHS = 91_982, 240
 
@@ -210,8 +212,8 @@ def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
         parts = feed(our_run(scale, name), pack, device)
         ours: dict[str, Callable[[], object]] = {f"ours, pack, {name}": lambda f=parts: next(f)[0]()}
         if device.type == "cpu":
-            ours[f"ours, views alone, {name}"] = lambda d=dtype: augment.apply(images, drawn, scale.size, d)
-        if device.type == "cpu" and augment.fused():
+            ours[f"ours, views alone, {name}"] = lambda d=dtype: random_views.apply(images, drawn, scale.size, d)
+        if device.type == "cpu" and random_views.fused():
             ours |= {f"{name}, without numba": in_torch(call) for name, call in ours.items()}
         variants |= ours
     seconds = interleave(variants, scale.rounds, device)
@@ -233,7 +235,7 @@ def in_torch(call: Callable[[], object]) -> Callable[[], object]:
     """``call`` with its views made as where numba is not installed."""
 
     def without() -> object:
-        with patch.object(augment, "fused", lambda: None):
+        with patch.object(random_views, "fused", lambda: None):
             return call()
 
     return without

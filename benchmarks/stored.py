@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.record import provenance, write_json
-from mvitac.source import Sample, Source
-from mvitac.spec import DataSpec
+from mvitac.system.files import write_json
+from mvitac.system.provenance import provenance
 
 
 class Rows(Source):

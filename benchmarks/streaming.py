@@ -19,17 +19,18 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.batches import batches, training_rows
-from mvitac.datasets.stream import StreamConfig
-from mvitac.pack import Pack
-from mvitac.packing import build
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.sharding import write_shards
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec
+from mvitac.data.streaming import StreamedPack
+from mvitac.datasets.pack import StreamConfig
 from mvitac.recipes import recipe
-from mvitac.record import provenance, write_json
 from mvitac.run import Run
-from mvitac.sharding import write_shards
-from mvitac.source import Sample, Source
-from mvitac.spec import DataSpec
-from mvitac.streaming import StreamedPack
+from mvitac.system.files import write_json
+from mvitac.system.provenance import provenance
+from mvitac.training.sampler import batches, training_rows
 
 
 @dataclass

@@ -3,7 +3,7 @@
     python -m benchmarks.waiting [--rounds 3] [--json FILE]
 
 Each figure is a step of recipe `paper` (ResNet-10, 48 px, batch 64, bf16, all cores) in a process of its own
-(``benchmarks.memory``), variants in turn. `mvitac` sets GOMP_SPINCOUNT=10000 (``cli.py``), libgomp by itself 300,000.
+(``benchmarks.memory``), variants in turn. `mvitac` sets GOMP_SPINCOUNT=10000 (``cli/main.py``), libgomp by itself 300,000.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from mvitac.record import provenance, write_json
+from mvitac.system.files import write_json
+from mvitac.system.provenance import provenance
 
 VARIANTS = {
     "as libgomp does": {},

@@ -27,14 +27,14 @@ from rich.console import Console
 from rich.table import Table
 
 import mvitac
-from mvitac.encoders import SCRATCH
-from mvitac.heads import fit_linear
+from mvitac.data.pack import Pack
+from mvitac.deploy.policy import ObservationEncoder
+from mvitac.evaluation.classifiers import fit_linear
+from mvitac.evaluation.probe import ProbeSplit, parts
+from mvitac.evaluation.scores import interval, paired_difference
 from mvitac.model import Model, fresh
-from mvitac.pack import Pack
-from mvitac.policy import ObservationEncoder
-from mvitac.probe import Parts, parts
-from mvitac.record import check_place, write_json
-from mvitac.scores import interval, paired_difference
+from mvitac.nn.encoders import SCRATCH
+from mvitac.system.files import check_place, write_json
 
 KEYS = {
     "vision": {"observation.images.camera": "vision"},
@@ -85,7 +85,7 @@ def encode(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
     return {m: torch.cat([encoder(x).cpu() for x in seen]).numpy() for m, encoder in encoders.items()}
 
 
-def predict(x: np.ndarray, y: np.ndarray, rows: Parts) -> np.ndarray:
+def predict(x: np.ndarray, y: np.ndarray, rows: ProbeSplit) -> np.ndarray:
     """Success probability [num_test] of the test rows, from ``x`` and ``y`` of all rows: train, val, test in this order."""
     val, test = len(rows.train), len(rows.train) + len(rows.val)
     head, _ = fit_linear(x[:val], y[:val], x[val:test], y[val:test])
@@ -93,7 +93,7 @@ def predict(x: np.ndarray, y: np.ndarray, rows: Parts) -> np.ndarray:
 
 
 def play(p: np.ndarray, y: np.ndarray, objects: np.ndarray, hands: np.ndarray, threshold: float) -> dict[str, Any]:
-    """Episodes and lifts that held, by object, and grasps tried on average: a record of ``mvitac.scores.interval``."""
+    """Episodes and lifts that held, by object, and grasps tried on average: a record of ``mvitac.evaluation.scores.interval``."""
     lifted, tried = decide(p[hands], threshold)
     thing, held = objects[hands[:, 0]], y[hands[np.arange(len(hands)), lifted]]
     num = int(objects.max()) + 1

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.cameras import Source
-from mvitac.capture import Stream
-from mvitac.realtime import Live
-from mvitac.runtime import Engine
+from mvitac.deploy.engine import Engine
+from mvitac.live.cameras import Source
+from mvitac.live.predictor import Live
+from mvitac.live.streams import Stream
 
 
 def to_rgb(message: Any) -> np.ndarray:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from toy import toy_pack
 
-from mvitac.pack import Pack
+from mvitac.data.pack import Pack
 
 torch.set_num_threads(1)
 
@@ -46,9 +46,9 @@ def ctrl_c() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def smoke_run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of eight steps on the striped pairs."""
-    from mvitac.datasets.packed import PackConfig
+    from mvitac.datasets.pack import PackConfig
     from mvitac.recipes import recipe
-    from mvitac.train import train
+    from mvitac.training.loop import train
 
     return train(recipe("smoke", PackConfig(path=pack.path)), tmp_path_factory.mktemp("smoke") / "run", quiet=True)
 
@@ -56,7 +56,7 @@ def smoke_run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """That run, published."""
-    from mvitac.publish import publish
+    from mvitac.deploy.publish import publish
 
     return publish(smoke_run, tmp_path_factory.mktemp("artifact") / "artifact")
 
@@ -64,8 +64,8 @@ def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """That artifact, exported for ONNX Runtime."""
-    from mvitac.artifact import load
-    from mvitac.export import export
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.export import export
 
     out = tmp_path_factory.mktemp("export") / "onnx"
     export(load(artifact), pack, out, kind="onnx")

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.cameras import Ended, Source
-from mvitac.capture import Event, Stream
-from mvitac.realtime import Live, LiveConfig
-from mvitac.runtime import Engine
+from mvitac.deploy.engine import Engine
+from mvitac.live.cameras import Ended, Source
+from mvitac.live.contact import LiveConfig
+from mvitac.live.predictor import Live
+from mvitac.live.streams import Event, Stream
 
 FAULTS = ("unplugged", "frozen", "resolution", "damaged", "stalled")
 NAMES = {
@@ -73,7 +74,7 @@ class Rig(Source):
 class World:
     """Two streams of different rates around one ``Live``, in simulated time."""
 
-    def __init__(self, engine: Any, config: LiveConfig = LiveConfig(calibration=8), **options: Any) -> None:  # noqa: B008
+    def __init__(self, engine: Any, config: LiveConfig = LiveConfig(calibration=8), **options: Any) -> None:
         self.clock = Clock()
         self.rigs = {"vision": Rig(self.clock, 1), "touch": Rig(self.clock, 2)}
         self.streams = {m: [Stream(m, rig, clock=self.clock)] for m, rig in self.rigs.items()}

@@ -18,17 +18,18 @@ import safetensors.torch
 import torch
 
 import mvitac
-from mvitac.artifact import preprocessing, read_manifest, seal
-from mvitac.cli import main
-from mvitac.datasets.packed import PackConfig
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.model import pack_features, subtracted
-from mvitac.pack import Pack
-from mvitac.probe import parts
-from mvitac.publish import card, fit_readouts, push
-from mvitac.record import digest_file
-from mvitac.retrieval import check_pack
-from mvitac.session import Session, probe_runs
+from mvitac.deploy.artifact import preprocessing, read_manifest, seal
+from mvitac.deploy.publish import card, fit_readouts, push
+from mvitac.deploy.search import check_pack
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.probe import parts
+from mvitac.model import subtracted
+from mvitac.system.files import digest_file
 
 
 @pytest.fixture
@@ -67,7 +68,7 @@ def test_embeds_as_the_run_does_and_is_in_eval_mode(smoke_run: Path, artifact: P
 def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: Pack) -> None:
     """Each stored probe has the accuracy `mvitac probe` prints, and predict() on raw images has it again."""
     model = mvitac.load(artifact)
-    summary = probe_runs([smoke_run], Session(controls=False))["summary"]
+    summary = probe_runs([smoke_run], ProbeConfig(controls=False))["summary"]
     for task in pack.spec.tasks:
         rows = parts(pack, task).test
         labels = pack.column(f"label_{task.name}")[rows]
@@ -81,7 +82,7 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
 
 
 def test_a_probe_gives_scikit_learns_probabilities(smoke_run: Path, pack: Pack) -> None:
-    from mvitac.heads import fit_linear
+    from mvitac.evaluation.classifiers import fit_linear
 
     model = mvitac.load(smoke_run)
     for task in pack.spec.tasks:  # one of three classes, one of two

@@ -9,9 +9,17 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mvitac import augment
-from mvitac.augment import Augment, Drawn, ViewAugment, draw, plain_view, random_view
-from mvitac.encoders import IMAGENET_MEAN, IMAGENET_STD
+from mvitac.transforms import random_views
+from mvitac.transforms.random_views import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    Augment,
+    Drawn,
+    ViewAugment,
+    draw,
+    plain_view,
+    random_view,
+)
 
 
 def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
@@ -20,7 +28,7 @@ def images(num: int = 8, channels: int = 3, side: int = 40) -> torch.Tensor:
     return (F.interpolate(noise, (side, side), mode="bicubic").clamp(0, 1) * 255).to(torch.uint8)
 
 
-ROUTES = (augment._one_by_one, augment._batched)
+ROUTES = (random_views._one_by_one, random_views._batched)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -54,11 +62,13 @@ def test_both_routes_replay_the_same_parameters(size: int, channels: int) -> Non
     """Crop, flip, jitter and grayscale of the batched route are the one-by-one route's to within a level's rounding."""
     raw = images(16, channels, side=40)
     drawn = draw(ViewAugment(scale=(0.3, 1.0), grayscale=0.3, jitter=0.2), 16, 40, generator())
-    one_by_one, batched = (f(raw, drawn, size, torch.float32) for f in (augment._one_by_one, augment._batched))
+    one_by_one, batched = (
+        f(raw, drawn, size, torch.float32) for f in (random_views._one_by_one, random_views._batched)
+    )
     off = 255 * (denormalise(one_by_one) - denormalise(batched)).abs()
     assert off.max() < 2.5 and off.mean() < 0.5
     wrong = Drawn(drawn.boxes.roll(1, 0), drawn.flip, drawn.grayscale, drawn.gains)
-    other = denormalise(augment._batched(raw, wrong, size, torch.float32))
+    other = denormalise(random_views._batched(raw, wrong, size, torch.float32))
     assert 255 * (denormalise(one_by_one) - other).abs().mean() > 5  # the bound can fail
 
 
@@ -71,7 +81,7 @@ def test_both_routes_have_the_same_statistics() -> None:
     torch.testing.assert_close(a.std((0, 2, 3)), b.std((0, 2, 3)), atol=0.04, rtol=0)
 
 
-@pytest.mark.parametrize("route", [augment.apply, augment._one_by_one, augment._batched])
+@pytest.mark.parametrize("route", [random_views.apply, random_views._one_by_one, random_views._batched])
 def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> None:
     drawn = draw(ViewAugment(), 8, 40, generator())
     exact, rounded = (route(images(), drawn, 24, dtype) for dtype in (torch.float32, torch.bfloat16))
@@ -88,7 +98,7 @@ def test_compiled_views_are_torchs_bit_for_bit(side: int, size: int, channels: i
     raw = torch.randint(0, 256, (24, channels, side, side), dtype=torch.uint8, generator=generator())
     drawn = draw(ViewAugment(scale=(0.01, 1.0), grayscale=0.3), 24, side, generator())
     drawn.boxes[0], drawn.boxes[1] = torch.tensor([0, 0, side, side]), torch.tensor([side - 2, side - 1, 2, 1])
-    torchs, compiled = (route(raw, drawn, size, dtype) for route in (augment._one_by_one, augment.apply))
+    torchs, compiled = (route(raw, drawn, size, dtype) for route in (random_views._one_by_one, random_views.apply))
     gray = drawn.grayscale
     assert torch.equal(torchs[~gray], compiled[~gray])
     torch.testing.assert_close(torchs[gray], compiled[gray], atol=1e-6, rtol=0.01 if dtype == torch.bfloat16 else 1e-5)
@@ -98,7 +108,7 @@ def test_compiled_views_are_torchs_bit_for_bit(side: int, size: int, channels: i
 def test_compiled_rounding_to_bf16_is_torchs() -> None:
     """Also of halves, which go to the even neighbour, and of what is a bit less or more."""
     pytest.importorskip("numba")
-    from mvitac.fused import _bfloat16
+    from mvitac.transforms.numba_views import _bfloat16
 
     bits = [
         high << 16 | low for high in (0x3F80, 0x3F81, 0xBF80, 0xBF81) for low in (0, 1, 0x7FFF, 0x8000, 0x8001, 0xFFFF)
@@ -111,23 +121,23 @@ def test_compiled_rounding_to_bf16_is_torchs() -> None:
 def test_compiled_views_are_shared_among_torchs_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """One share for each, and the same views however many there are."""
     pytest.importorskip("numba")
-    from mvitac import fused
+    from mvitac.transforms import numba_views
 
-    shares, views = [], fused.views
+    shares, views = [], numba_views.views
 
     def counted(*arrays: np.ndarray) -> None:
         shares.append(len(arrays[0]))
         views(*arrays)
 
-    monkeypatch.setattr(fused, "views", counted)
+    monkeypatch.setattr(numba_views, "views", counted)
     drawn = draw(ViewAugment(), 8, 40, generator())
-    alone = augment.apply(images(), drawn, 32)
+    alone = random_views.apply(images(), drawn, 32)
     assert shares == [8]
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    assert torch.equal(augment.apply(images(), drawn, 32), alone)
+    assert torch.equal(random_views.apply(images(), drawn, 32), alone)
     assert sorted(shares[1:]) == [2, 3, 3]
     shares.clear()
-    augment.apply(images(2), draw(ViewAugment(), 2, 40, generator()), 32)
+    random_views.apply(images(2), draw(ViewAugment(), 2, 40, generator()), 32)
     assert shares == [1, 1]
 
 
@@ -140,16 +150,18 @@ def test_torchs_route_where_the_compiled_one_cannot(monkeypatch: pytest.MonkeyPa
         def views(self, *_: object) -> None:
             raise AssertionError("the compiled route was taken")
 
-    monkeypatch.setattr(augment, "fused", Cannot)
+    monkeypatch.setattr(random_views, "fused", Cannot)
     plain, jittered = (draw(ViewAugment(jitter=j), 8, 40, generator()) for j in (0.0, 0.3))
     for drawn, size, dtype in ((jittered, 32, torch.float32), (plain, 32, torch.float64), (plain, 26, torch.float32)):
-        expected = augment._one_by_one(images(), drawn, size, dtype)
-        assert torch.equal(augment.apply(images(), drawn, size, dtype), expected)
+        expected = random_views._one_by_one(images(), drawn, size, dtype)
+        assert torch.equal(random_views.apply(images(), drawn, size, dtype), expected)
     plain_view(images(), 32)
     with pytest.raises(AssertionError, match="compiled"):
-        augment.apply(images(), plain, 32)
-    monkeypatch.setattr(augment, "fused", lambda: None)
-    assert torch.equal(augment.apply(images(), plain, 32), augment._one_by_one(images(), plain, 32, torch.float32))
+        random_views.apply(images(), plain, 32)
+    monkeypatch.setattr(random_views, "fused", lambda: None)
+    assert torch.equal(
+        random_views.apply(images(), plain, 32), random_views._one_by_one(images(), plain, 32, torch.float32)
+    )
 
 
 def test_flip_is_exact() -> None:
@@ -161,7 +173,7 @@ def test_flip_is_exact() -> None:
         torch.ones(4, 5),
     )
     torch.testing.assert_close(
-        denormalise(augment.apply(raw, drawn, 32)), raw.flip(-1).float() / 255, atol=1e-6, rtol=0
+        denormalise(random_views.apply(raw, drawn, 32)), raw.flip(-1).float() / 255, atol=1e-6, rtol=0
     )
 
 
@@ -224,7 +236,7 @@ def test_without_noise_a_view_is_what_it_was() -> None:
         random_view(images(), ViewAugment(noise=noise), 24, drawing)
         after.append(torch.rand(1, generator=drawing))
     plain = generator()
-    augment.apply(images(), draw(ViewAugment(), 8, 40, plain), 24)
+    random_views.apply(images(), draw(ViewAugment(), 8, 40, plain), 24)
     assert after[0] == torch.rand(1, generator=plain) and after[0] != after[1]
 
 

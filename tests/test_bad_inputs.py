@@ -1,6 +1,6 @@
 """Two hundred bad inputs: each ends in one line that says what was given and what to do, exit code 2, nothing left behind.
 
-Every case runs ``mvitac.cli.main`` in this process. While it runs, training, packing and probing are traps: a mistake that
+Every case runs ``mvitac.cli.main.main`` in this process. While it runs, training, packing and probing are traps: a mistake that
 is noticed only after the work began fails its case. ``{tmp}``, ``{pack}``, ``{run}`` and ``{out}`` in a command stand for
 the test's own folder, a good pack, a good finished run (all copies where they are spoilt) and a free place for output.
 """
@@ -32,21 +32,21 @@ from PIL import Image
 from toy import Toy
 
 import mvitac
-from mvitac import batches as batches_module
-from mvitac import packing
-from mvitac import probe as probe_module
-from mvitac.cli import main
-from mvitac.datasets.packed import PackConfig
+from mvitac.cli.main import main
+from mvitac.data import build as packing
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
+from mvitac.evaluation import probe as probe_module
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, safetensors_digest
-from mvitac.pack import Pack
-from mvitac.packing import build
 from mvitac.recipes import recipe
-from mvitac.record import digest, digest_file, write_atomic
 from mvitac.registry import to_json
-from mvitac.train import train
+from mvitac.system.files import digest, digest_file, write_atomic
+from mvitac.training import views as batches_module
+from mvitac.training.loop import train
 
 Spoil = Callable[[Path], object]
 
@@ -941,7 +941,7 @@ def checkpoint(change: Callable[[dict[str, Any]], object]) -> Spoil:
 
 def other_run(path: Path) -> None:
     """The checkpoint of the same run with another seed."""
-    run, _ = mvitac.model.load_run(path)  # type: ignore[attr-defined]
+    run, _ = mvitac.run.load_run(path)  # type: ignore[attr-defined]
     out = train(replace(run, seed=5), path.parent / "other", quiet=True)
     shutil.copy(out / CHECKPOINT, path / CHECKPOINT)
 
@@ -1174,7 +1174,7 @@ def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pyt
     shutil.copytree(finished, tmp_path / "r")
     (tmp_path / "r" / MODEL).unlink()
     data, rng = (finished / kind).read_bytes(), np.random.default_rng(13)
-    run, _ = mvitac.model.load_run(finished)  # type: ignore[attr-defined]
+    run, _ = mvitac.run.load_run(finished)  # type: ignore[attr-defined]
     noticed = 0
     for _ in range(NUM_DAMAGES):
         (tmp_path / "r" / kind).write_bytes(damaged(data, rng))

@@ -15,10 +15,10 @@ from test_methods import ROWS, TINY, build, outcome, small, views
 from test_train import smoke
 from toy import Toy
 
-from mvitac.diagnostics import spread
-from mvitac.distributed import World
-from mvitac.losses import queue_nce
-from mvitac.memory import Bank, Queue, shard_banks
+from mvitac.data.pack import Pack
+from mvitac.evaluation.diagnostics import spread
+from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.probe import probe_model
 from mvitac.methods.byol import BYOLConfig, regression
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.cmc import CMC, CMCConfig, nce
@@ -29,12 +29,13 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.simclr import SimCLRConfig, nt_xent
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.methods.vicreg import VICReg, VICRegConfig, covariance, variance
-from mvitac.model import load, pack_features
-from mvitac.pack import Pack
-from mvitac.probe import probe_model
+from mvitac.model import load
+from mvitac.nn.losses import queue_nce
+from mvitac.nn.memory_bank import Bank, Queue, shard_banks
 from mvitac.recipes import with_method
 from mvitac.run import Optim
-from mvitac.train import train
+from mvitac.system.distributed import World
+from mvitac.training.loop import train
 
 
 def unit(x: torch.Tensor) -> list[list[float]]:

@@ -17,19 +17,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mvitac.batches import make_views
-from mvitac.cli import main
-from mvitac.datasets.calandra import NUM_SHARDS, PHASES, Calandra, CalandraConfig, crop_kinect
-from mvitac.datasets.calandra_objects import AUTHORS_TEST, AUTHORS_TRAIN, doubtful, most_attempted, owners_shuffle
-from mvitac.datasets.packed import PackConfig
-from mvitac.feed import Feed
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.probe import parts
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.datasets.calandra.objects import AUTHORS_TEST, AUTHORS_TRAIN, doubtful, most_attempted, owners_shuffle
+from mvitac.datasets.calandra.reader import NUM_SHARDS, PHASES, Calandra, CalandraConfig, crop_kinect
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.probe import parts
 from mvitac.recipes import recipe
-from mvitac.session import Session, probe_runs
-from mvitac.tables import markdown, print_summary
-from mvitac.train import train
+from mvitac.report.tables import markdown, print_summary
+from mvitac.training.loader import Feed
+from mvitac.training.loop import train
+from mvitac.training.views import make_views
 
 GEL, KINECT = (24, 32, 3), (54, 96, 3)
 OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_other_thing")
@@ -385,7 +385,7 @@ def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leakin
     for ask in (("during",), ("after",)):
         pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)
         run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=2, eval_every=1)
-        result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], Session(probes=("linear", "knn")))
+        result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], ProbeConfig(probes=("linear", "knn")))
         console = Console(record=True, width=120, file=(tmp_path / "out.txt").open("w"))
         print_summary(result, console)
         tables = console.export_text() + markdown(result)

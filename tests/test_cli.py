@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from mvitac.cli import COMMANDS, HELP, main
+from mvitac.cli.main import COMMANDS, HELP, main
 
 GOLDEN = Path(__file__).parent / "golden"
 
 
 def test_help_imports_nothing_heavy() -> None:
     """`mvitac --help` in a fresh interpreter: no torch, numpy, tyro or rich among the modules it loads."""
-    code = "import sys; from mvitac.cli import main; main(['--help']); print(sorted(sys.modules))"
+    code = "import sys; from mvitac.cli.main import main; main(['--help']); print(sorted(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.startswith(HELP)
     for heavy in ("torch", "numpy", "tyro", "rich", "mvitac.train"):
@@ -34,7 +34,7 @@ def test_importing_the_package_imports_no_torch() -> None:
     ("given", "expected"), [({}, "10000"), ({"OMP_WAIT_POLICY": "ACTIVE"}, None), ({"GOMP_SPINCOUNT": "7"}, "7")]
 )
 def test_threads_wait_briefly_unless_told_otherwise(given: dict[str, str], expected: str | None) -> None:
-    code = "import os; from mvitac.cli import main; main(['--version']); print(os.environ.get('GOMP_SPINCOUNT'))"
+    code = "import os; from mvitac.cli.main import main; main(['--version']); print(os.environ.get('GOMP_SPINCOUNT'))"
     clean = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
     out = subprocess.run([sys.executable, "-c", code], env=clean | given, capture_output=True, text=True, check=True)
     assert out.stdout.split()[-1] == str(expected)
@@ -59,7 +59,7 @@ def test_a_pipe_of_its_own_that_breaks_is_one(
     def broken(arguments: list[str]) -> int:
         raise BrokenPipeError(32, "Broken pipe")
 
-    monkeypatch.setattr("mvitac.cli._run", broken)
+    monkeypatch.setattr("mvitac.cli.main._run", broken)
     assert main(["probe"]) == 2
     assert "Broken pipe" in capsys.readouterr().err
 

@@ -27,26 +27,28 @@ from PIL import Image
 from rich.console import Console
 from toy import Toy, toy_pack
 
-from mvitac import compare, jobs
-from mvitac.cli import main
-from mvitac.compare import cost, gather, lay_out, leaks, pairs_of
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.packed import PackConfig
+from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.folds import lay_out_folds
-from mvitac.jobs import do, do_all, seconds_of
-from mvitac.locks import Busy, alone
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.paper_tables import comma, latex, lines_of, markdown, write_tables
-from mvitac.plans import ABLATION, PLANS, TABLE1, TABLE2, Plan, Row, changed, find_plan, setting, slug
+from mvitac.evaluation.evaluate import ProbeConfig
+from mvitac.evaluation.scores import interval, paired_difference
+from mvitac.experiments import collect, jobs
+from mvitac.experiments.collect import cost, gather, lay_out, leaks, pairs_of
+from mvitac.experiments.cross_validation import lay_out_folds
+from mvitac.experiments.jobs import do, do_all, seconds_of
+from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
+from mvitac.experiments.plan import Plan, Row, changed, setting, slug
+from mvitac.experiments.table import lines_of
+from mvitac.experiments.table_formats import comma, latex, markdown, write_tables
 from mvitac.recipes import RECIPES, recipe
-from mvitac.record import write_json
-from mvitac.scores import interval, paired_difference
-from mvitac.session import Session
-from mvitac.source import Sample
-from mvitac.step import Step
-from mvitac.train import Interrupted, train
+from mvitac.system.files import write_json
+from mvitac.system.locks import Busy, hold_lock
+from mvitac.training.loop import Interrupted, train
+from mvitac.training.step import Step
 
 ROWS = (
     Row(label="MViTac", printed={"touch": {"pattern": 57.6}}),
@@ -64,9 +66,9 @@ def small(pack: Pack, **changes: object) -> Plan:
 def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     """Six runs, straight through, and their result."""
     out = tmp_path_factory.mktemp("compare") / "out"
-    work = lay_out(small(pack), pack, out, Session())
+    work = lay_out(small(pack), pack, out, ProbeConfig())
     do_all(work, 1, lambda line: None)
-    result = gather(work, out, Session())
+    result = gather(work, out, ProbeConfig())
     write_tables(result, out)
     return out, result
 
@@ -107,14 +109,14 @@ def test_the_plans_hold_the_papers_tables() -> None:
 
 
 def test_table1_has_one_budget(pack: Pack, tmp_path: Path) -> None:
-    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, Session())
+    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, ProbeConfig())
     assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 32  # smoke changes no tau
     assert {(job.run.steps, job.run.batch_size, job.run.optim.lr) for job in work.jobs} == {(4, 16, 2e-3)}
     assert [job.run.seed for job in work.jobs] == [0] * 16 + [1] * 16
 
 
 def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) -> None:
-    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path, Session())
+    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path, ProbeConfig())
     assert "no grayscale" in work.left_out and "the same run as 'MViTac'" in work.left_out["no grayscale"]
     assert "grayscale .2" not in work.left_out
     assert "plain touch flips" in work.left_out  # these are the recipe's
@@ -126,20 +128,20 @@ def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) ->
 
 def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "touch-only", vision_channels=0)
-    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path / "out", Session())
+    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path / "out", ProbeConfig())
     assert "learns from pairs" in work.left_out["TAG (CMC)"]
     assert "unknown modality" in work.left_out["supervised, vision only"]
     assert "the same run as 'supervised, touch only'" in work.left_out["supervised, both"]
     assert "the same run as 'MViTac, end-to-end'" in work.left_out["MViTac, end-to-end, all pairs"]
     assert "MViTac, end-to-end, all pairs, no touch flips" not in work.left_out
     assert {job.label for job in work.jobs} >= {"MViTac", "MoCo per modality", "supervised, touch only"}
-    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path / "out", Session())
+    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path / "out", ProbeConfig())
     for label in ("lambda_inter 2.0", "losses tt", "losses vv + tt"):
         assert "the same run as 'MViTac'" in work.left_out[label]
     assert "the same run as 'no flips'" in work.left_out["no touch flips"]
     assert "another modality" in work.left_out["losses vv"]
     with pytest.raises(ValueError, match="no row that this data allows"):
-        lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", Session())
+        lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", ProbeConfig())
 
 
 def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Path) -> None:
@@ -156,7 +158,7 @@ def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Pa
         Row(label="darker", set={"data.path": str(darker.path)}),
         Row(label="fewer", set={"data.path": str(fewer.path)}),
     )
-    session = Session(tasks=("pattern",), modalities=("touch",), controls=False)
+    session = ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False)
     work = lay_out(small(pack, rows=rows, seeds=1), pack, tmp_path / "out", session)
     assert list(work.left_out) == ["fewer"] and "another column id" in work.left_out["fewer"]
     do_all(work, 1, lambda line: None)
@@ -274,10 +276,10 @@ def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, m
     out, result = done
     assert len(list(out.rglob("model.safetensors"))) == 6 and not list(out.rglob("checkpoint.pt"))
     monkeypatch.setattr(jobs, "train", None)  # calling it would raise
-    monkeypatch.setattr(compare, "controls_of", None)
-    work = lay_out(small(pack), pack, out, Session())
+    monkeypatch.setattr(collect, "controls_of", None)
+    work = lay_out(small(pack), pack, out, ProbeConfig())
     do_all(work, 1, lambda line: None)
-    assert gather(work, out, Session()) == json.loads(json.dumps(result))
+    assert gather(work, out, ProbeConfig()) == json.loads(json.dumps(result))
 
 
 def test_controls_are_made_again_where_the_data_names_others(
@@ -287,28 +289,30 @@ def test_controls_are_made_again_where_the_data_names_others(
     out = shutil.copytree(done[0], tmp_path / "out")
     other = Pack(pack.path)
     other.spec = replace(pack.spec, controls={"noise": ("noise",)})
-    monkeypatch.setattr(compare, "controls_of", lambda *_: ([], []))
+    monkeypatch.setattr(collect, "controls_of", lambda *_: ([], []))
     for data, kept in ((pack, True), (other, False)):
-        result = gather(lay_out(small(pack), data, out, Session()), out, Session())
+        result = gather(lay_out(small(pack), data, out, ProbeConfig()), out, ProbeConfig())
         assert any(record["source"] == "noise only" for record in result["records"]) == kept
 
 
 def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: Path) -> None:
     wild = Row(label="wild", set={"optim.name": "sgd", "optim.lr": 1e30, "log_every": 1})
-    work = lay_out(small(pack, rows=(ROWS[0], wild), seeds=1), pack, tmp_path, Session(controls=False))
+    work = lay_out(small(pack, rows=(ROWS[0], wild), seeds=1), pack, tmp_path, ProbeConfig(controls=False))
     do_all(work, 1, lambda line: None)
-    result = gather(work, tmp_path, Session(controls=False))
+    result = gather(work, tmp_path, ProbeConfig(controls=False))
     assert "not finite" in result["failed"]["wild, seed 0"]
     assert "Diverged: wild, seed 0" in write_tables(result, tmp_path)[0].read_text()
     assert {record["source"] for record in result["records"]} == {"MViTac"}
     lost = replace(work, jobs=[job for job in work.jobs if job.label == "wild"])
     with pytest.raises(ValueError, match=r"no run of .* is finished: .*\(wild, seed 0: the loss is not finite"):
-        gather(lost, tmp_path, Session(controls=False))
+        gather(lost, tmp_path, ProbeConfig(controls=False))
 
 
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_path: Path) -> None:
-    work = lay_out(small(pack, seeds=3, set={"steps": 30000, "eval_every": 0}), pack, tmp_path, Session(controls=False))
+    work = lay_out(
+        small(pack, seeds=3, set={"steps": 30000, "eval_every": 0}), pack, tmp_path, ProbeConfig(controls=False)
+    )
     terminal = Console(force_terminal=True, file=(screen := io.StringIO()), width=80)
 
     def press() -> None:
@@ -330,7 +334,7 @@ def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_pat
 def test_a_run_that_fails_is_told_and_the_others_go_on(
     done: tuple[Path, dict], pack: Pack, tmp_path: Path, num_jobs: int
 ) -> None:
-    work = lay_out(small(pack, rows=ROWS[:2], seeds=1, set={"steps": 3}), pack, tmp_path, Session(controls=False))
+    work = lay_out(small(pack, rows=ROWS[:2], seeds=1, set={"steps": 3}), pack, tmp_path, ProbeConfig(controls=False))
     shutil.copytree(done[0] / "runs/mvitac/seed0", work.jobs[0].out)
     (work.jobs[0].out / "scores.json").unlink()
     said: list[str] = []
@@ -342,11 +346,11 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(
 
 def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) -> None:
     """As when the same command runs on two machines; here a thread is the other one."""
-    work = lay_out(small(pack, rows=ROWS[:2], seeds=1), pack, tmp_path, Session(controls=False))
+    work = lay_out(small(pack, rows=ROWS[:2], seeds=1), pack, tmp_path, ProbeConfig(controls=False))
     begun, go, said = threading.Event(), threading.Event(), []
 
     def other() -> None:
-        with alone(work.jobs[0].out, "", wait=False):
+        with hold_lock(work.jobs[0].out, "", wait=False):
             begun.set()
             go.wait(60)
 
@@ -362,14 +366,14 @@ def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) ->
         assert [job.done for job in work.jobs] == [False, True] and not work.jobs[0].out.exists()
         go.set()
         held.result()
-    text = write_tables(gather(work, tmp_path, Session(controls=False)), tmp_path)[0].read_text()
+    text = write_tables(gather(work, tmp_path, ProbeConfig(controls=False)), tmp_path)[0].read_text()
     assert "**Not finished: MViTac, seed 0.**" in text
     do_all(work, 1, lambda line: None)
     assert [job.done for job in work.jobs] == [True, True] and not list(tmp_path.rglob("*.lock"))
 
 
 def test_a_run_killed_once_scored_loses_its_checkpoint_later(done: tuple[Path, dict], pack: Pack) -> None:
-    work = lay_out(small(pack), pack, done[0], Session())
+    work = lay_out(small(pack), pack, done[0], ProbeConfig())
     (work.jobs[0].out / "checkpoint.pt").touch()
     do_all(work, 1, lambda line: None)
     assert not (work.jobs[0].out / "checkpoint.pt").exists()
@@ -379,14 +383,14 @@ def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], 
     """Before anything is trained or told, though all runs are finished."""
     out, _ = done
     with pytest.raises(ValueError, match="mvitac/seed0 holds a different run"):
-        lay_out(small(pack, set={"steps": 5, "eval_every": 0}), pack, out, Session())
+        lay_out(small(pack, set={"steps": 5, "eval_every": 0}), pack, out, ProbeConfig())
     other = toy_pack(tmp_path / "other", num=90)
     with pytest.raises(ValueError, match="mvitac/seed0 holds a different run"):
-        lay_out(small(other), other, out, Session())
+        lay_out(small(other), other, out, ProbeConfig())
 
 
 def test_other_probes_score_finished_runs_again(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = (Session(controls=False, probes=probes) for probes in (("linear",), ("knn", "linear")))
+    first, second = (ProbeConfig(controls=False, probes=probes) for probes in (("linear",), ("knn", "linear")))
     plan = small(pack, rows=ROWS[:1], seeds=1)
     work = lay_out(plan, pack, tmp_path, first)
     do_all(work, 1, lambda line: None)
@@ -402,10 +406,10 @@ def test_other_probes_score_finished_runs_again(pack: Pack, tmp_path: Path, monk
 
 def test_scores_that_do_not_say_what_they_are_of_are_of_linear_probes(pack: Pack, tmp_path: Path) -> None:
     """As they were written before there was a choice of probes in a plan."""
-    work = lay_out(small(pack, rows=ROWS[:1], seeds=1), pack, tmp_path, Session(controls=False))
+    work = lay_out(small(pack, rows=ROWS[:1], seeds=1), pack, tmp_path, ProbeConfig(controls=False))
     write_json(work.jobs[0].out / "scores.json", {"records": [], "retrieval": []})
     assert work.jobs[0].done
-    asked = replace(work.jobs[0], session=Session(tasks=("pattern",), controls=False))
+    asked = replace(work.jobs[0], session=ProbeConfig(tasks=("pattern",), controls=False))
     assert not asked.done and not replace(work.jobs[0], stress=True).done
 
 
@@ -437,7 +441,7 @@ def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> 
     steps = [{"step": 10, "pairs_per_s": 80.0}, {"step": 10, "eval": {}}, {"step": 30, "pairs_per_s": 160.0}]
     (fake / "log.jsonl").write_text("\n".join(map(json.dumps, steps)))
     assert seconds_of(fake) == pytest.approx(10 * 16 / 80 + 20 * 16 / 160)
-    work = lay_out(small(pack), pack, out, Session())
+    work = lay_out(small(pack), pack, out, ProbeConfig())
     assert cost("MViTac", work.jobs[:1], pack)["trained_parameters"] > 100_000
 
 
@@ -472,10 +476,10 @@ def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
 
 def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack: Pack) -> None:
     out, result = done
-    work = lay_out(small(pack), pack, out, Session())
+    work = lay_out(small(pack), pack, out, ProbeConfig())
     noted = copy(pack)
     noted.spec = replace(pack.spec, notes=("half of it\nis the same",))
-    result = gather(replace(work, pack=noted), out, Session())
+    result = gather(replace(work, pack=noted), out, ProbeConfig())
     lines = lines_of(result)
     assert "\nNote: half of it is the same.\n" in markdown(result, lines)
     assert latex(result, lines).splitlines()[1] == "% Note: half of it is the same."
@@ -511,7 +515,7 @@ def test_a_control_of_one_probe_is_one_line_of_the_csv(done: tuple[Path, dict]) 
 def test_peak_memory_is_of_training_on_its_own_gpu(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scoring a finished run once more leaves what its training took."""
     common = {"seeds": 1, "tasks": ("pattern",), "set": {"steps": 1, "eval_every": 0}}
-    session = Session(tasks=("pattern",), modalities=("touch",), controls=False)
+    session = ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False)
     work = lay_out(small(pack, rows=ROWS[:1], **common), pack, tmp_path, session)
     (job,) = work.jobs
     peak, asked = [777], []
@@ -529,7 +533,7 @@ def test_peak_memory_is_of_training_on_its_own_gpu(pack: Pack, tmp_path: Path, m
 
 def test_a_row_is_not_named_as_a_control_of_the_data(pack: Pack, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="row 'noise only' has the name of a control of this data"):
-        lay_out(small(pack, rows=(*ROWS, Row(label="noise only"))), pack, tmp_path, Session())
+        lay_out(small(pack, rows=(*ROWS, Row(label="noise only"))), pack, tmp_path, ProbeConfig())
 
 
 # -- significance -----------------------------------------------------------------------------------------------------
@@ -810,14 +814,14 @@ def test_folds_test_a_group_once_in_a_tasks_own_split(
 
     monkeypatch.setattr(type(plan.data), "open", with_own_split)
     with pytest.raises(ValueError, match=r"both test object '1' \(column mine\): each group must be tested once"):
-        lay_out_folds(plan, tmp_path / "out", Session())
+        lay_out_folds(plan, tmp_path / "out", ProbeConfig())
 
 
 def test_a_row_that_one_fold_does_not_allow_runs_on_none(two_folds: Path, tmp_path: Path) -> None:
     plan = find_plan(str(two_folds))
     big = Row(label="big", set={"batch_size": 32})  # few has 35 rows to train on, fold1 has 20
     plan = replace(plan, rows=(*plan.rows, big), folds=("split=few", "split=fold1"))
-    works = lay_out_folds(plan, tmp_path / "out", Session())
+    works = lay_out_folds(plan, tmp_path / "out", ProbeConfig())
     assert [sorted({job.label for job in work.jobs}) for work in works] == [["MViTac", "SimCLR"]] * 2
     assert all("20 rows to train on" in work.left_out["big"] for work in works)
 

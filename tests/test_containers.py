@@ -17,17 +17,17 @@ from films import film, shade
 from PIL import Image
 from toy import Toy
 
-from mvitac.cli import main
-from mvitac.datasets import lerobot_out
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
 from mvitac.datasets.hub import HubConfig
-from mvitac.datasets.lerobot import LeRobotConfig, choose
-from mvitac.datasets.lerobot_out import write_lerobot
-from mvitac.datasets.rows import RowsConfig
-from mvitac.datasets.videos import nearest
+from mvitac.datasets.lerobot import writer
+from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
+from mvitac.datasets.lerobot.writer import write_lerobot
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.datasets.table.video_times import nearest
 from mvitac.datasets.webdataset import WebDatasetConfig
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.source import Sample
 
 
 def packed(config: RowsConfig, out: Path) -> Pack:
@@ -185,7 +185,7 @@ def toy(request: pytest.FixtureRequest, tmp_path: Path) -> Pack:
 
 
 def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lerobot_out, "FILE_BYTES", 100_000)  # several files
+    monkeypatch.setattr(writer, "FILE_BYTES", 100_000)  # several files
     assert main(["data", "export-lerobot", str(toy.path), "--out", str(tmp_path / "set"), "--fps", "25"]) == 0
     assert len(list((tmp_path / "set/data/chunk-000").iterdir())) > 2
     names = ("label_pattern", "label_bright")

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from toy import Toy, toy_pack
 
-from mvitac.controls import borders, controls_of, start_weights, starts_of, thumbnails
-from mvitac.encoders import SCRATCH, EncoderConfig
-from mvitac.heads import fit_knn, spread_out
+from mvitac.data.spec import DataSpec
+from mvitac.evaluation.classifiers import fit_knn, spread_out
+from mvitac.evaluation.controls import borders, controls_of, start_weights, starts_of, thumbnails
 from mvitac.methods.moco import MoCoConfig
 from mvitac.methods.supervised import SupervisedConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.recipes import recipe, with_method
 from mvitac.run import Run
-from mvitac.spec import DataSpec
 
 
 def pictures(*images: np.ndarray) -> Any:

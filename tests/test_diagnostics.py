@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvitac import diagnostics as d
+from mvitac.evaluation import diagnostics as d
 
 
 def test_collapsed_features_look_collapsed() -> None:

@@ -23,20 +23,20 @@ from test_step import build as build_from
 from test_train import power_cut
 from torch import Tensor
 
-from mvitac import checkpoint
-from mvitac.batches import batches, training_rows
+from mvitac.data.pack import Pack
+from mvitac.data.sharding import write_shards
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.packed import PackConfig
-from mvitac.distributed import World
+from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
 from mvitac.methods.cmc import CMCConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.pack import Pack
 from mvitac.recipes import recipe, with_method
 from mvitac.run import Optim, Run
-from mvitac.sharding import write_shards
-from mvitac.step import Part, Step
-from mvitac.train import train
+from mvitac.system.distributed import World
+from mvitac.training import checkpoint
+from mvitac.training.loop import train
+from mvitac.training.sampler import batches, training_rows
+from mvitac.training.step import Chunk, Step
 
 RUN = replace(
     recipe("smoke"), optim=Optim(name="sgd"), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
@@ -87,7 +87,7 @@ def together(command: list[str], num: int = 2, fails: bool = False) -> None:
 
 
 def three_steps(
-    start: Callable[[], tuple[Method, Step]], parts: list[Part], run: Run, to: Path, world: World | None = None
+    start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, to: Path, world: World | None = None
 ) -> dict[str, Any]:
     """What three steps on ``parts`` make, with a checkpoint ``to`` after the second."""
     method, step = start()
@@ -100,7 +100,7 @@ def three_steps(
     return {**result, "weights": method.state_dict()}
 
 
-def third_step(start: Callable[[], tuple[Method, Step]], parts: list[Part], run: Run, of: Path) -> dict[str, Tensor]:
+def third_step(start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, of: Path) -> dict[str, Tensor]:
     """The weights after the last of these, begun from the checkpoint ``of``."""
     method, step = start()
     assert checkpoint.restore(of, run, method, step.optimiser, 3) == 2
@@ -209,7 +209,7 @@ def test_the_loop_keeps_whole_banks_when_the_number_of_processes_changes(
 
 
 def test_a_batch_that_does_not_divide_is_named(pack: Pack, tmp_path: Path) -> None:
-    from mvitac.train import _check_world
+    from mvitac.training.loop import _check_world
 
     with pytest.raises(ValueError, match="batch_size 16 is not the same whole number of pairs for each of 3 processes"):
         _check_world(recipe("smoke"), World(0, 3))

@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mvitac.cli import main
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.checks.contact_sheet import MISSING, strips_of
+from mvitac.data.checks.examine import examine, examine_pack, examine_source
+from mvitac.data.checks.finding import Finding, exit_code
+from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
+from mvitac.data.checks.image_stats import area_means, look_at
+from mvitac.data.pack import Pack
+from mvitac.data.source import Count, Sample, Source
+from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.folder import FolderConfig
-from mvitac.doctor import Finding, examine, examine_pack, examine_source, exit_code
-from mvitac.doctor.looks import area_means, look_at
-from mvitac.doctor.pictures import MAX_LAG, motion_correlations
-from mvitac.doctor.sheet import MISSING, strips_of
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.source import Count, Sample, Source
-from mvitac.spec import DataSpec, Task
 
 NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32
 TEST, VAL = (3, 8, 13, 18), (4, 9)

@@ -9,7 +9,7 @@ import safetensors.torch
 import timm
 import torch
 
-from mvitac.encoders import SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk
 
 
 @pytest.fixture(scope="module")

@@ -20,14 +20,14 @@ from PIL import Image
 from toy import reordered
 
 import mvitac
-from mvitac.cli import main
-from mvitac.landscape import COLOURS, Landscape
-from mvitac.pack import Pack
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.report.explorer_data import COLOURS, ExplorerData
 
 
 @pytest.fixture(scope="module")
-def land(artifact: Path, pack: Pack) -> Landscape:
-    return Landscape(mvitac.load(artifact), pack)
+def land(artifact: Path, pack: Pack) -> ExplorerData:
+    return ExplorerData(mvitac.load(artifact), pack)
 
 
 def decode(text: str) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def decode(text: str) -> dict[str, Any]:
     return value
 
 
-def test_points_carry_place_colour_and_row(land: Landscape, pack: Pack) -> None:
+def test_points_carry_place_colour_and_row(land: ExplorerData, pack: Pack) -> None:
     value = decode(land.points("both", "label", "test", "pattern"))
     rows = pack.rows("test")
     assert np.array_equal(value["row"], rows)
@@ -47,7 +47,7 @@ def test_points_carry_place_colour_and_row(land: Landscape, pack: Pack) -> None:
     np.testing.assert_allclose(value["xy"].T / 65535, land.plane("both")[rows], atol=1e-4)
 
 
-def test_more_classes_than_a_byte_counts(land: Landscape, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_classes_than_a_byte_counts(land: ExplorerData, monkeypatch: pytest.MonkeyPatch) -> None:
     used = np.arange(300)
     monkeypatch.setattr(land, "classes", {"pattern": [f"class {i}" for i in used]})
     monkeypatch.setattr(land, "rows", used)
@@ -79,7 +79,7 @@ def test_twenty_colours_are_told_apart() -> None:
     assert (1.05 / (luminance + 0.05)).min() > 1.5 and ((luminance + 0.05) / 0.05).min() > 1.9
 
 
-def test_the_plane_holds_the_most_variance(land: Landscape) -> None:
+def test_the_plane_holds_the_most_variance(land: ExplorerData) -> None:
     x = land.x["touch"] - land.x["touch"].mean(0)
     first, second = land.plane("touch").T
     scores = np.linalg.svd(x, full_matrices=False)
@@ -87,7 +87,7 @@ def test_the_plane_holds_the_most_variance(land: Landscape) -> None:
         assert abs(np.corrcoef(found, expected)[0, 1]) > 0.98  # the ends are clipped
 
 
-def test_errors_are_the_probes(land: Landscape, pack: Pack, artifact: Path) -> None:
+def test_errors_are_the_probes(land: ExplorerData, pack: Pack, artifact: Path) -> None:
     said = mvitac.load(artifact).predict(vision=pack.images["vision"], touch=pack.images["touch"])["pattern"]
     wrong = np.flatnonzero(said.argmax(1).numpy() != pack.column("label_pattern"))
     assert 0 < len(wrong) < pack.num
@@ -98,24 +98,24 @@ def test_errors_are_the_probes(land: Landscape, pack: Pack, artifact: Path) -> N
     assert "(probe: " in land.describe(int(wrong[0]))
 
 
-def test_neighbours_leave_out_the_point_itself(land: Landscape) -> None:
+def test_neighbours_leave_out_the_point_itself(land: ExplorerData) -> None:
     pairs = land.neighbours(land.x["touch"][5:6], "touch", 4, without=5)
     every = land.x["touch"] @ land.x["touch"][5]
     every[5] = -2
     assert [i for i, _ in pairs] == np.argsort(-every, kind="stable")[:4].tolist()
 
 
-def test_a_dropped_picture_is_classified_and_finds_itself(land: Landscape, pack: Pack) -> None:
+def test_a_dropped_picture_is_classified_and_finds_itself(land: ExplorerData, pack: Pack) -> None:
     said, pairs = land.query(np.array(pack.images["touch"][17]), "touch", 3)
     assert pairs[0][0] == 17 and pairs[0][1] == pytest.approx(1, abs=1e-4)
     assert set(said) == {"pattern", "bright"} and sum(said["pattern"].values()) == pytest.approx(1, abs=1e-4)
 
 
-def test_a_pack_of_other_numbers_or_tasks(land: Landscape, artifact: Path, pack: Pack) -> None:
+def test_a_pack_of_other_numbers_or_tasks(land: ExplorerData, artifact: Path, pack: Pack) -> None:
     """The probes' answers are compared by name; a task that the pack lacks is answered all the same."""
     other = reordered(pack)
     other.spec = replace(other.spec, tasks=other.spec.tasks[:1])
-    found = Landscape(mvitac.load(artifact), other)
+    found = ExplorerData(mvitac.load(artifact), other)
     wrong = land.shown("all", "pattern", mistakes=True)
     assert np.array_equal(found.shown("all", "pattern", mistakes=True), wrong)
     assert found.describe(int(wrong[0])).partition(" · light")[0] in land.describe(int(wrong[0]))
@@ -125,7 +125,7 @@ def test_a_pack_of_other_numbers_or_tasks(land: Landscape, artifact: Path, pack:
 
 def test_fewer_rows_are_of_every_class(artifact: Path, pack: Pack) -> None:
     """Although the pack's three classes take turns, and every third row would be of one."""
-    few = Landscape(mvitac.load(artifact), pack, limit=40)
+    few = ExplorerData(mvitac.load(artifact), pack, limit=40)
     assert len(few.rows) == 40 and (np.diff(few.rows) > 0).all()
     assert np.bincount(few.labels["pattern"]).min() >= 8
 
@@ -146,7 +146,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     opened.close()
 
 
-def centre_of_a_point(browser: Browser, land: Landscape, index: int) -> tuple[float, float]:
+def centre_of_a_point(browser: Browser, land: ExplorerData, index: int) -> tuple[float, float]:
     """Where scatter.js draws row ``index`` before any zoom."""
     left, top, width, height = browser.run(
         "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
@@ -198,7 +198,7 @@ def listeners(port: int) -> set[str]:
 
 
 def test_the_page_in_a_browser(
-    browser: Browser, land: Landscape, pack: Pack, artifact: Path, smoke_run: Path, tmp_path: Path
+    browser: Browser, land: ExplorerData, pack: Pack, artifact: Path, smoke_run: Path, tmp_path: Path
 ) -> None:
     """Map, hover, click, filter, two runs side by side, a phone's width; listens on loopback only."""
     port = free_port()
@@ -236,7 +236,7 @@ def test_the_page_in_a_browser(
         assert browser.problems == []
 
 
-def check_zoom(browser: Browser, land: Landscape, row: int) -> None:
+def check_zoom(browser: Browser, land: ExplorerData, row: int) -> None:
     """By wheel and by two fingers: the map changes, and what was under pointer or fingers is still there."""
     x, y = centre_of_a_point(browser, land, row)
     name = str(land.pack.column("id")[row])

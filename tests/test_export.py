@@ -18,19 +18,19 @@ import torch
 from toy import reordered, toy_pack
 
 import mvitac
-import mvitac.export as exports
-from mvitac import graph as graphs
-from mvitac.cli import main
-from mvitac.datasets.packed import PackConfig
-from mvitac.export import Tolerance, export, parity, reference
-from mvitac.graph import Graph
+import mvitac.deploy.export as exports
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.deploy import export_module as graphs
+from mvitac.deploy.engine import Engine, cosines
+from mvitac.deploy.export import Tolerance, export, parity, reference
+from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.publish import with_readouts
 from mvitac.model import Model
-from mvitac.pack import Pack
-from mvitac.publish import with_readouts
 from mvitac.recipes import recipe
-from mvitac.record import digest, digest_file, write_json
-from mvitac.runtime import Engine, cosines
-from mvitac.train import train
+from mvitac.system.files import digest, digest_file, write_json
+from mvitac.training.loop import train
 
 EXACT = Tolerance(min_cosine=0.9999, accuracy_loss=0.0)
 
@@ -40,7 +40,7 @@ def model(artifact: Path) -> Model:
     return mvitac.load(artifact)
 
 
-def run_graph(graph: Graph):
+def run_graph(graph: ExportModule):
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
         with torch.no_grad():
             return [x.numpy() for x in graph(*(torch.from_numpy(a) for a in arrays))]
@@ -48,7 +48,7 @@ def run_graph(graph: Graph):
     return call
 
 
-def check(model: Model, graph: Graph, pack: Pack, tolerance: Tolerance = EXACT) -> dict:
+def check(model: Model, graph: ExportModule, pack: Pack, tolerance: Tolerance = EXACT) -> dict:
     rows = pack.rows("test")
     return parity(graph, run_graph(graph), model, pack, rows, reference(model, graph, pack, rows), tolerance)
 
@@ -62,14 +62,14 @@ def openvino(model: Model, pack: Pack, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.mark.parametrize("stored", [32, 45, 72])
 def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model: Model) -> None:
-    from mvitac.augment import plain_view
+    from mvitac.transforms.random_views import plain_view
 
     images = torch.randint(
         0, 256, (3, 3, stored, stored), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
     )
     was, model.stored = model.stored, stored
     try:
-        graph = Graph(model)
+        graph = ExportModule(model)
         found = graph.view(images.permute(0, 2, 3, 1), graph.filter)
     finally:
         model.stored = was
@@ -95,7 +95,7 @@ def test_the_heads_have_a_view_of_their_own_where_they_learned_from_one(smoke_ru
     """Embeddings from whole images at one side, the shared space at the side of the training views."""
     model = mvitac.load(smoke_run)
     model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
-    graph = Graph(model)
+    graph = ExportModule(model)
     assert graph.twice
     images = {m: pack.images[m][:5].copy() for m in ("vision", "touch")}
     found = dict(zip(graph.outputs, graph(*(torch.from_numpy(images[m]) for m in graph.modalities)), strict=True))
@@ -146,7 +146,7 @@ def test_rows_that_check_and_calibrate_are_of_every_class(
     monkeypatch.setattr(exports, "NUM_CALIBRATION", 20)
     rows = {r.tobytes(): i for i, r in enumerate(pack.images["touch"])}
     labels = pack.column("label_pattern")
-    ranges = [rows[touch[0].tobytes()] for _, touch in exports._examples(Graph(model), pack)]
+    ranges = [rows[touch[0].tobytes()] for _, touch in exports._examples(ExportModule(model), pack)]
     assert len(set(ranges)) == 20 and set(pack.column("split")[ranges]) == {"train"}
     assert np.bincount(labels[ranges]).min() >= 3
     seen: list[int] = []
@@ -154,7 +154,7 @@ def test_rows_that_check_and_calibrate_are_of_every_class(
     class Stop(Exception):
         pass
 
-    def checked(model: Model, graph: Graph, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+    def checked(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
         seen.extend(rows.tolist())
         raise Stop
 
@@ -168,11 +168,11 @@ def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "p", touch_channels=6, num=90)
     run = train(recipe("smoke", PackConfig(path=pack.path)), tmp_path / "r", quiet=True)
     model = with_readouts(mvitac.load(run))
-    assert check(model, Graph(model), pack)["cosine"]["embedding_touch"]["min"] > 0.9999
+    assert check(model, ExportModule(model), pack)["cosine"]["embedding_touch"]["min"] > 0.9999
 
 
 def test_a_wrong_normalisation_is_named(model: Model, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    check(model, Graph(model), pack)
+    check(model, ExportModule(model), pack)
     for mean, std, message in (
         ((0.5,) * 3, (0.5,) * 3, r"normalises to \[-1, 1\]"),
         ((0.0,) * 3, (1.0,) * 3, "does not normalise by the ImageNet mean"),
@@ -180,7 +180,7 @@ def test_a_wrong_normalisation_is_named(model: Model, pack: Pack, monkeypatch: p
         with monkeypatch.context() as patch:
             patch.setattr(graphs, "IMAGENET_MEAN", mean)
             patch.setattr(graphs, "IMAGENET_STD", std)
-            wrong = Graph(model)
+            wrong = ExportModule(model)
         with pytest.raises(ValueError, match=f"not the trained model: embedding_vision has cosine .*{message}"):
             check(model, wrong, pack)
 
@@ -193,7 +193,7 @@ def test_bgr_input_is_named(model: Model, tmp_path: Path) -> None:
     images = rng.integers(0, 256, (pack.num, 4, 4, 3)).repeat(8, 1).repeat(8, 2).astype(np.uint8)
     images[..., 0] //= 8
     pack.images = dict.fromkeys(("vision", "touch"), images)
-    graph, rows = Graph(model), pack.rows("test")
+    graph, rows = ExportModule(model), pack.rows("test")
     call = run_graph(graph)
     wanted = reference(model, graph, pack, rows)
     parity(graph, call, model, pack, rows, wanted, EXACT)
@@ -209,13 +209,13 @@ def test_corrupted_weights_in_the_graph_leave_no_export(
     model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Same weights for the reference, other ones in what is written: parity stops it and the folder is not made."""
-    real = Graph.forward
+    real = ExportModule.forward
 
-    def corrupted(self: Graph, *images: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def corrupted(self: ExportModule, *images: torch.Tensor) -> tuple[torch.Tensor, ...]:
         found = real(self, *images)
         return (found[0] * torch.linspace(-1, 1, found[0].shape[1]), *found[1:])
 
-    monkeypatch.setattr(Graph, "forward", corrupted)
+    monkeypatch.setattr(ExportModule, "forward", corrupted)
     with pytest.raises(ValueError, match="not the trained model"):
         export(model, pack, tmp_path / "x", kind="torch")
     assert list(tmp_path.iterdir()) == []
@@ -223,7 +223,7 @@ def test_corrupted_weights_in_the_graph_leave_no_export(
 
 def test_accuracy_is_of_classes_by_name(model: Model, pack: Pack) -> None:
     """The pack that checks may number them otherwise, and may lack a task."""
-    graph, other = Graph(model), reordered(pack)
+    graph, other = ExportModule(model), reordered(pack)
     found = check(model, graph, other)["accuracy"]
     assert found == check(model, graph, pack)["accuracy"] and set(found) == {"pattern", "bright"}
     assert found["pattern"]["original"] == 100 * model.readouts["pattern.both"].question.accuracy
@@ -232,7 +232,7 @@ def test_accuracy_is_of_classes_by_name(model: Model, pack: Pack) -> None:
 
 
 def test_lost_accuracy_stops_an_export(model: Model, pack: Pack) -> None:
-    graph, rows = Graph(model), pack.rows("test")
+    graph, rows = ExportModule(model), pack.rows("test")
     wanted, call = reference(model, graph, pack, rows), run_graph(graph)
     at = graph.outputs.index("probability_pattern")
 
@@ -292,7 +292,7 @@ def test_a_pickle_or_a_library_in_a_torch_export_is_never_run(smoke_run: Path, p
 
 def test_an_engine_that_computes_otherwise_is_refused_on_the_spot(onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The few real inputs that travel with an export are run again where it is opened."""
-    from mvitac import runtime
+    from mvitac.deploy import engine as runtime
 
     real = runtime.open_engine
     monkeypatch.setattr(runtime, "open_engine", lambda *a, **k: lambda arrays: real(*a, **k)([255 - x for x in arrays]))
@@ -331,5 +331,5 @@ def test_impossible_requests_are_refused_first(
 
 
 def test_running_an_onnx_export_needs_no_torch() -> None:
-    code = "import sys, mvitac.runtime; print('torch' in sys.modules)"
+    code = "import sys, mvitac.deploy.engine; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"

@@ -18,17 +18,17 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from mvitac.cli import main
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.images import decode, fit, shrink
+from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
-from mvitac.datasets.images import decode
-from mvitac.datasets.rows import Rows
-from mvitac.datasets.splits import deal
-from mvitac.pack import Pack, fit, shrink
-from mvitac.packing import build
+from mvitac.datasets.table.splits import assign_splits
+from mvitac.datasets.table.table import Rows
 from mvitac.recipes import recipe
-from mvitac.record import cache_dir
 from mvitac.registry import from_json, to_json
 from mvitac.run import Run
+from mvitac.system.files import cache_dir
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
 NUM = 24
@@ -413,11 +413,11 @@ def test_dealt_splits_never_share_a_group() -> None:
         groups = [f"g{g}" for g in rng.integers(0, num_groups, int(rng.integers(num_groups, 400)))]
         target = rng.integers(-1, num_classes, len(groups)).tolist()
         test, val = rng.uniform(0.1, 0.4), rng.uniform(0, 0.4)
-        splits = deal(groups, [target], test, val, trial)
+        splits = assign_splits(groups, [target], test, val, trial)
         home = dict(zip(groups, splits, strict=True))
         assert all(home[group] == split for group, split in zip(groups, splits, strict=True))
         order = rng.permutation(len(groups))
-        again = deal([groups[i] for i in order], [[target[i] for i in order]], test, val, trial)
+        again = assign_splits([groups[i] for i in order], [[target[i] for i in order]], test, val, trial)
         assert again == [splits[i] for i in order]  # rows may come in any order
         unlabelled = {g for g in home if all(t < 0 for t, h in zip(target, groups, strict=True) if h == g)}
         assert {g for g, split in home.items() if split == "unlabelled"} == unlabelled
@@ -431,12 +431,12 @@ def test_dealing_is_stratified_and_the_shares_are_kept() -> None:
     groups = [f"{g:03d}" for g in range(200)]
     target = [g % 4 for g in range(200)]
     for seed in range(5):
-        splits = np.array(deal(groups, [target], 0.25, 0.15, seed))
+        splits = np.array(assign_splits(groups, [target], 0.25, 0.15, seed))
         assert (splits == "test").sum() in range(48, 53)
         assert (splits == "val").sum() in range(28, 33)
         for kind in range(4):
             assert (splits[np.array(target) == kind] == "test").sum() in range(11, 15)
-    assert deal(groups, [target], 0.25, 0.15, 0) != deal(groups, [target], 0.25, 0.15, 1)
+    assert assign_splits(groups, [target], 0.25, 0.15, 0) != assign_splits(groups, [target], 0.25, 0.15, 1)
 
 
 def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Table) -> None:

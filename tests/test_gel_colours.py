@@ -13,19 +13,20 @@ import torch
 from scipy.ndimage import gaussian_filter
 from toy import toy_pack
 
-from mvitac.augment import Augment, ViewAugment, plain_view
-from mvitac.batches import make_views
-from mvitac.datasets.packed import PackConfig
-from mvitac.feed import Feed
-from mvitac.gel_colours import MIN_ROWS, GelMirror, slope_colours
-from mvitac.pack import Pack, Store
-from mvitac.packing import build
+from mvitac.data.build import build
+from mvitac.data.pack import Pack, Store
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.pack import PackConfig
 from mvitac.recipes import recipe
 from mvitac.run import Run
-from mvitac.sim.gel import SENSORS, render
-from mvitac.source import Sample, Source
-from mvitac.spec import DataSpec, Task
-from mvitac.train import train
+from mvitac.sim.gel import render
+from mvitac.sim.sensors import SENSORS
+from mvitac.training.loader import Feed
+from mvitac.training.loop import train
+from mvitac.training.views import make_views
+from mvitac.transforms.gel_flip import MIN_ROWS, GelMirror, slope_colours
+from mvitac.transforms.random_views import Augment, ViewAugment, plain_view
 
 SIDE = 48
 PIXEL_MM = 12.8 / SIDE

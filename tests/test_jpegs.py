@@ -19,21 +19,24 @@ from test_bad_inputs import described, seal
 from test_train import assert_equal_weights, power_cut, smoke
 from toy import Counting, Toy
 
-from mvitac import batches, jpegs, packing, retrieval
-from mvitac.cli import main
+from mvitac.cli.main import main
+from mvitac.data import build as packing
+from mvitac.data import jpeg
+from mvitac.data.build import build
+from mvitac.data.jpeg import Jpegs, decode, encode
+from mvitac.data.pack import Pack
+from mvitac.data.partial_pack import JpegFile
+from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.jpegs import Jpegs, decode, encode
-from mvitac.model import pack_features
-from mvitac.pack import Pack
-from mvitac.packing import build
+from mvitac.deploy import search
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import pack_features
 from mvitac.recipes import recipe
-from mvitac.record import digest
 from mvitac.registry import to_json
 from mvitac.run import Run
-from mvitac.session import Session, probe_runs
-from mvitac.source import Lost, Sample, Source
-from mvitac.train import train
-from mvitac.unfinished import JpegFile
+from mvitac.system.files import digest
+from mvitac.training import views
+from mvitac.training.loop import train
 
 FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
 
@@ -107,8 +110,8 @@ def test_indexed_like_the_array_it_stands_for(
     images = small.images["touch"]
     whole = np.stack([images[row] for row in range(120)])
     with ThreadPoolExecutor(num_threads) as pool:
-        monkeypatch.setattr(jpegs, "_num_threads", lambda: num_threads)
-        monkeypatch.setattr(jpegs, "_threads", lambda: pool)
+        monkeypatch.setattr(jpeg, "_num_threads", lambda: num_threads)
+        monkeypatch.setattr(jpeg, "_threads", lambda: pool)
         found = images[index]
     assert found.dtype == np.uint8 and np.array_equal(found, whole[index])
     assert found.shape == whole[index].shape
@@ -426,32 +429,32 @@ def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch
     """By a thread for JPEGs; a raw pack's views are made where they are used, as ever."""
     import threading
 
-    from mvitac.distributed import World
+    from mvitac.system.distributed import World
 
     makers: list[str] = []
-    real = batches.make_views
+    real = views.make_views
     monkeypatch.setattr(
-        batches, "make_views", lambda *args: makers.append(threading.current_thread().name) or real(*args)
+        views, "make_views", lambda *args: makers.append(threading.current_thread().name) or real(*args)
     )
     for pack, name in ((small, "prefetch"), (decoded, "MainThread")):
         makers.clear()
         run, rows = run_on(pack), pack.rows("train")
-        for parts in batches.feed_parts(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
+        for parts in views.feed_parts(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
             assert len(parts[0]().rows) == run.batch_size
         assert makers == [name] * 3
 
 
 def test_probed_and_searched_as_the_same_pixels(trained: Path, small: Pack, decoded: Pack, tmp_path: Path) -> None:
-    from mvitac.artifact import load
+    from mvitac.deploy.artifact import load
 
     model, rows = load(trained), small.rows("test")
     for modality in ("vision", "touch"):
         pair = [pack_features(model, pack, modality, rows) for pack in (small, decoded)]
         assert torch.equal(*pair)
     records = [
-        probe_runs([trained], Session(tasks=("pattern",), probes=("knn",)), pack)["records"]
+        probe_runs([trained], ProbeConfig(tasks=("pattern",), probes=("knn",)), pack)["records"]
         for pack in (small, decoded)
     ]
     assert records[0] and records[0] == records[1]
-    index = retrieval.build(model, small, tmp_path / "index", ("test",))
+    index = search.build(model, small, tmp_path / "index", ("test",))
     assert index.find(model, small.images["touch"][rows[3]], "touch", "touch", 1)[0].tolist() == [[3]]

@@ -6,12 +6,12 @@ import pytest
 import torch
 from toy import Toy
 
-from mvitac.encoders import SCRATCH, EncoderConfig
-from mvitac.losses import queue_nce
 from mvitac.methods.byol import regression
 from mvitac.methods.dino import DINO, DINOConfig
 from mvitac.methods.simclr import nt_xent
 from mvitac.methods.vicreg import VICReg, VICRegConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.losses import queue_nce
 
 loss = pytest.importorskip("lightly.loss")
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)

@@ -17,19 +17,21 @@ from faults import Clock, Rig, World, faulty
 from PIL import Image
 from rich.console import Console
 
-from mvitac.artifact import seal
-from mvitac.cameras import Camera, Folder, Simulated, source
-from mvitac.capture import CaptureThread, Stream
-from mvitac.cli import main
-from mvitac.commands.live import _engine, sources, view
-from mvitac.datasets.lerobot import LeRobotConfig
+from mvitac.cli.live import _engine, sources, view
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.datasets.lerobot.reader import LeRobotConfig
+from mvitac.deploy.artifact import seal
+from mvitac.deploy.engine import Engine
+from mvitac.deploy.search import neighbours
+from mvitac.live.cameras import Camera, Folder, Simulated, source
+from mvitac.live.contact import Contact, LiveConfig
+from mvitac.live.display import Window, draw
+from mvitac.live.predictor import Live
+from mvitac.live.recorder import Recorder, finish
+from mvitac.live.streams import CaptureThread, Stream
 from mvitac.model import Model
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.realtime import Contact, Live, LiveConfig, neighbours
-from mvitac.recording import Recorder, finish
-from mvitac.runtime import Engine
-from mvitac.window import Window, draw
 
 
 @pytest.fixture(scope="module")
@@ -600,7 +602,7 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
         made.append(model.classes["pattern"])
         shutil.copytree(onnx, out)
 
-    monkeypatch.setattr("mvitac.export.export", exported)
+    monkeypatch.setattr("mvitac.deploy.export.export", exported)
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
     for model in (artifact, other, artifact):
         assert _engine(str(model), 1, Console(quiet=True)).classes.keys() == {"pattern", "bright"}

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvitac.losses import info_nce
+from mvitac.nn.losses import info_nce
 
 
 def slow_info_nce(query: torch.Tensor, key: torch.Tensor, tau: float) -> float:

@@ -14,17 +14,16 @@ from test_train import assert_equal_weights, power_cut, smoke
 from torch._subclasses.fake_tensor import FakeTensorMode
 from toy import Toy
 
-from mvitac.batch import Views
-from mvitac.encoders import SCRATCH, EncoderConfig
-from mvitac.methods import Method, MethodConfig
+from mvitac.data.pack import Pack
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Method, MethodConfig, Views
 from mvitac.model import load
-from mvitac.pack import Pack
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.recipes import with_method
 from mvitac.registry import default, from_json, to_json
 from mvitac.run import Optim
-from mvitac.spec import DataSpec
-from mvitac.step import build_optimiser
-from mvitac.train import train
+from mvitac.training.loop import train
+from mvitac.training.step import build_optimiser
 
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
 NAMES = sorted(MethodConfig.choices)

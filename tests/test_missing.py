@@ -10,24 +10,24 @@ import pytest
 import torch
 from toy import Toy
 
-from mvitac import batches as batches_module
-from mvitac import probe as probe_module
-from mvitac import retrieval
-from mvitac.batches import partners
-from mvitac.cli import main
-from mvitac.datasets.packed import PackConfig
-from mvitac.export import _examples, export
-from mvitac.graph import Graph
-from mvitac.landscape import Landscape
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.datasets.pack import PackConfig
+from mvitac.deploy import search
+from mvitac.deploy.export import _examples, export
+from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.publish import fit_readouts
+from mvitac.evaluation import probe as probe_module
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.probe import parts
 from mvitac.model import Model, load
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.probe import parts
-from mvitac.publish import fit_readouts
 from mvitac.recipes import recipe
-from mvitac.session import Session, probe_runs
-from mvitac.source import Sample
-from mvitac.train import train
+from mvitac.report.explorer_data import ExplorerData
+from mvitac.training import views as batches_module
+from mvitac.training.loop import train
+from mvitac.training.sampler import partners
 
 
 @dataclass
@@ -100,7 +100,7 @@ def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch:
         return real(model, pack, modality, rows, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(probe_module, "features", features)
-    result = probe_runs([tmp_path / "run"], Session(tasks=("pattern",)), holes)
+    result = probe_runs([tmp_path / "run"], ProbeConfig(tasks=("pattern",)), holes)
     for modality, rows in asked.items():
         assert rows and holes.has(modality)[sorted(rows)].all()
     task = holes.spec.tasks[0]
@@ -125,15 +125,15 @@ def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> Non
 def test_an_export_is_checked_and_calibrated_on_what_is_there(holes: Pack, model: Model, tmp_path: Path) -> None:
     report = export(model, holes, tmp_path / "x", kind="torch", modalities=("touch",))
     assert report["num_rows"] == len(holes.rows("test", having=("touch",))) < len(holes.rows("test"))
-    examples = _examples(Graph(model, ("touch",)), holes)
+    examples = _examples(ExportModule(model, ("touch",)), holes)
     assert len(examples) == len(holes.rows("train", "unlabelled", having=("touch",)))
     assert all(x.any() for (x,) in examples)
 
 
 def test_what_is_not_there_is_not_searched_embedded_or_shown(holes: Pack, model: Model, tmp_path: Path) -> None:
     whole = np.flatnonzero(holes.has("vision") & holes.has("touch"))
-    index = retrieval.build(model, holes, tmp_path / "index")
-    assert index.table.column("row").to_pylist() == whole.tolist() == Landscape(model, holes).rows.tolist()
+    index = search.build(model, holes, tmp_path / "index")
+    assert index.table.column("row").to_pylist() == whole.tolist() == ExplorerData(model, holes).rows.tolist()
     model.save(tmp_path / "model.safetensors")
     arguments = ["embed", str(holes.path), "--model", str(tmp_path), "--out", str(tmp_path / "e.npz")]
     assert main(arguments) == 0

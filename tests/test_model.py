@@ -12,13 +12,14 @@ from PIL import Image
 from toy import toy_pack
 
 import mvitac
-from mvitac.augment import plain_view
-from mvitac.datasets.packed import PackConfig
-from mvitac.datasets.places import difference
-from mvitac.model import Model, pack_features
-from mvitac.pack import Pack
+from mvitac.data.images import difference
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.features import pack_features
+from mvitac.model import Model
 from mvitac.recipes import recipe
-from mvitac.train import train
+from mvitac.training.loop import train
+from mvitac.transforms.random_views import plain_view
 
 
 def trained(pack: Pack, out: Path) -> Path:
@@ -142,7 +143,7 @@ def test_loading_needs_no_network_and_no_start_weights(pack: Pack, tmp_path: Pat
     import safetensors.torch
     import timm
 
-    from mvitac.encoders import EncoderConfig
+    from mvitac.nn.encoders import EncoderConfig
 
     torch.manual_seed(0)
     start = tmp_path / "start.safetensors"

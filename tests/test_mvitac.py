@@ -11,12 +11,12 @@ import torch.nn.functional as F
 from test_losses import slow_info_nce
 from toy import Toy
 
-from mvitac.batch import Views
-from mvitac.encoders import SCRATCH, EncoderConfig
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Views
 from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.run import Optim
-from mvitac.spec import DataSpec
-from mvitac.step import build_optimiser
+from mvitac.training.step import build_optimiser
 
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
 CONFIG = MViTacConfig(hidden=24, out=12)

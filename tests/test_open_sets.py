@@ -13,17 +13,17 @@ import pytest
 from films import film, shade
 from PIL import Image
 
-from mvitac.cli import main
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.images import decode, shrink
+from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.images import decode
 from mvitac.datasets.physiclear import PhysiclearConfig
 from mvitac.datasets.slip_grasp import SlipGraspConfig
 from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
-from mvitac.datasets.splits import folds
-from mvitac.datasets.videos import num_frames, spread
+from mvitac.datasets.table.splits import folds
+from mvitac.datasets.table.video_times import num_frames, spread
 from mvitac.datasets.vt60 import VT60Config
-from mvitac.pack import Pack, shrink
-from mvitac.packing import build
 
 
 def plain(path: Path, value: int) -> None:

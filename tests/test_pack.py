@@ -18,12 +18,13 @@ import pytest
 from filelock import FileLock
 from toy import Counting, Toy, toy_pack
 
-from mvitac import locks, packing
-from mvitac.datasets.packed import PackConfig
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.source import Lost, Sample, Source
-from mvitac.unfinished import RowFile
+from mvitac.data import build as packing
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.partial_pack import RowFile
+from mvitac.data.source import Lost, Sample, Source
+from mvitac.datasets.pack import PackConfig
+from mvitac.system import locks
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 

@@ -16,10 +16,10 @@ import torch
 from faults import Clock, Rig
 
 import mvitac
+from mvitac.data.pack import Pack
+from mvitac.deploy.engine import Engine
+from mvitac.deploy.policy import ObservationEncoder
 from mvitac.model import Model
-from mvitac.pack import Pack
-from mvitac.policy import ObservationEncoder
-from mvitac.runtime import Engine
 
 KEYS = {"observation.images.wrist": "vision", "observation.images.gel": "touch"}
 

@@ -14,23 +14,23 @@ import torch
 from sklearn.linear_model import LogisticRegression
 from toy import Toy, toy_pack
 
-from mvitac import features as features_module
-from mvitac.datasets.packed import PackConfig
-from mvitac.heads import fit_paper, train_heads
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation import features as features_module
+from mvitac.evaluation.classifiers import fit_paper, train_heads
+from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, _places, probe_runs
+from mvitac.evaluation.probe import cross_modal, parts, probe_all, probe_features, probe_model
+from mvitac.evaluation.scores import interval, summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh, load
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.probe import cross_modal, parts, probe_all, probe_features, probe_model
 from mvitac.recipes import recipe
-from mvitac.report import _as_scored, open_runs
+from mvitac.report.report import _as_scored, open_runs
+from mvitac.report.tables import markdown
 from mvitac.run import Optim
-from mvitac.scores import interval, summarise
-from mvitac.session import END_TO_END, Session, _places, probe_runs
-from mvitac.source import Sample
-from mvitac.spec import DataSpec
-from mvitac.tables import markdown
-from mvitac.train import train
+from mvitac.training.loop import train
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def runs(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def result(runs: list[Path]) -> dict:
-    return probe_runs(runs, Session(probes=("linear", "knn")))
+    return probe_runs(runs, ProbeConfig(probes=("linear", "knn")))
 
 
 def features_that_know(pack: Pack, task_index: int, how_well: float = 3.0) -> np.ndarray:
@@ -201,7 +201,7 @@ def test_summary_shows_a_controls_only_probe(result: dict) -> None:
 
 
 def test_features_are_computed_once(runs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    session = Session(probes=("knn",), controls=False)
+    session = ProbeConfig(probes=("knn",), controls=False)
     first = probe_runs(runs[:1], session)
 
     def never(*_: object, **__: object) -> None:
@@ -287,14 +287,14 @@ def test_runs_on_different_data_are_not_mixed(runs: list[Path], tmp_path: Path) 
     run = replace(recipe("smoke", PackConfig(path=other.path)), steps=1)
     path = train(run, tmp_path / "r", quiet=True)
     with pytest.raises(ValueError, match="trained on different data"):
-        probe_runs([runs[0], path], Session())
+        probe_runs([runs[0], path], ProbeConfig())
 
 
 def test_runs_of_other_settings_are_no_seeds_of_one_another(runs: list[Path], tmp_path: Path) -> None:
     """Two temperatures are two lines, each by its folder; what the two seeds share is one."""
     run = load(runs[0]).run
     colder = train(replace(run, method=replace(run.method, temperature=0.5)), tmp_path / "colder", quiet=True)
-    session = Session(probes=("knn",), tasks=("pattern",), modalities=("touch",), controls=False)
+    session = ProbeConfig(probes=("knn",), tasks=("pattern",), modalities=("touch",), controls=False)
     found = probe_runs([*runs, colder], session)["summary"]["pattern"]["touch"]
     seeds, other = f"mvitac ({runs[0].parent.name})", "mvitac (colder)"
     assert {source: cell["seeds"] for source, cell in found.items()} == {seeds: [0, 1], other: [0]}

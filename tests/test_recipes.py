@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
+from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.recipes import RECIPES, recipe
 from mvitac.registry import from_json, to_json
 from mvitac.run import Run
-from mvitac.spec import DataSpec, Task
 
 
 def test_paper_constants() -> None:

@@ -11,13 +11,13 @@ import pytest
 from test_policy import load_example
 
 import mvitac
-from mvitac.datasets.packed import PackConfig
+from mvitac.data.build import build
+from mvitac.data.source import Sample
+from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Grasps, GraspsConfig
+from mvitac.deploy.policy import ObservationEncoder
 from mvitac.model import fresh
-from mvitac.packing import build
-from mvitac.policy import ObservationEncoder
 from mvitac.recipes import recipe
-from mvitac.source import Sample
 
 regrasp = load_example("regrasp")
 THINGS, EACH = 40, 5

@@ -14,23 +14,23 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from mvitac import figures
-from mvitac.cli import main
-from mvitac.datasets.packed import PackConfig
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.gallery import nearest_groups
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.pack import Pack
-from mvitac.packing import build
 from mvitac.recipes import recipe
-from mvitac.report import wall_seconds, write_report
+from mvitac.report import figures
+from mvitac.report.galleries import nearest_groups
+from mvitac.report.report import wall_seconds, write_report
+from mvitac.report.tables import cell, columns_of
 from mvitac.run import Run
-from mvitac.scores import summarise
-from mvitac.session import Session, probe_runs
-from mvitac.source import Sample, Source
-from mvitac.spec import DataSpec, Task
-from mvitac.tables import cell, columns_of
-from mvitac.train import train
+from mvitac.training.loop import train
 
 
 class Page(HTMLParser):
@@ -261,7 +261,7 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     first, pack = noise(tmp_path, Noise(), method=SupervisedConfig())
     second = train(smoke(pack), tmp_path / "second", quiet=True)
     (first / "log.jsonl").unlink()
-    result = probe_runs([first, second], Session(probes=("knn", "linear"), controls=False))
+    result = probe_runs([first, second], ProbeConfig(probes=("knn", "linear"), controls=False))
     page = Page(write_report([first, second], tmp_path / "out", result=result, quiet=True).read_text())
     assert "supervised, mvitac on noise" in page.text
     assert "The same by logistic regression" in page.text
@@ -278,7 +278,7 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
 
 
 def test_wall_time_adds_up_the_logged_speeds(materials: Path) -> None:
-    from mvitac.report import open_runs
+    from mvitac.report.report import open_runs
 
     run = open_runs([materials / "run0"])[0]
     log = [{"step": 10, "loss": 1.0, "pairs_per_s": 8.0}, {"step": 10, "eval": {}}]

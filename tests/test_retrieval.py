@@ -13,11 +13,11 @@ from PIL import Image
 from test_policy import load_example
 
 import mvitac
-from mvitac.cli import main
-from mvitac.locks import Busy
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.deploy.search import Index, build, nearest
 from mvitac.model import Model
-from mvitac.pack import Pack
-from mvitac.retrieval import Index, build, nearest
+from mvitac.system.locks import Busy
 
 
 def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:

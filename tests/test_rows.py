@@ -14,14 +14,14 @@ import pytest
 from films import film, shade
 from PIL import Image
 
-from mvitac import video
-from mvitac.datasets import rows as rows_module
+from mvitac.data import video
+from mvitac.data.build import build
+from mvitac.data.checks.examine import examine_source
+from mvitac.data.images import difference
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
 from mvitac.datasets.folder import FolderConfig
-from mvitac.datasets.places import difference
-from mvitac.doctor import examine_source
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.source import Sample
+from mvitac.datasets.table import table as rows_module
 
 Table = list[dict[str, Any]]
 

@@ -10,47 +10,49 @@ import pytest
 from PIL import Image
 from toy import Toy
 
-from mvitac import sheet
-from mvitac.cli import main
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.source import Sample
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.report import contact_sheet
 
 
 def test_strips_hold_their_class_and_spread_over_groups(pack: Pack) -> None:
-    found, num_all = sheet.strips(pack, num=20)
+    found, num_all = contact_sheet.strips(pack, num=20)
     assert [strip.name for strip in found] == ["columns", "rows", "checks"]
     assert num_all == 3
     for label, strip in enumerate(found):
         assert (pack.column("label_pattern")[strip.rows] == label).all()
         assert len(set(pack.column("group")[strip.rows])) == 20
         assert strip.num_rows == 40 and strip.num_groups == 20
-    again = sheet.strips(pack, num=20)[0]
+    again = contact_sheet.strips(pack, num=20)[0]
     assert all((a.rows == b.rows).all() for a, b in zip(found, again, strict=True))
-    assert any((a.rows != b.rows).any() for a, b in zip(found, sheet.strips(pack, num=20, seed=1)[0], strict=True))
+    assert any(
+        (a.rows != b.rows).any() for a, b in zip(found, contact_sheet.strips(pack, num=20, seed=1)[0], strict=True)
+    )
 
 
 def test_strips_by_column_and_split(pack: Pack) -> None:
-    found, num_all = sheet.strips(pack, "group", limit=7, num=9)
+    found, num_all = contact_sheet.strips(pack, "group", limit=7, num=9)
     assert len(found) == 7 and num_all == 60
     assert all(len(strip.rows) == 2 for strip in found)
-    tested, _ = sheet.strips(pack, "bright", split="test", num=50)
+    tested, _ = contact_sheet.strips(pack, "bright", split="test", num=50)
     assert set(pack.column("split")[np.concatenate([s.rows for s in tested])]) == {"test"}
     for options, says in (({"by": "patern"}, "did you mean 'pattern'"), ({"split": "dev"}, "unknown split 'dev'")):
         with pytest.raises(ValueError, match=says):
-            sheet.strips(pack, **options)
+            contact_sheet.strips(pack, **options)
 
 
 @pytest.mark.parametrize("touch_channels", [3, 6])
 def test_pixels_lie_where_they_should(tmp_path: Path, touch_channels: int) -> None:
     pack = build(Toy(touch_channels=touch_channels), tmp_path / "p", size=32, quiet=True)
-    found, num_all = sheet.strips(pack, num=3)
-    picture = np.asarray(sheet.to_image(pack, found, num_all, side=32))
-    wide = 32 * (1 + touch_channels // 3) + sheet.GAP
+    found, num_all = contact_sheet.strips(pack, num=3)
+    picture = np.asarray(contact_sheet.to_image(pack, found, num_all, side=32))
+    wide = 32 * (1 + touch_channels // 3) + contact_sheet.GAP
     for line, strip in enumerate(found):
-        top = sheet.LINE + 4 + line * (32 + sheet.LINE + sheet.GAP) + sheet.LINE
+        top = contact_sheet.LINE + 4 + line * (32 + contact_sheet.LINE + contact_sheet.GAP) + contact_sheet.LINE
         for place, row in enumerate(strip.rows):
-            left = sheet.GAP + place * wide
+            left = contact_sheet.GAP + place * wide
             sensors = [pack.images["vision"][row], *np.split(pack.images["touch"][row], touch_channels // 3, axis=2)]
             for k, image in enumerate(sensors):
                 assert (picture[top : top + 32, left + 32 * k : left + 32 * (k + 1)] == image).all()
@@ -66,7 +68,7 @@ class Holes(Toy):
 
 def test_a_gap_is_crossed_out(tmp_path: Path) -> None:
     pack = build(Holes(), tmp_path / "p", size=32, quiet=True)
-    gap, whole = (np.asarray(sheet.pair(pack, row, 32))[:, 32:] for row in (4, 5))
+    gap, whole = (np.asarray(contact_sheet.pair(pack, row, 32))[:, 32:] for row in (4, 5))
     assert (gap[1, 15] == 225).all() and (gap[16, 16] < 200).all()
     assert (whole == pack.images["touch"][5]).all()
 

@@ -9,14 +9,15 @@ from itertools import product
 import numpy as np
 import pytest
 
+from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.registry import from_json, to_json
 from mvitac.sim import gel
-from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, area_resize, background, press, pressure, relax, render
+from mvitac.sim.gel import GEL_STIFFNESS, area_resize, background, press, pressure, relax, render
 from mvitac.sim.materials import CLASSES, draw_instance, touch
 from mvitac.sim.relief import KINDS, Relief, draw_tables, noise
-from mvitac.source import Sample
-from mvitac.spec import DataSpec
+from mvitac.sim.sensors import SENSORS
 
 LIST = "import sys; from mvitac.sim.materials import touch; import hashlib; p = touch(3, 7, 2, 1, size=32); "
 PRINT = "print(hashlib.sha256(p['vision'].tobytes() + p['touch'].tobytes()).hexdigest())"

@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from mvitac.encoders import SCRATCH, EncoderConfig, build_trunk
-from mvitac.small_maps import SmallMapConv2d, _Product, use_products
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.small_conv import SmallMapConv2d, _Product, use_products
 
 CHANNELS_LAST = torch.channels_last
 
@@ -24,7 +24,7 @@ def layer(stride: int, dtype: torch.dtype = torch.float32) -> SmallMapConv2d:
 def test_equals_the_convolution_and_its_gradients(
     side: tuple[int, int], stride: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mvitac.small_maps.MAX_PIXELS", 20)
+    monkeypatch.setattr("mvitac.nn.small_conv.MAX_PIXELS", 20)
     conv = layer(stride, torch.float64)
     images = torch.randn(4, 5, *side, dtype=torch.float64).to(memory_format=CHANNELS_LAST).requires_grad_()
     asked, want = conv(images), F.conv2d(images, conv.weight, stride=stride, padding=1)

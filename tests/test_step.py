@@ -14,15 +14,14 @@ from test_methods import small
 from torch import Tensor, nn
 from toy import Toy
 
-from mvitac.batch import Views
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.data.pack import Pack
+from mvitac.methods.base import Method, MethodConfig, Views
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.pack import Pack
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
-from mvitac.step import Step
-from mvitac.train import train
+from mvitac.training.loop import train
+from mvitac.training.step import Step
 
 RUN = replace(recipe("smoke"), optim=Optim(lr=1e-3), method=MViTacConfig(hidden=24, out=12, dropout=0.3))
 CPU = torch.device("cpu")
@@ -172,7 +171,7 @@ def test_recomputing_saves_memory() -> None:
 
 
 def test_chunks_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
-    from mvitac.datasets.packed import PackConfig
+    from mvitac.datasets.pack import PackConfig
 
     run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, steps=4)
     first, second = (train(run, tmp_path / name, quiet=True) / "model.safetensors" for name in "ab")
@@ -181,7 +180,7 @@ def test_chunks_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
 
 
 def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
-    from mvitac.datasets.packed import PackConfig
+    from mvitac.datasets.pack import PackConfig
 
     with pytest.raises(ValueError, match="chunk 5: give a divisor of batch_size 16"):
         replace(RUN, chunk=5)

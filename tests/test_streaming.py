@@ -20,19 +20,20 @@ from test_bad_inputs import seal
 from test_train import assert_equal_weights, power_cut, smoke
 from toy import Toy
 
-from mvitac import validation
-from mvitac.batches import batches, epoch_order, mix, partners, shard_order, training_rows
-from mvitac.cli import main
-from mvitac.datasets.stream import StreamConfig
-from mvitac.distributed import World
-from mvitac.model import fresh, pack_features
-from mvitac.pack import Pack
-from mvitac.packing import build
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.sharding import deal_rows, write_shards
+from mvitac.data.streaming import Cache, StreamedPack
+from mvitac.datasets.pack import StreamConfig
+from mvitac.evaluation.features import pack_features
+from mvitac.model import fresh
 from mvitac.recipes import recipe
 from mvitac.run import Run
-from mvitac.sharding import deal_rows, write_shards
-from mvitac.streaming import Cache, StreamedPack
-from mvitac.train import train
+from mvitac.system.distributed import World
+from mvitac.training import validation
+from mvitac.training.loop import train
+from mvitac.training.sampler import batches, epoch_order, mix, partners, shard_order, training_rows
 
 SHARD_MB = 0.05
 """Eight of the toy's pairs: 120 are 15 shards, 9 of them of its 72 training rows."""

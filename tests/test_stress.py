@@ -11,21 +11,21 @@ import pytest
 import torch
 from test_compare import small
 
-from mvitac import stress as module
-from mvitac.cli import main
-from mvitac.compare import gather, lay_out
-from mvitac.datasets.packed import PackConfig
-from mvitac.features import features
-from mvitac.jobs import do_all
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation import robustness as module
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import features
+from mvitac.evaluation.probe import ProbeSplit, parts, probe_features
+from mvitac.evaluation.robustness import DROPOUT, LEAK, MISSING, NOISE, PREPARED, STRESSES, stress
+from mvitac.experiments.collect import gather, lay_out
+from mvitac.experiments.jobs import do_all
+from mvitac.experiments.table_formats import write_tables
 from mvitac.model import Model, load
-from mvitac.pack import Pack
-from mvitac.paper_tables import write_tables
-from mvitac.probe import Parts, parts, probe_features
 from mvitac.recipes import recipe
 from mvitac.run import Optim
-from mvitac.session import Session, probe_runs
-from mvitac.stress import DROPOUT, LEAK, MISSING, NOISE, PREPARED, STRESSES, stress
-from mvitac.train import train
+from mvitac.training.loop import train
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_a_missing_modality_leaves_what_the_other_says(trained: Path, pack: Pack
 def test_modality_dropout_learns_from_each_row_three_times(
     trained: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learned: list[tuple[np.ndarray, Parts]] = []
+    learned: list[tuple[np.ndarray, ProbeSplit]] = []
     real = module.fit_probe
     monkeypatch.setattr(
         module,
@@ -120,7 +120,7 @@ def test_a_leak_gives_half_of_each_test_group_away_and_nothing_else(pack: Pack) 
     given = set(leaking.train) - set(rows.train)
     assert given == set(rows.test) - set(leaking.test) and len(leaking.train) == len(rows.train)
     assert {str(name) for name in groups[sorted(given)]} == {str(name) for name in groups[leaking.test]}
-    few = Parts(rows.train[:8], rows.val, rows.test)
+    few = ProbeSplit(rows.train[:8], rows.val, rows.test)
     honest, leaking = (module._halved(few, groups, leaks, seed=1)[1] for leaks in (False, True))
     assert len(leaking.train) == len(honest.train) == 8  # half of test is more than there is to replace
     assert not set(leaking.train) & {*rows.train, *leaking.test}
@@ -146,7 +146,7 @@ def test_noise_is_that_strong_the_same_for_all_and_on_test_images_only(
 def test_without_noise_it_is_the_plain_probe(trained: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "NOISE_LEVELS", 0.0)
     found = stress(load(trained), pack, pack.spec.tasks, ["touch", "both"])
-    plain = probe_runs([trained], Session(controls=False))["records"]
+    plain = probe_runs([trained], ProbeConfig(controls=False))["records"]
     for record in (r for r in found if r["probe"] == NOISE):
         same = [r for r in plain if all(r[k] == record[k] for k in ("task", "modality")) and r["probe"] == "linear"]
         assert record["group_correct"] == same[0]["group_correct"]
@@ -174,7 +174,7 @@ def test_in_a_comparison_and_on_the_command_line(
     pack: Pack, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plan = small(pack, seeds=1, stress=True, tasks=("pattern",), set={"steps": 1, "eval_every": 0})
-    session = Session(tasks=("pattern",))
+    session = ProbeConfig(tasks=("pattern",))
     work = lay_out(plan, pack, tmp_path, session)
     do_all(work, 1, lambda line: None)
     text = write_tables(gather(work, tmp_path, session), tmp_path)[0].read_text()

@@ -15,10 +15,13 @@ import pytest
 from PIL import Image
 from videos import numbered, read_number, write_video
 
-from mvitac.cli import main
-from mvitac.datasets.stratify import stratify
-from mvitac.datasets.touch_and_go import CHUNK, TouchAndGoConfig
-from mvitac.datasets.touch_and_go_lists import (
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.data.video import frames
+from mvitac.datasets.table.splits import stratify
+from mvitac.datasets.touch_and_go.lists import (
     CLASSES,
     SOFT,
     assign_by_recording,
@@ -28,12 +31,9 @@ from mvitac.datasets.touch_and_go_lists import (
     read_list,
     read_lists,
 )
-from mvitac.datasets.touch_and_go_recordings import Recording
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.probe import parts
-from mvitac.source import Sample
-from mvitac.video import frames
+from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig
+from mvitac.datasets.touch_and_go.recordings import Recording
+from mvitac.evaluation.probe import parts
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 LISTS, SAMPLE = SHARED / "touch_and_go_lists", SHARED / "touch_and_go_sample"

@@ -21,18 +21,19 @@ import safetensors.torch
 import torch
 from toy import toy_pack
 
-from mvitac import batches
-from mvitac.batches import epoch_order, make_views, partners
-from mvitac.datasets.packed import PackConfig
-from mvitac.feed import Feed
-from mvitac.log import last_line
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
-from mvitac.pack import Pack
 from mvitac.recipes import recipe
 from mvitac.run import Optim, Run
-from mvitac.train import Diverged, train
-from mvitac.validation import evaluate
+from mvitac.training import views as batches
+from mvitac.training.loader import Feed
+from mvitac.training.log import last_line
+from mvitac.training.loop import Diverged, train
+from mvitac.training.sampler import epoch_order, partners
+from mvitac.training.validation import evaluate
+from mvitac.training.views import make_views
 
 
 def smoke(pack: Pack, **changes: object) -> Run:
@@ -134,15 +135,15 @@ def test_sigkill_at_random_moments(pack: Pack, tmp_path: Path) -> None:
 def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, straight: Path, tmp_path: Path) -> None:
     sent = []
 
-    def sink(step: int, values: dict[str, float]) -> None:
+    def logger(step: int, values: dict[str, float]) -> None:
         if step == 4 and not sent:
             sent.append(step)
             os.kill(os.getpid(), signal.SIGINT)
 
-    from mvitac.train import Interrupted
+    from mvitac.training.loop import Interrupted
 
     with pytest.raises(Interrupted, match=r"after step 4 of 8; continue with --resume"):
-        train(smoke(pack), tmp_path / "r", quiet=True, sinks=(sink,))
+        train(smoke(pack), tmp_path / "r", quiet=True, loggers=(logger,))
     assert torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)["step"] == 4
     train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(straight, tmp_path / "r")
@@ -181,7 +182,7 @@ def test_resume_refuses_a_different_run(pack: Pack, straight: Path) -> None:
 
 
 def test_from_run_json_repeats_it(pack: Pack, straight: Path, tmp_path: Path) -> None:
-    from mvitac.cli import main
+    from mvitac.cli.main import main
 
     assert main(["pretrain", "--from", str(straight / "run.json"), "--out", str(tmp_path / "again"), "--quiet"]) == 0
     assert_equal_weights(straight, tmp_path / "again")
@@ -214,7 +215,7 @@ def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
 
 def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import mvitac
-    from mvitac import validation as module
+    from mvitac.training import validation as module
 
     used: list[np.ndarray] = []
     real = module.pack_features

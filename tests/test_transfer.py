@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from toy import Toy, toy_pack
 
-from mvitac.cli import main
-from mvitac.datasets.packed import PackConfig
-from mvitac.pack import Pack
-from mvitac.packing import build
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.pack import PackConfig
 from mvitac.recipes import recipe
-from mvitac.source import Sample
-from mvitac.spec import DataSpec, Task
-from mvitac.train import train
-from mvitac.transfer import Transfer
+from mvitac.training.loop import train
 
 
 class Negative(Toy):
@@ -44,7 +44,7 @@ def negative(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 
 def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -> None:
-    both = Transfer(pack, negative)
+    both = JoinedPack(pack, negative)
     np.testing.assert_array_equal(both.rows("train", "val"), pack.rows("train", "val"))
     np.testing.assert_array_equal(both.rows("test"), pack.num + negative.rows("test"))
     assert both.num == pack.num + negative.num == len(both.column("id")) == len(set(both.column("id")))
@@ -59,7 +59,7 @@ def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -
     assert not both.spec.controls
     assert both.spec.name == f"{negative.path.name}, probes learned on {pack.path.name}"
     assert both.digest not in (pack.digest, negative.digest)
-    assert Transfer(negative, pack).digest != both.digest
+    assert JoinedPack(negative, pack).digest != both.digest
 
 
 def test_rows_without_an_image_stay_without(pack: Pack, tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_rows_without_an_image_stay_without(pack: Pack, tmp_path: Path) -> None:
             ]
 
     holes = build(Holes(), tmp_path / "p", size=32, quiet=True)
-    both = Transfer(pack, holes)
+    both = JoinedPack(pack, holes)
     np.testing.assert_array_equal(both.has("touch"), np.concatenate([pack.has("touch"), holes.has("touch")]))
 
 
@@ -98,12 +98,12 @@ def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
         source.mark = mark
         packs.append(build(source, tmp_path / name, size=32, quiet=True))
     if column == "sensor":
-        assert "sensor" not in Transfer(*packs).table.column_names
+        assert "sensor" not in JoinedPack(*packs).table.column_names
     else:
         with pytest.raises(ValueError, match=r"columns differ in kind .*phase"):
-            Transfer(*packs)
+            JoinedPack(*packs)
         with pytest.raises(ValueError, match=r"task 'pattern' is about other rows or split otherwise in"):
-            Transfer(packs[0], toy_pack(tmp_path / "c"))
+            JoinedPack(packs[0], toy_pack(tmp_path / "c"))
 
 
 def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path: Path) -> None:
@@ -133,15 +133,15 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
     with pytest.raises(
         ValueError, match=r"instance '.*' is learned from in .* and scored in .*, one of \d+: give packs"
     ):
-        Transfer(pack, build(Shuffled(), tmp_path / "shuffled", size=32, quiet=True))
+        JoinedPack(pack, build(Shuffled(), tmp_path / "shuffled", size=32, quiet=True))
     with pytest.raises(
         ValueError, match=r"no task is in both packs: .* has pattern, bright, .* other pattern, other bright"
     ):
-        Transfer(pack, build(Other(), tmp_path / "other", size=32, quiet=True))
+        JoinedPack(pack, build(Other(), tmp_path / "other", size=32, quiet=True))
     with pytest.raises(ValueError, match=r"class of pattern.*waves"):
-        Transfer(pack, build(New(), tmp_path / "new", size=32, quiet=True))
+        JoinedPack(pack, build(New(), tmp_path / "new", size=32, quiet=True))
     with pytest.raises(ValueError, match=r"vision has 3 channels at 32 px in .* and 3 at 24 px in"):
-        Transfer(pack, toy_pack(tmp_path / "small", size=24))
+        JoinedPack(pack, toy_pack(tmp_path / "small", size=24))
 
 
 def test_probe_learns_on_one_pack_and_meets_another(
@@ -152,7 +152,7 @@ def test_probe_learns_on_one_pack_and_meets_another(
     asked = ["probe", str(tmp_path / "run"), "--tasks", "pattern", "--modalities", "touch", "--json"]
     assert not main([*asked, str(tmp_path / "new.json"), "--on", str(negative.path), "--learn-on", str(pack.path)])
     result = json.loads((tmp_path / "new.json").read_text())
-    assert result["pack"] == Transfer(pack, negative).digest
+    assert result["pack"] == JoinedPack(pack, negative).digest
     assert {r["num_test"] for r in result["records"]} == {len(negative.rows("test"))}
     assert {r["source"] for r in result["records"]} == {"mvitac", "majority", "untrained", "pixels", "border"}
     assert "probes learned on" in capsys.readouterr().out

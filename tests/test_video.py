@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 from videos import edited, numbered, read_number, write_video
 
-from mvitac import video
-from mvitac.datasets import videos
-from mvitac.video import frames, num_frames
+from mvitac.data import video
+from mvitac.data.video import frames, num_frames
+from mvitac.datasets.table import video_times
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "touch_and_go_sample"
 NUM = 150
@@ -99,8 +99,8 @@ def test_a_trim_without_encoding_anew_counts_what_is_shown(
     with av.open(str(path)) as container:
         shown = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
     assert [read_number(image)[0] for _, image in shown] == [*range(first, first + num)]
-    assert num_frames(path) == videos.num_frames(path) == num
-    assert np.allclose(videos.timestamps(path), [time for time, _ in shown])
+    assert num_frames(path) == video_times.num_frames(path) == num
+    assert np.allclose(video_times.timestamps(path), [time for time, _ in shown])
     for wanted in ([0], [1, 2, 30], range(num)):
         found = list(frames(path, wanted))
         assert [number for number, _ in found] == list(wanted)
@@ -273,7 +273,7 @@ def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
 
 
 def test_decoding_needs_no_torch() -> None:
-    code = "import sys, mvitac.video; sys.exit('torch' in sys.modules)"
+    code = "import sys, mvitac.data.video; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from mvitac.data.pack import Pack
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.model import load
-from mvitac.pack import Pack
-from mvitac.session import Session, probe_runs
-from mvitac.workers import in_threads, side_by_side
+from mvitac.system.processes import in_threads, side_by_side
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_probes_do_not_depend_on_it(
         model.run = replace(model.run, seed=1)
         other = shutil.copytree(smoke_run, tmp_path / f"run{threads}")
         model.save(other / "model.safetensors")
-        return probe_runs([smoke_run, other], Session(), pack)["summary"]
+        return probe_runs([smoke_run, other], ProbeConfig(), pack)["summary"]
 
     assert scores(2) == scores(1)
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mvitac.pack import Pack
-from mvitac.packing import build
-from mvitac.source import Sample, Source
-from mvitac.spec import DataSpec, Task
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Task
 
 NUM_CLASSES = 3
 

@@ -11,14 +11,13 @@ import torch.distributed as dist
 from test_distributed import METHODS, build, loop_run, run_of, third_step, three_steps, views
 from test_step import split
 
-from mvitac import batches
-from mvitac.datasets.packed import PackConfig
-from mvitac.datasets.stream import StreamConfig
-from mvitac.distributed import join, synchronise_norms
-from mvitac.memory import shard_banks
+from mvitac.datasets.pack import PackConfig, StreamConfig
 from mvitac.methods.base import Method
-from mvitac.step import Step
-from mvitac.train import train as pretrain
+from mvitac.nn.memory_bank import shard_banks
+from mvitac.system.distributed import join, synchronise_norms
+from mvitac.training import views as batches
+from mvitac.training.loop import train as pretrain
+from mvitac.training.step import Step
 
 
 def step(folder: Path) -> None:

@@ -12,18 +12,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mvitac.artifact import PublishedModel, load
+    from mvitac.data.pack import Pack
+    from mvitac.deploy.artifact import PublishedModel, load
     from mvitac.model import Model
-    from mvitac.pack import Pack
     from mvitac.recipes import recipe
     from mvitac.run import Run
-    from mvitac.train import train
+    from mvitac.training.loop import train
 
 __version__ = "0.1.0"
 __all__ = ["Model", "Pack", "PublishedModel", "Run", "load", "recipe", "train"]
 
-_HOME = {"Model": "model", "Pack": "pack", "Run": "run", "recipe": "recipes", "train": "train"}
-_HOME |= {"load": "artifact", "PublishedModel": "artifact"}
+_HOME = {"Model": "model", "Pack": "data.pack", "Run": "run", "recipe": "recipes", "train": "training.loop"}
+_HOME |= {"load": "deploy.artifact", "PublishedModel": "deploy.artifact"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,5 +1,5 @@
 """``python -m mvitac`` is the command ``mvitac``."""
 
-from mvitac.cli import main
+from mvitac.cli.main import main
 
 raise SystemExit(main())

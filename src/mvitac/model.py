@@ -19,17 +19,15 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
-from mvitac.allocator import keep_freed_memory
-from mvitac.augment import plain_view
-from mvitac.datasets.places import difference
-from mvitac.encoders import SCRATCH
+from mvitac.data.images import difference, fit
+from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Method
-from mvitac.pack import Pack, fit
-from mvitac.readout import Readout
-from mvitac.record import brief, digest, read_json, write_atomic
+from mvitac.nn.encoders import SCRATCH
+from mvitac.nn.linear_probe import LinearProbe
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.spec import DataSpec
+from mvitac.system.files import brief, digest, write_atomic
+from mvitac.transforms.random_views import plain_view
 
 FORMAT = "mvitac-model"
 Images = np.ndarray | Tensor | Image.Image | Sequence[Any]
@@ -48,7 +46,7 @@ class Model(nn.Module):
         self.tasks = tuple(own)
         self.classifiers = nn.ModuleList(own.values())
         # No part of the state dict: a run's weights are the same with and without the probes that were published.
-        self.readouts: dict[str, Readout] = {}
+        self.readouts: dict[str, LinearProbe] = {}
         self.eval()
 
     @torch.no_grad()
@@ -58,7 +56,7 @@ class Model(nn.Module):
         With ``for_heads`` those that ``project`` and ``classify`` want: at the side of the views the heads learned from,
         which may be smaller than the side that serves a probe best (``Augment.whole``).
         """
-        view = plain_view(images, self.run.augment.size if for_heads else self.run.augment.seen)
+        view = plain_view(images, self.run.augment.size if for_heads else self.run.augment.eval_size)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=precision == "bf16"):
             return self.encoders[modality](view).float()
 
@@ -141,7 +139,7 @@ class Model(nn.Module):
     def weights_digest(self) -> str:
         """Content address of the weights and of the view they expect, for caches."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
-        return digest([safetensors_digest(tensors), self.run.augment.seen])
+        return digest([safetensors_digest(tensors), self.run.augment.eval_size])
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.safetensors) with run and data description in its header."""
@@ -224,36 +222,6 @@ def check_tensors(file: Path, expected: dict[str, Tensor], found: dict[str, Any]
         if tensor.shape != found[name].shape:
             shapes = f"{tuple(found[name].shape)}, expected {tuple(tensor.shape)}"
             raise ValueError(f"{file} holds other weights than its run describes: {name!r} is {shapes}")
-
-
-def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
-    """The ``Run`` and the whole record of a run's folder."""
-    return read_record(path / "run.json")
-
-
-def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
-    """The ``Run`` and the whole record in a run.json; ValueError names the file and the field that does not fit."""
-    record = read_json(file, "a run's record")
-    if not isinstance(record, dict) or "run" not in record:
-        raise ValueError(f"{file} is not a run's record: give the run.json that `mvitac pretrain` wrote")
-    try:
-        return Run.load(record["run"]), record
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-
-
-def pack_features(
-    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, precision: str = "fp32"
-) -> Tensor:
-    """Features [len(rows), D] of pack rows, as ``Model.features``, in chunks on the model's device; back on the CPU."""
-    device = next(model.parameters()).device
-    if device.type == "cpu":
-        keep_freed_memory()  # else every activation is mapped anew: twice the time and more on a virtual machine
-    chunks = []
-    for chunk in np.array_split(rows, max(1, len(rows) // 256)):
-        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        chunks.append(model.features(modality, images, for_heads=for_heads, precision=precision).cpu())
-    return torch.cat(chunks)
 
 
 def to_arrays(value: Images, channels: int, what: str) -> list[np.ndarray]:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields, replace
 
-from mvitac.augment import Augment, ViewAugment
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.calandra import CalandraConfig
+from mvitac.datasets.calandra.reader import CalandraConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
-from mvitac.encoders import SCRATCH, EncoderConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.registry import default, unknown
 from mvitac.run import Optim, Run
+from mvitac.transforms.random_views import Augment, ViewAugment
 
 
 def paper(data: DatasetConfig) -> Run:

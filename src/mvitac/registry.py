@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib
+import pkgutil
 import types
 import typing
 from pathlib import Path
@@ -55,6 +57,12 @@ def find(kind: type[T], name: str) -> type[T]:
 def default(kind: type[T], name: str) -> T:
     """The class registered under ``name`` with all its defaults."""
     return find(kind, name)()
+
+
+def import_all(package: str, path: typing.Iterable[str]) -> None:
+    """Import every module of ``package``, so that what they define is registered: a new choice is one new file."""
+    for module in pkgutil.iter_modules(path):
+        importlib.import_module(f"{package}.{module.name}")
 
 
 LATER = {"later": True}

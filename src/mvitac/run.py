@@ -4,19 +4,37 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
-from mvitac.augment import Augment, ViewAugment
+from mvitac.data.spec import DataSpec
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.encoders import EncoderConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.record import digest
+from mvitac.nn.encoders import EncoderConfig
 from mvitac.registry import from_json, to_json
-from mvitac.spec import DataSpec
+from mvitac.system.files import digest, read_json
+from mvitac.transforms.random_views import Augment, ViewAugment
+
+
+def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
+    """The ``Run`` and the whole record of a run's folder."""
+    return read_record(path / "run.json")
+
+
+def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
+    """The ``Run`` and the whole record in a run.json; ValueError names the file and the field that does not fit."""
+    record = read_json(file, "a run's record")
+    if not isinstance(record, dict) or "run" not in record:
+        raise ValueError(f"{file} is not a run's record: give the run.json that `mvitac pretrain` wrote")
+    try:
+        return Run.load(record["run"]), record
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
 
 MAX_STEPS = 100_000_000
 """A budget beyond this is a slip of the keyboard: at a thousand steps a second it would take a day."""
@@ -157,9 +175,9 @@ class Run:
                 f"views of {self.augment.size} px cannot be cut from images stored at {stored_size} px:"
                 f" give --augment.size {stored_size} or less, or pack the data at a larger --data.size"
             )
-        if self.augment.seen > stored_size:
+        if self.augment.eval_size > stored_size:
             raise ValueError(
-                f"whole images of {self.augment.seen} px were stored at {stored_size} px:"
+                f"whole images of {self.augment.eval_size} px were stored at {stored_size} px:"
                 f" give --augment.whole {stored_size} or less, or pack the data at a larger --data.size"
             )
         if self.precision == "bf16" and self.device.startswith("mps"):

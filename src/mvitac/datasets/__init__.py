@@ -1,35 +1,10 @@
-"""Datasets, one file each; importing this package registers them. No torch here: packing workers import it."""
+"""Datasets, one file each. Importing this package imports every file in it, and so registers them all.
 
-from mvitac.datasets import (
-    calandra,
-    folder,
-    hub,
-    lerobot,
-    packed,
-    physiclear,
-    simulated,
-    slip_grasp,
-    slip_gsmini,
-    stream,
-    touch_and_go,
-    vt60,
-    webdataset,
-)
+No torch here: packing workers import it.
+"""
+
 from mvitac.datasets.base import DatasetConfig
+from mvitac.registry import import_all
 
-__all__ = [
-    "DatasetConfig",
-    "calandra",
-    "folder",
-    "hub",
-    "lerobot",
-    "packed",
-    "physiclear",
-    "simulated",
-    "slip_grasp",
-    "slip_gsmini",
-    "stream",
-    "touch_and_go",
-    "vt60",
-    "webdataset",
-]
+__all__ = ["DatasetConfig"]
+import_all(__name__, __path__)

@@ -6,12 +6,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mvitac.jpegs import QUALITY
-from mvitac.pack import Pack, Store
-from mvitac.packing import build, check_request, stored_as
-from mvitac.record import cache_dir, check_place, digest
+from mvitac.data.build import build, check_request, stored_as
+from mvitac.data.jpeg import QUALITY
+from mvitac.data.pack import Pack, Store
+from mvitac.data.source import Source
 from mvitac.registry import Registered
-from mvitac.source import Source
+from mvitac.system.files import cache_dir, check_place, digest
 
 KEEPING = ("size", "workers", "store", "quality")
 """Options of every dataset that say how its images are kept, not which they are."""
@@ -41,7 +41,7 @@ class DatasetConfig(Registered, ABC):
         """Where the samples come from; ValueError if it is not there."""
 
     def open(self, *, quiet: bool = False) -> Pack:
-        """The pack of this dataset, made in the cache (see ``record.cache_dir``) the first time, and anew when its files
+        """The pack of this dataset, made in the cache (see ``files.cache_dir``) the first time, and anew when its files
         have changed."""
         source = self.source()
         kept = stored_as(self.store, self.quality)

@@ -27,8 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from mvitac.datasets.manifest import Manifest, find_manifest, list_class_folders, read_manifest
-from mvitac.datasets.rows import RowsConfig
+from mvitac.datasets.table.manifest import Manifest, find_manifest, list_class_folders, read_manifest
+from mvitac.datasets.table.table import RowsConfig
 
 
 @dataclass(frozen=True, kw_only=True)

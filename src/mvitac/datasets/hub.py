@@ -15,10 +15,10 @@ from typing import Any, ClassVar
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mvitac.datasets.manifest import Manifest, text_of
-from mvitac.datasets.places import Cell, Place
-from mvitac.datasets.rows import RowsConfig
-from mvitac.record import digest
+from mvitac.datasets.table.image_refs import ImageRef, ParquetCell
+from mvitac.datasets.table.manifest import Manifest, text_of
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.system.files import digest
 
 SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
 
@@ -37,7 +37,7 @@ class HubConfig(RowsConfig):
         if not files or not files[0].is_file():
             raise ValueError(f"{self.path} is no .parquet and holds none: give a parquet file, or a folder of them")
         rows: list[dict[str, str]] = []
-        found: dict[str, list[Place | None]] = {}
+        found: dict[str, list[ImageRef | None]] = {}
         sides = [SPLITS.get(file.stem.split("-")[0]) for file in files]
         for file, side in zip(files, sides, strict=True):
             before = len(rows)
@@ -60,7 +60,7 @@ class HubConfig(RowsConfig):
         return Manifest(self.path, self.path, names, rows, digest([rows, sorted(found)]), found)
 
 
-def _read(file: Path, rows: list[dict[str, str]], found: dict[str, list[Place | None]]) -> list[str]:
+def _read(file: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]]) -> list[str]:
     """Add the rows of ``file`` and where their images lie; the names of its image columns."""
     try:
         opened = pq.ParquetFile(file)
@@ -74,7 +74,7 @@ def _read(file: Path, rows: list[dict[str, str]], found: dict[str, list[Place | 
             for place, values in enumerate(table):
                 rows.append({name: _text(value, classes.get(name)) for name, value in values.items()})
                 for column in images:
-                    found.setdefault(column, []).append(Cell(str(file), group, column, place))
+                    found.setdefault(column, []).append(ParquetCell(str(file), group, column, place))
             for column in images:
                 _mark_gaps(opened, group, column, found[column], num)
     except (pa.ArrowException, OSError) as error:
@@ -88,7 +88,7 @@ def _is_image(kind: pa.DataType) -> bool:
     return pa.types.is_binary(kind) or pa.types.is_large_binary(kind)
 
 
-def _mark_gaps(opened: pq.ParquetFile, group: int, column: str, places: list[Place | None], num: int) -> None:
+def _mark_gaps(opened: pq.ParquetFile, group: int, column: str, places: list[ImageRef | None], num: int) -> None:
     """None for rows whose image is null."""
     leaves = [opened.schema.column(i).path for i in range(len(opened.schema.names))]
     leaf = next(i for i, path in enumerate(leaves) if path in (column, f"{column}.bytes"))

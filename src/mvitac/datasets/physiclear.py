@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from mvitac.datasets.manifest import Manifest, in_clone
-from mvitac.datasets.rows import RowsConfig
-from mvitac.datasets.videos import num_frames, spread
+from mvitac.datasets.table.manifest import Manifest, in_clone
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.datasets.table.video_times import num_frames, spread
 
 LABELS = {
     "material": "MATERIALS",

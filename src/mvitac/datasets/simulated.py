@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from mvitac.data.images import difference
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.datasets.places import difference
 from mvitac.sim import grasps, materials
-from mvitac.source import Sample, Source
-from mvitac.spec import DataSpec, Task
 
 LICENCE = "Apache-2.0 (made by this package)"
 

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from mvitac.datasets.manifest import Manifest, in_clone
-from mvitac.datasets.rows import RowsConfig
-from mvitac.datasets.splits import folds
-from mvitac.datasets.videos import num_frames, spread
-from mvitac.record import digest_file
+from mvitac.datasets.table.manifest import Manifest, in_clone
+from mvitac.datasets.table.splits import folds
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.datasets.table.video_times import num_frames, spread
+from mvitac.system.files import digest_file
 
 FINGERS = {"left": "camera_0.avi", "right": "camera_2.avi"}
 ALIASES = {"bag_of_peanuts": "bag_peanuts"}

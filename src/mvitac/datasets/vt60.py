@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from mvitac.datasets.manifest import Manifest, in_clone
-from mvitac.datasets.rows import RowsConfig
-from mvitac.datasets.splits import folds
+from mvitac.datasets.table.manifest import Manifest, in_clone
+from mvitac.datasets.table.splits import folds
+from mvitac.datasets.table.table import RowsConfig
 
 
 @dataclass(frozen=True, kw_only=True)

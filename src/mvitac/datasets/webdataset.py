@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from mvitac.datasets.images import IMAGES
-from mvitac.datasets.manifest import Manifest, text_of
-from mvitac.datasets.places import Place, Stretch
-from mvitac.datasets.rows import RowsConfig
-from mvitac.record import digest
+from mvitac.data.images import IMAGES
+from mvitac.datasets.table.image_refs import ImageRef, TarMember
+from mvitac.datasets.table.manifest import Manifest, text_of
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.system.files import digest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class WebDatasetConfig(RowsConfig):
         if not shards or not shards[0].is_file():
             raise ValueError(f"{self.path} is no .tar and holds none: give a tar file, or a folder of them")
         samples: dict[str, dict[str, str]] = {}
-        places: dict[str, dict[str, Place]] = {}
+        places: dict[str, dict[str, ImageRef]] = {}
         for shard in shards:
             self._index(shard, samples, places)
         columns = list(dict.fromkeys(c for found in places.values() for c in found))
@@ -48,7 +48,7 @@ class WebDatasetConfig(RowsConfig):
         found = {c: [places[key].get(c) for key in samples if key in places] for c in columns}
         return Manifest(self.path, self.path, names, rows, digest([rows, columns]), found)
 
-    def _index(self, shard: Path, samples: dict[str, dict[str, str]], places: dict[str, dict[str, Place]]) -> None:
+    def _index(self, shard: Path, samples: dict[str, dict[str, str]], places: dict[str, dict[str, ImageRef]]) -> None:
         """Add the members of ``shard``, which lie in it as they are: it must not be compressed."""
         try:
             with tarfile.open(shard, "r:") as tar:
@@ -66,7 +66,7 @@ class WebDatasetConfig(RowsConfig):
                             raise ValueError(
                                 f"{shard} has two {column} images of {key}: names must differ between shards"
                             )
-                        places[key][column] = Stretch(str(shard), member.offset_data, member.size)
+                        places[key][column] = TarMember(str(shard), member.offset_data, member.size)
                     elif last in ("json", "cls", "txt"):
                         file = tar.extractfile(member)
                         text = file.read().decode() if file else ""

@@ -1,20 +1,7 @@
-"""Pre-training methods, one file each; importing this package registers them."""
+"""Pre-training methods, one file each. Importing this package imports every file in it, and so registers them all."""
 
-from mvitac.methods import byol, calandra, cmc, dino, mct, moco, mvitac, simclr, ssvtp, supervised, vicreg
 from mvitac.methods.base import Method, MethodConfig
+from mvitac.registry import import_all
 
-__all__ = [
-    "Method",
-    "MethodConfig",
-    "byol",
-    "calandra",
-    "cmc",
-    "dino",
-    "mct",
-    "moco",
-    "mvitac",
-    "simclr",
-    "ssvtp",
-    "supervised",
-    "vicreg",
-]
+__all__ = ["Method", "MethodConfig"]
+import_all(__name__, __path__)

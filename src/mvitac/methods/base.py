@@ -1,4 +1,7 @@
-"""The method contract: what a pre-training method owes the loop, and nothing more."""
+"""One training batch as a method sees it.
+
+Shapes: N rows of a dataset, B images in a batch, V views of each image, C channels, H x W pixels.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,21 @@ from typing import ClassVar, Self
 
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig
+from mvitac.data.spec import DataSpec
+from mvitac.nn.encoders import EncoderConfig
 from mvitac.registry import Registered
-from mvitac.spec import DataSpec
+
+
+@dataclass(frozen=True)
+class Views:
+    """A batch as a method sees it: V augmented, normalised views [B, C, H, W] of every image, per modality."""
+
+    images: dict[str, list[Tensor]]
+    """modality -> V tensors; a modality the dataset lacks is absent."""
+    labels: dict[str, Tensor]
+    """task -> [B] int64, -1 = unlabelled; only supervised references look at it."""
+    rows: Tensor
+    """[B] int64, the row of each pair in its pack (memory banks are indexed by it)."""
 
 
 class Method(nn.Module, ABC):
@@ -55,7 +69,7 @@ class Contrastive(Method):
     pair i, such as embeddings.
 
     Saying so in three parts lets the loop embed a batch in chunks (gradient caching) or on many processes (all-gathered
-    negatives) and contrast all of it at once (``step.py``).
+    negatives) and contrast all of it at once (``training/step.py``).
     """
 
     @abstractmethod

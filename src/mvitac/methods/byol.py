@@ -14,11 +14,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Head, Projected, build_trunk, num_features
-from mvitac.methods.base import Contrastive, MethodConfig
-from mvitac.momentum import Momentum, rising
-from mvitac.spec import DataSpec
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, Head, Projected, build_trunk, num_features
+from mvitac.nn.momentum import Momentum, rising
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from mvitac.encoders import EncoderConfig, build_trunk, num_features
+from mvitac.data.spec import DataSpec
 from mvitac.methods.supervised import LabelledConfig, Supervised
-from mvitac.spec import DataSpec
+from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
 
 
 @dataclass(frozen=True, kw_only=True)

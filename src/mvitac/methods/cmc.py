@@ -25,12 +25,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.distributed import World
-from mvitac.encoders import EncoderConfig, build_towers
-from mvitac.memory import Bank
-from mvitac.methods.base import Contrastive, MethodConfig
-from mvitac.spec import DataSpec
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, build_towers
+from mvitac.nn.memory_bank import Bank
+from mvitac.system.distributed import World
 
 EPS = 1e-7
 """Added to both denominators, as the owner's code does."""

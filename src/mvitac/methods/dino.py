@@ -20,11 +20,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, build_towers
-from mvitac.methods.base import Contrastive, MethodConfig
-from mvitac.momentum import Momentum, rising
-from mvitac.spec import DataSpec
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, build_towers
+from mvitac.nn.momentum import Momentum, rising
 
 BOTTLENECK = 256
 

@@ -19,14 +19,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig
-from mvitac.losses import queue_nce
-from mvitac.memory import Queue
-from mvitac.methods.base import Contrastive
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, Views
+from mvitac.methods.moco import QueueConfig
 from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
-from mvitac.methods.queued import QueueConfig
-from mvitac.spec import DataSpec
+from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.losses import queue_nce
+from mvitac.nn.memory_bank import Queue
 
 QUEUES = [f"{modality}_{head}" for modality in ("vision", "touch") for head in ("intra", "inter")]
 """One for the keys of each head of each modality, named as ``MViTac.keys`` names them but for the view."""

@@ -6,20 +6,47 @@ K keys, never the other keys of its batch. MViTac keeps the momentum tower and d
 
 from __future__ import annotations
 
+from abc import ABC
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Head, build_towers
-from mvitac.losses import queue_nce
-from mvitac.memory import Queue
-from mvitac.methods.base import Contrastive
-from mvitac.methods.queued import QueueConfig
-from mvitac.momentum import Momentum, rising
-from mvitac.spec import DataSpec
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, Head, build_towers
+from mvitac.nn.losses import queue_nce
+from mvitac.nn.memory_bank import Queue
+from mvitac.nn.momentum import Momentum, rising
+
+
+@dataclass(frozen=True, kw_only=True)
+class QueueConfig(MethodConfig, ABC):
+    """Base of their configs; no method by itself."""
+
+    queue: int = 4096
+    """K, keys remembered for each head; MoCo's 65,536 are 5 % of ImageNet, 4,096 are 5 % of Touch and Go. Never more than
+    half the training rows, so that a row seldom meets its own older key."""
+    momentum: float = 0.999
+    """m of the key towers (MoCo: .999)."""
+    momentum_end: float | None = None
+    """If given, m rises to this along a half cosine."""
+    out: int = 128
+    """Width of the embeddings (MoCo: 128)."""
+    hidden: int = 512
+    """Hidden width of the 2-layer heads (MoCo v2: the trunk's own width)."""
+    head_norm: bool = False
+    """BatchNorm after the heads' first layer (MoCo v2: none)."""
+
+    def __post_init__(self) -> None:
+        self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
+        if not 1 <= self.queue <= 1 << 24:
+            raise ValueError(f"queue {self.queue}: give 1 to {1 << 24} keys")
+
+    def queue_size(self, num_rows: int) -> int:
+        """Keys to remember when training on ``num_rows`` rows."""
+        return min(self.queue, max(1, num_rows // 2))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,12 +15,11 @@ from typing import ClassVar, Literal, Self
 import torch
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Head, build_trunk
-from mvitac.losses import info_nce
-from mvitac.methods.base import Contrastive, MethodConfig
-from mvitac.momentum import Momentum, rising
-from mvitac.spec import DataSpec
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, Head, build_trunk
+from mvitac.nn.losses import info_nce
+from mvitac.nn.momentum import Momentum, rising
 
 PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
 """loss -> modality of its queries, of its keys."""

@@ -13,10 +13,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, Head, build_towers
-from mvitac.methods.base import Contrastive, MethodConfig
-from mvitac.spec import DataSpec
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, Head, build_towers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,11 +16,10 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, build_towers
-from mvitac.losses import info_nce
-from mvitac.methods.base import Contrastive, MethodConfig
-from mvitac.spec import DataSpec
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, build_towers
+from mvitac.nn.losses import info_nce
 
 
 @dataclass(frozen=True, kw_only=True)

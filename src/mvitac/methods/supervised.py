@@ -13,11 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mvitac.batch import Views
-from mvitac.encoders import EncoderConfig, build_trunk, num_features
-from mvitac.methods.base import Method, MethodConfig
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Method, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
 from mvitac.registry import unknown
-from mvitac.spec import DataSpec
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mvitac.sim.gel import GEL_STIFFNESS, SENSORS, F, area_resize, press, render
+from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
+from mvitac.sim.sensors import SENSORS
 
 VERSION = 1
 """Changes with every change of a pixel; stored in the pack."""

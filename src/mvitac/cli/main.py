@@ -1,0 +1,170 @@
+"""The command line: thin and lazy. `mvitac --help` imports nothing heavy; each command imports what it needs.
+
+A user's mistake ends in one line on stderr and exit code 2; Ctrl-C in 130; anything else is our bug and shows a traceback.
+"""
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Sequence
+
+HELP = """\
+usage: mvitac COMMAND [OPTIONS]     (mvitac COMMAND --help explains one)
+
+Learn from paired camera and optical-tactile images without labels, and prove
+what the features are worth.
+
+  demo                 the whole road in minutes, on simulated data
+  data simulate KIND   simulate materials or grasps into a pack
+  data pack            read any dataset (--data NAME) into a pack
+  data shard PACK URL  write a pack in shards, for --data stream
+  data info PACK       what is in a pack
+  data check PACK      what is wrong with a pack, or with --data NAME (doctor)
+  data sheet KIND      a picture of what the simulator makes
+  data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
+  data export-lerobot  write a PACK as a LeRobotDataset v3
+  pretrain             pre-train encoders (--method, --data, --recipe)
+  probe RUN...         linear probes beside their controls
+  compare              many runs into the paper's tables (--plan NAME or FILE)
+  report RUN...        one HTML page with curves, tables and pictures
+  publish RUN OUT      weights, probes, model card: one folder, or on the Hub
+  export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
+  live MODEL           cameras or files in, a prediction for every touch out
+  explore RUN          a local page: the map of features, neighbours, mistakes
+  embed PACK           embeddings of every row, as .npz or .parquet
+  index PACK           make a pack searchable
+  find IMAGE           the nearest known touches to a picture, and back
+
+First steps:
+  mvitac demo                                        # no data needed
+  mvitac pretrain --data materials --recipe demo --out runs/first
+  mvitac probe runs/first
+  mvitac report runs/first                           # open the page it names
+"""
+
+COMMANDS = {
+    "demo": "demo:demo",
+    "data simulate": "data:simulate",
+    "data pack": "data:pack",
+    "data shard": "data:shard",
+    "data info": "data:info",
+    "data check": "data_check:check",
+    "data sheet": "data:sheet",
+    "data show": "data:show",
+    "data export-lerobot": "data:export_lerobot",
+    "pretrain": "pretrain:pretrain",
+    "probe": "evaluate:probe",
+    "compare": "compare:compare",
+    "report": "evaluate:report",
+    "publish": "deploy:publish",
+    "export": "deploy:export",
+    "live": "live:live",
+    "explore": "explore:explore",
+    "embed": "search:embed",
+    "index": "search:index",
+    "find": "search:find",
+}
+"""Command -> module of this package:function, imported when called."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    _wait_briefly()
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _run(arguments)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError as error:
+        if _reader_left():
+            return 141  # as a shell says of what SIGPIPE ended
+        print(f"mvitac: error: {one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, OSError, MemoryError) as error:
+        print(f"mvitac: error: {one_line(error)}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        if type(error).__name__ == "Interrupted":
+            print(f"mvitac: {error}", file=sys.stderr)
+            return 130
+        if isinstance(error, RuntimeError) and re.search("out of memory|can't allocate memory", str(error)):  # torch's
+            print(f"mvitac: error: {one_line(MemoryError())}", file=sys.stderr)
+            return 2
+        raise
+
+
+def _run(arguments: list[str]) -> int:
+    """The command that ``arguments`` name, done; its exit code."""
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(HELP, end="")
+        return 0
+    if arguments[0] == "--version":
+        from mvitac import __version__
+
+        print(__version__)
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    _check_once(rest)
+    if name == "data" and rest:
+        if rest[0] in ("-h", "--help"):
+            print(HELP, end="")
+            return 0
+        name, rest = f"data {rest[0]}", rest[1:]
+    if name not in COMMANDS:
+        from mvitac.registry import unknown
+
+        raise unknown("command", name, COMMANDS)
+    module, function = COMMANDS[name].split(":")
+    return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(rest) or 0
+
+
+def _reader_left() -> bool:
+    """Whether nobody reads what is printed any more (``mvitac ... | head``); what is left of it then goes nowhere."""
+    import select
+
+    out = select.poll()
+    out.register(1, 0)
+    left = any(event & select.POLLERR for _, event in out.poll(0))
+    if left:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return left
+
+
+def _wait_briefly() -> None:
+    """Let OpenMP's threads spin for microseconds, not milliseconds, while they wait for each other.
+
+    Beside any other busy program the thread that is waited for may not be running: a step on two cores then took five
+    times as long (docs/speed.md). libgomp reads it when torch loads it; whoever sets OpenMP's own variables is obeyed.
+    """
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
+        os.environ["GOMP_SPINCOUNT"] = "10000"
+
+
+def _check_once(argv: Sequence[str]) -> None:
+    """An option given twice is a slip in a long command: say so instead of letting the last one win."""
+    names = [word.split("=")[0].replace("_", "-") for word in argv if word.startswith("--")]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name} is given twice: give it once")
+
+
+def one_line(error: BaseException) -> str:
+    """An error as one line; what the system says of a file gets the file's name and what to do."""
+    if isinstance(error, OSError) and error.strerror:
+        advice = {
+            28: "free some space or choose another --out",
+            13: "check its permissions or choose another place",
+            30: "choose another --out",
+            36: "choose a shorter name",
+        }
+        hint = advice.get(error.errno or 0, "check the path")
+        text = f"{error.filename or 'file'}: {error.strerror} ({hint})"
+    elif isinstance(error, MemoryError):
+        text = "not enough memory: use a smaller --batch-size, --augment.size or pack"
+    else:
+        text = str(error) or type(error).__name__
+    text = " ".join(text.split()).replace("\0", "\\x00")
+    return text if len(text) <= 1200 else f"{text[:600]} ... {text[-600:]}"

@@ -1,1 +1,0 @@
-"""The commands, a module per family. Each imports what it needs only when it is called (``cli.COMMANDS`` names them)."""

@@ -1,0 +1,337 @@
+"""What the table tells: damaged items, labels, classes, leaks between splits, sensors, numbers, published counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mvitac.data.checks.finding import Finding, Verdict, share, some
+from mvitac.data.pack import SPLITS, Pack
+from mvitac.data.source import Count
+
+KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
+"""Columns that, where a dataset has them, should not lie on two sides of a split either."""
+MIX = ("sensor", "vision_size", "touch_size")
+"""Columns that say what an image was taken with."""
+
+
+def unreadable(pack: Pack) -> Finding:
+    """Items that packing could not read."""
+    damaged = pack.meta.get("damaged", [])
+    if not damaged:
+        return Finding(item="unreadable items", verdict="ok", evidence=f"none; {pack.num} rows were read")
+    name, why = damaged[0]
+    return Finding(
+        item="unreadable items",
+        verdict="broken" if len(damaged) > 0.01 * pack.num else "look",
+        evidence=f"{len(damaged)} beside {pack.num} rows that were read, first {name}: {why}",
+        advice="repair or download them again; the pack holds only the others",
+    )
+
+
+def missing_images(pack: Pack) -> Finding:
+    """Rows that lack an image of a modality the dataset has."""
+    notes = []
+    verdict: Verdict = "ok"
+    for modality in pack.spec.modalities:
+        lacking = ~pack.has(modality)
+        if lacking.any():
+            notes.append(f"{share(int(lacking.sum()), pack.num)} rows have no {modality}")
+        for split in ("train", "test"):
+            if len(rows := pack.rows(split)) and lacking[rows].all():
+                verdict = "look"
+                notes.append(f"no row of {split} has {modality}")
+    return Finding(
+        item="missing images",
+        verdict=verdict,
+        evidence="; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
+        advice="deal the splits so that both have both, or leave the modality out" if verdict != "ok" else "",
+    )
+
+
+def missing_labels(pack: Pack) -> Finding:
+    """Rows of train, val and test without the label that their task is about."""
+    item, notes, rows = "missing labels", [], []
+    verdict: Verdict = "ok"
+    if not pack.spec.tasks:
+        return Finding(item=item, verdict="ok", evidence="no tasks: nothing to label")
+    for task in pack.spec.tasks:
+        labels = pack.column(f"label_{task.name}")
+        for split in ("train", "val", "test"):
+            asked = pack.rows(split, only=task.only, by=task.split)
+            empty = asked[labels[asked] < 0]
+            if len(asked) == len(empty) and split != "val":
+                verdict = "broken"
+                notes.append(f"{task.name}: no labelled rows in {split}")
+            elif len(empty):
+                verdict = "look" if verdict == "ok" else verdict
+                notes.append(
+                    f"{task.name}: {share(len(empty), len(asked))} in {split}, first {pack.column('id')[empty[0]]}"
+                )
+                rows += empty.tolist()
+    advice = "fill them in, or move the rows to split unlabelled; fine if they are meant for pre-training only"
+    return Finding(
+        item=item,
+        verdict=verdict,
+        evidence="; ".join(notes) or "none in train, val and test",
+        advice=advice if notes else "",
+        rows=tuple(rows),
+    )
+
+
+def class_balance(pack: Pack) -> list[Finding]:
+    """Per task: classes that cannot be learned or are never asked, and how far a constant answer gets."""
+    findings = []
+    for task in pack.spec.tasks:
+        labels = pack.column(f"label_{task.name}").astype(int)
+        counts = {}
+        for side, splits in (("train", ("train", "val")), ("test", ("test",))):
+            found = labels[pack.rows(*splits, only=task.only, by=task.split)]
+            counts[side] = np.bincount(found[found >= 0], minlength=len(task.classes))
+        item = f"classes of {task.name}"
+        if not counts["train"].sum() or not counts["test"].sum():
+            findings.append(Finding(item=item, verdict="not checkable", evidence="no labels in train or test"))
+            continue
+        majority = counts["test"][counts["train"].argmax()] / counts["test"].sum()
+        unseen = [c for i, c in enumerate(task.classes) if counts["test"][i] and not counts["train"][i]]
+        unasked = [c for i, c in enumerate(task.classes) if not counts["test"][i]]
+        name = task.classes[counts["train"].argmax()]
+        evidence = f"{len(task.classes)} classes; always saying {name!r} scores {100 * majority:.1f} % on test"
+        verdict: Verdict = "ok"
+        advice = ""
+        if unasked:
+            verdict, advice = "look", "say in every result which classes were asked, or deal the groups anew"
+            evidence += f"; never tested: {some(unasked)}"
+        if majority > 0.9 or (majority > 0.75 and len(task.classes) > 2):
+            verdict, advice = "look", "report balanced accuracy beside accuracy"
+        if unseen:
+            verdict, advice = "broken", "these cannot be learned: deal the groups anew, or drop the classes"
+            evidence += f"; tested but never seen in training: {some(unseen)}"
+        findings.append(Finding(item=item, verdict=verdict, evidence=evidence, advice=advice))
+    return findings
+
+
+# -- splits -----------------------------------------------------------------------------------------------------------
+
+
+def sides_of(splits: np.ndarray) -> np.ndarray:
+    """Split names with unlabelled counted as train: pre-training sees both."""
+    return np.where(splits == "unlabelled", "train", splits)
+
+
+def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """(name, rows that count, their sides) of ``split`` and of every other column that holds nothing but split names
+    (folds). In a task's own column the rows without its label are on no side: nobody learns from them or is asked."""
+    for name in pack.table.column_names:
+        values = pack.column(name)
+        if values.dtype == object and set(np.unique(values.astype(str))) <= set(SPLITS):
+            own = [pack.column(f"label_{task.name}") >= 0 for task in pack.spec.tasks if task.split == name != "split"]
+            rows = np.flatnonzero(np.logical_or.reduce(own)) if own else np.arange(pack.num)
+            sides = sides_of(values.astype(str)[rows])
+            if name == "split" or len(np.unique(sides)) > 1:
+                yield name, rows, sides
+
+
+def leaks(pack: Pack) -> list[Finding]:
+    """Groups, touch groups and other keys that lie on two sides, for every split column; sound folds are one finding."""
+    findings, sound = [], []
+    names = [n for n in ("group", "touch_group", *KEYS) if n in pack.table.column_names]
+    for split, counted, sides in split_columns(pack):
+        verdict: Verdict = "ok"
+        notes, rows = [], []
+        for name in names:
+            values = pack.column(name).astype(str)[counted]
+            on = {side: set(values[sides == side].tolist()) for side in np.unique(sides)}
+            both = sorted({v for a in on for b in on if a < b for v in on[a] & on[b]})
+            if both:
+                verdict = "broken" if name in ("group", "touch_group") else "look" if verdict == "ok" else verdict
+                kind = f" ({pack.spec.group_by})" if name == "group" else ""
+                test = on.get("test", set())
+                of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""
+                notes.append(f"{name}{kind}: {len(both)} of {len(set(values))} on two sides, e.g. {both[0]!r}{of}")
+                for one in both[:4]:  # a row from each side, next to each other on the sheet
+                    mine = np.flatnonzero(values == one)
+                    rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
+        if split != "split" and not notes:
+            sound.append(split)
+            continue
+        findings.append(
+            Finding(
+                item="groups across splits" if split == "split" else f"groups across column {split}",
+                verdict=verdict,
+                evidence="; ".join(notes) or f"none of {', '.join(names)} lies on two sides",
+                advice="split by the largest of these keys, or say in every result what test shares with train"
+                * bool(notes),
+                rows=tuple(rows),
+            )
+        )
+    if sound:
+        evidence = f"{some(sound, 8)}: none of {', '.join(names)} lies on two sides"
+        findings.append(Finding(item="groups across split columns", verdict="ok", evidence=evidence))
+    return findings
+
+
+# -- sensors and numbers ----------------------------------------------------------------------------------------------
+
+
+def mixture(pack: Pack) -> Finding:
+    """Several sensors or resolutions: where they are, and whether they alone give a label away."""
+    columns = [name for name in MIX if name in pack.table.column_names]
+    verdict: Verdict = "ok"
+    notes = []
+    for column in columns:
+        values = pack.column(column).astype(str)
+        names, counts = np.unique(values[values != "None"], return_counts=True)  # rows without this image
+        if len(names) == 1:
+            notes.append(f"{column}: {names[0]}")
+            continue
+        order = np.argsort(-counts)
+        notes.append(f"{column}: {some([f'{names[i]} {100 * counts[i] / pack.num:.0f} %' for i in order], 4)}")
+        if column.endswith("_size"):
+            verdict = "look"
+        on = {split: set(values[pack.rows(split)].tolist()) for split in ("train", "test")}
+        if alone := sorted(on["test"] - on["train"]):
+            verdict = "look"
+            notes.append(f"{column} {some(alone)} only in test")
+        for task in pack.spec.tasks:
+            rows = pack.rows("train", "val", "test", only=task.only, by=task.split)
+            labels = pack.column(f"label_{task.name}").astype(int)[rows]
+            counted = (labels >= 0) & (values[rows] != "None")
+            mine, labels = values[rows][counted], labels[counted]
+            if not len(labels):
+                continue
+            majority = np.bincount(labels).max() / len(labels)
+            told = sum(np.bincount(labels[mine == one]).max() for one in np.unique(mine)) / len(labels)
+            if told > majority + 0.1:
+                verdict = "look"
+                notes.append(
+                    f"{column} alone tells {task.name} to {100 * told:.0f} % (majority {100 * majority:.0f} %)"
+                )
+    if not columns:
+        return Finding(
+            item="sensors and resolutions",
+            verdict="not checkable",
+            evidence="no column sensor, and a pack holds one size: check the source with --data instead",
+        )
+    advice = "probe each kind apart, or make train and test alike in it" if verdict != "ok" else ""
+    return Finding(item="sensors and resolutions", verdict=verdict, evidence="; ".join(notes), advice=advice)
+
+
+def numbers(pack: Pack) -> Finding:
+    """Columns of numbers with gaps, infinities or values far outside the others'."""
+    notes, rows, seen = [], [], 0
+    for name, values in numeric_columns(pack):
+        seen += 1
+        bad = ~np.isfinite(values)
+        if bad.any() and not bad.all():
+            notes.append(
+                f"{name} is no number in {share(int(bad.sum()), len(values))}, first row {np.flatnonzero(bad)[0]}"
+            )
+            rows += np.flatnonzero(bad).tolist()
+        good = values[~bad]
+        if len(good) >= 8:
+            low, middle, high = np.percentile(good, [5, 50, 95])
+            far = (
+                np.flatnonzero(np.abs(np.where(bad, middle, values) - middle) > 100 * (high - low))
+                if high > low
+                else []
+            )
+            if len(far):
+                notes.append(f"{name} is {values[far[0]]:g} in row {far[0]}, others {low:g} to {high:g}")
+                rows += list(far)
+    return Finding(
+        item="numbers",
+        verdict="look" if notes else "ok",
+        evidence="; ".join(notes) or f"{seen} columns, all finite and in range",
+        advice="repair the cells, or leave the rows out" if notes else "",
+        rows=tuple(rows),
+    )
+
+
+def give_aways(pack: Pack) -> Finding:
+    """Columns of numbers that alone tell a label: confounds that a control probe should have.
+
+    In the labelled rows outside test: the best answer in each eighth of the values, against always the same answer. A
+    column that holds the label itself (every value one class) says nothing, and one that is a control is known.
+    """
+    notes = []
+    known = {column for columns in pack.spec.controls.values() for column in columns}
+    for task in pack.spec.tasks:
+        rows = pack.rows("train", "val", only=task.only, by=task.split)
+        labels = pack.column(f"label_{task.name}").astype(int)[rows]
+        rows, labels = rows[labels >= 0], labels[labels >= 0]
+        if len(rows) < 64:
+            continue
+        majority = np.bincount(labels).max() / len(labels)
+        for name, values in numeric_columns(pack):
+            if name in known:
+                continue
+            mine = values[rows]
+            if not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
+                continue
+            part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
+            told = sum(np.bincount(labels[part == one]).max() for one in np.unique(part)) / len(labels)
+            if told > majority + 0.1:
+                notes.append(f"{name} tells {task.name} to {100 * told:.0f} % (majority {100 * majority:.0f} %)")
+    advice = "put them beside every score as a control (--data.controls name=column)" if notes else ""
+    return Finding(
+        item="columns that give a label away",
+        verdict="look" if notes else "ok",
+        evidence="; ".join(notes) or "no column of numbers does",
+        advice=advice,
+    )
+
+
+def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
+    """Whether the values are few and each goes with one label only: the label itself, or a name for it."""
+    names, numbers = np.unique(values, return_inverse=True)
+    return len(names) <= 2 * len(np.unique(labels)) and all(
+        len(set(labels[numbers == i])) == 1 for i in range(len(names))
+    )
+
+
+def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, names of groups, labels (also
+    as a table wrote them, with gaps where a row has none) and sums."""
+    other = {"id", *(task.name for task in pack.spec.tasks)}
+    names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
+    for name in pack.table.column_names:
+        values = pack.column(name)
+        if name in other or name.startswith(("label_", "crc_", "bytes_")):
+            continue
+        if any((values.astype(str) == one).all() for one in names):
+            continue
+        values = _parsed(values) if values.dtype.kind == "O" else values
+        if values is not None and values.dtype.kind in "fiub":
+            yield name, values.astype(float)
+
+
+def _parsed(values: np.ndarray) -> np.ndarray | None:
+    """A text column of numbers (at least nine cells in ten) as float, gaps as NaN; None if it is not one."""
+    out = np.full(len(values), np.nan)
+    known = 0
+    for i, cell in enumerate(values):
+        try:
+            out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name, though Python reads a number
+            known += 1
+        except (TypeError, ValueError):
+            continue
+    return out if known >= 0.9 * len(values) else None
+
+
+def published(counts: list[Count]) -> list[Finding]:
+    """Counts of the source against the owners' lists."""
+    findings = []
+    for count in counts:
+        same = count.published == count.found
+        detail = f"; {count.detail}" if count.detail else ""
+        findings.append(
+            Finding(
+                item=f"published: {count.what}",
+                verdict="ok" if same else "look",
+                evidence=f"{count.found} found, {count.published} published{detail}",
+                advice="" if same else "fine for a part of the data; say so beside every result",
+            )
+        )
+    return findings

@@ -1,0 +1,78 @@
+"""Images as arrays: decode, resize to a square, subtract a background."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from PIL import Image, ImageOps
+
+
+def fit(image: np.ndarray, size: int) -> np.ndarray:
+    """uint8 [H, W, C] -> [size, size, C], squashed as the paper does (appendix B), three channels at a time."""
+    if image.shape[:2] == (size, size):
+        return image
+    # A pixel of one sensor as one element of three bytes: taken apart at the speed of memory, ten times that of bytes.
+    pixels = np.ascontiguousarray(image).view("V3")
+    sensors = [np.ascontiguousarray(pixels[:, :, i]).view(np.uint8) for i in range(pixels.shape[2])]
+    shaped = [s.reshape(*image.shape[:2], 3) for s in sensors]
+    return np.concatenate([shrink(Image.fromarray(s), size) for s in shaped], axis=2)
+
+
+def shrink(image: Image.Image, size: int) -> np.ndarray:
+    """An RGB image as uint8 [size, size, 3], the pixels ``fit`` gives, without its array in full size."""
+    if image.size != (size, size):
+        image = image.resize((size, size), Image.Resampling.BILINEAR)
+    return np.asarray(image)
+
+
+IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".gif")
+
+
+def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
+    """An image file as RGB: upright (EXIF), 16 bits scaled to 8, transparent parts black.
+
+    ``name`` is what to call an open file in errors.
+    """
+    name = name or str(path)
+    try:
+        with Image.open(path) as image:
+            # A camera's MPO hides a second picture behind the first; a GIF or TIFF stack is no photo.
+            if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
+                raise ValueError(f"it holds {getattr(image, 'n_frames', 0)} frames, not one: store one image per row")
+            image.load()
+            ImageOps.exif_transpose(image, in_place=True)
+            return _to_rgb(image)
+    except FileNotFoundError:
+        raise ValueError(f"{name} does not exist any more: it was there when packing began") from None
+    # What PIL raises for damaged files is not one family.
+    except (OSError, ValueError, SyntaxError, TypeError, IndexError, EOFError, struct.error) as error:
+        raise ValueError(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from None
+    except Image.DecompressionBombError as error:
+        raise ValueError(f"{name} is too large ({error})") from None
+
+
+def _to_rgb(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I"):
+        values = np.asarray(image).astype(np.int64)
+        if values.min() < 0 or values.max() > 65535:
+            raise ValueError(f"its values lie in {values.min()} to {values.max()}, not in 16 bits: scale it first")
+        gray = ((values + 128) // 257).astype(np.uint8)  # 65535 -> 255; PIL's own conversion clips instead
+        return Image.fromarray(gray).convert("RGB")
+    if image.mode == "F":
+        raise ValueError("it holds floating-point values of unknown range: store it with 8 or 16 bits")
+    if image.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in image.info:
+        image = image.convert("RGBA")
+        black = Image.new("RGBA", image.size, (0, 0, 0, 255))
+        image = Image.alpha_composite(black, image)
+    return image if image.mode == "RGB" else image.convert("RGB")
+
+
+def difference(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """``image`` minus ``background``, halved, plus one half: no contact is 128; uint8 as both."""
+    if image.shape != background.shape:
+        (h, w), (h2, w2) = image.shape[:2], background.shape[:2]
+        raise ValueError(f"image is {w} x {h}, its background {w2} x {h2}: a difference needs one size")
+    return ((image.astype(np.int16) - background + 256) >> 1).astype(np.uint8)

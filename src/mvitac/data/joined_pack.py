@@ -1,0 +1,120 @@
+"""Two packs as one, for what is learned on the one and scored on the other: a probe that meets a new sensor, room or robot.
+
+No torch here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+
+from mvitac.data.jpeg import Lazy
+from mvitac.data.pack import Images, Pack
+from mvitac.data.spec import Task
+from mvitac.registry import unknown
+
+
+class JoinedPack(Pack):
+    """Train and val rows are those of ``learn``, test rows those of ``score``; rows numbered as the one after the other.
+
+    Tasks are those both have, classes by their names in ``learn``. ValueError if the packs have no task in common, classes
+    that were not learned, other image shapes, or a group on both sides: none of its rows would be unseen.
+    """
+
+    def __init__(self, learn: Pack, score: Pack) -> None:
+        self.path, self.meta = score.path, score.meta
+        self.num, self.size, self.store = learn.num + score.num, learn.size, "raw"
+        self.digests = {"learn": learn.digest, "score": score.digest}
+        for modality in ("vision", "touch"):
+            shapes = [(pack.size, pack.spec.channels(modality)) for pack in (learn, score)]
+            if shapes[0] != shapes[1]:
+                raise ValueError(
+                    f"{modality} has {shapes[0][1]} channels at {shapes[0][0]} px in {learn.path} and {shapes[1][1]} at"
+                    f" {shapes[1][0]} px in {score.path}: pack both alike (--data.size)"
+                )
+        known = {task.name: task for task in learn.spec.tasks}
+        tasks = [(known[task.name], task) for task in score.spec.tasks if task.name in known]
+        if not tasks:
+            names = [", ".join(task.name for task in pack.spec.tasks) or "none" for pack in (learn, score)]
+            raise ValueError(f"no task is in both packs: {learn.path} has {names[0]}, {score.path} {names[1]}")
+        for ours, theirs in tasks:
+            if (ours.only, ours.split) != (theirs.only, theirs.split):
+                raise ValueError(f"task {ours.name!r} is about other rows or split otherwise in {score.path}")
+        sides = {"split", *(task.split for task, _ in tasks)}
+        self.table = _joined(
+            _side(learn, tasks, sides, "learned", {"train", "val"}), _side(score, tasks, sides, "scored", {"test"})
+        )
+        self.spec = replace(
+            learn.spec,
+            name=f"{score.path.name}, probes learned on {learn.path.name}",
+            tasks=tuple(task for task, _ in tasks),
+            controls={
+                name: columns
+                for name, columns in learn.spec.controls.items()
+                if score.spec.controls.get(name) == columns
+            },
+            notes=tuple(dict.fromkeys((*learn.spec.notes, *score.spec.notes))),
+        )
+        self.images: dict[str, Images] = {m: _Both(learn.images[m], score.images[m]) for m in self.spec.modalities}
+        group = self.column("group").astype(str)
+        for task in self.spec.tasks:
+            seen = np.isin(self.column(task.split), ["train", "val"])
+            shared = np.intersect1d(group[seen], group[self.rows("test", by=task.split)])
+            if len(shared):
+                by = learn.spec.group_by
+                raise ValueError(
+                    f"{by} {str(shared[0])!r} is learned from in {learn.path} and scored in {score.path}, one of"
+                    f" {len(shared)}: give packs whose splits agree, or another name to what is another {by}"
+                )
+
+
+class _Both(Lazy):
+    """Images of one pack, then of another."""
+
+    def __init__(self, first: Images, second: Images) -> None:
+        _, height, width, channels = first.shape
+        super().__init__((len(first) + len(second), height, width, channels))
+        self.first, self.second = first, second
+
+    def _made(self, rows: np.ndarray) -> np.ndarray:
+        images = np.empty((len(rows), *self.shape[1:]), np.uint8)
+        early = rows < len(self.first)
+        images[early], images[~early] = self.first[rows[early]], self.second[rows[~early] - len(self.first)]
+        return images
+
+
+def _side(pack: Pack, tasks: list[tuple[Task, Task]], sides: set[str], name: str, keep: set[str]) -> pa.Table:
+    """What probes read of the table of ``pack``: other splits than ``keep`` hidden, labels as numbered by the first of each
+    pair of tasks."""
+    read = {
+        "id",
+        "group",
+        *(c for task, _ in tasks for c in task.only),
+        *(c for cs in pack.spec.controls.values() for c in cs),
+    }
+    columns = {n: pack.table.column(n) for n in pack.table.column_names if n in read}
+    columns["id"] = pa.array([f"{name}/{one}" for one in columns["id"].to_pylist()])
+    for column in sides:
+        columns[column] = pa.array([s if s in keep else "hidden" for s in pack.table.column(column).to_pylist()])
+    for modality in pack.spec.modalities:
+        columns[f"has_{modality}"] = pa.array(pack.has(modality))
+    own = {task.name: task for task in pack.spec.tasks}
+    for task, _ in tasks:
+        places = [task.classes.index(c) if c in task.classes else -2 for c in own[task.name].classes]
+        labels = np.array([*places, -1])[pack.column(f"label_{task.name}").astype(int)]  # -1, none, is the last
+        if (labels == -2).any():
+            new = next(c for c in own[task.name].classes if c not in task.classes)
+            raise unknown(f"class of {task.name}", f"{new} ({pack.path})", task.classes)
+        columns[f"label_{task.name}"] = pa.array(labels)
+    return pa.table(columns)
+
+
+def _joined(first: pa.Table, second: pa.Table) -> pa.Table:
+    """The rows of both with the columns of both."""
+    names = [name for name in first.column_names if name in second.column_names]
+    try:
+        return pa.concat_tables([first.select(names), second.select(names)], promote_options="permissive")
+    except pa.ArrowException as error:
+        raise ValueError(f"the packs' columns differ in kind ({' '.join(str(error).split())[:120]})") from None

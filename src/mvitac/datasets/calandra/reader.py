@@ -1,0 +1,336 @@
+"""``--data calandra``: the grasps of "The Feeling of Success" (Calandra et al., CoRL 2017) from their owners' HDF5 shards.
+
+    <path>/calandra_corl2017_000.h5 ... calandra_corl2017_037.h5       any of the 38
+      /data/i0 ... /data/i249                                          one grasp each; 46 in the last shard
+          attributes  is_gripping (bool), object_name (bytes)
+          gelsightA_<phase>, gelsightB_<phase>   uint8 [960, 1280, 3]   phase: before, during, after
+          kinectA_rgb_<phase>                    uint8 [540, 960, 3]
+
+One item is one grasp, read phase by phase with plain h5py, so memory does not grow with the shard. 'before' is taken
+with the fingers open, 'during' with the fingers closed before the lift, 'after' 4 s after the lift attempt, when the
+outcome can be seen. A label therefore exists only in rows that it may be asked of (``ask``): no code can probe 'after'
+by oversight, and a task that uses it says so in its name, hence in every table.
+
+Sources: FACTS section 4; the owners' scripts (github.com/robertocalandra/the-feeling-of-success) for name repairs, the
+Kinect crop and the object-wise split; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for
+their 32 and 8 objects.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from mvitac.data.source import Count, Sample, Source, one_stamp, stamp_of
+from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.base import KEEPING, DatasetConfig
+from mvitac.datasets.calandra.objects import (
+    AUTHORS_TEST,
+    AUTHORS_TRAIN,
+    REPAIRS,
+    doubtful,
+    doubtful_text,
+    most_attempted,
+    object_name,
+    owners_shuffle,
+)
+from mvitac.registry import to_json, unknown
+from mvitac.system.files import brief, digest
+
+VERSION = 1
+"""Raised when the same shards would give another pack."""
+PHASES = ("before", "during", "after")
+Phase = Literal["before", "during", "after"]
+NUM_SHARDS, NUM_PER_SHARD, NUM_GRASPS = 38, 250, 9296
+SHARD = re.compile(r"calandra_corl2017_(\d{3})\.h5")
+
+
+KINECT_CROP = (0.06441159, 0.60563023, 0.13482023, 0.97554603)
+"""Top, bottom, left, right as shares of the image: the table and some space above it, as the owners crop it."""
+
+
+_CLASSES = ("failure", "success")
+TASKS = {
+    "during": Task(name="success", classes=_CLASSES, only={"phase": "during"}),
+    "before": Task(name="success_before", classes=_CLASSES, only={"phase": "before"}),
+    "after": Task(name="success_after_leaks", classes=_CLASSES, only={"phase": "after"}),
+    "authors": Task(name="success_trained_with_after", classes=_CLASSES),
+}
+Ask = Literal["during", "before", "after", "authors"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalandraConfig(DatasetConfig):
+    """Grasps of about 106 objects with two GelSights (stacked, 6 channels) and a Kinect; label success."""
+
+    name: ClassVar[str] = "calandra"
+
+    path: Path = Path("data/calandra")
+    """Folder with the owners' shards calandra_corl2017_000.h5 to _037.h5, or with some of them."""
+    shards: tuple[int, ...] = ()
+    """Numbers of the shards to read (0 to 37); none given = all that are there."""
+    split: str = "authors"
+    """authors: their published 32 training and 8 test objects. object: the owners' way, 75 % of all objects to train,
+    25 % to test, by split_seed. fold:K (K from 0, in order of names) or fold:NAME: leave this one object out."""
+    split_seed: int = 0
+    """Another number is another dealing of the objects (object), and another choice of val."""
+    val_share: float = 0.15
+    """Share of the training objects set aside to choose on (val); the authors and the owners have none."""
+    ask: tuple[Ask, ...] = ("during",)
+    """What may be probed. during: success (the paper). before: success_before. after: success_after_leaks, which sees
+    the outcome. authors: success_trained_with_after, their protocol (train on all phases, choose and test on 'during')."""
+    phases: tuple[Phase, ...] = PHASES
+    """Which images become rows; without labels all of them serve pre-training."""
+    kinect_crop: bool = False
+    """Cut the camera image to the table, as the owners do."""
+    extra_objects: bool = False
+    """Keep the objects outside the authors' 40 as unlabelled rows for pre-training (split authors)."""
+    repairs: tuple[str, ...] = ()
+    """More object names to repair, as "written=right", beside those known."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, values in (("shards", self.shards), ("ask", self.ask), ("phases", self.phases)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name} {' '.join(map(str, values))}: name each once")
+        if not all(0 <= shard < NUM_SHARDS for shard in self.shards):
+            raise ValueError(f"shards {' '.join(map(str, self.shards))}: give numbers from 0 to {NUM_SHARDS - 1}")
+        if not self.phases:
+            raise ValueError(f"phases: give at least one of {', '.join(PHASES)}")
+        if not self.split.startswith("fold:") and self.split not in ("authors", "object"):
+            raise unknown("split", self.split, ("authors", "object", "fold:K", "fold:NAME"))
+        if self.split_seed < 0:
+            raise ValueError(f"split_seed {self.split_seed}: give a number >= 0")
+        if not 0 <= self.val_share < 1:
+            raise ValueError(f"val_share {self.val_share}: give a share of the training objects in [0, 1)")
+        for asked in self.ask:
+            if (needed := "during" if asked == "authors" else asked) not in self.phases:
+                raise ValueError(f"ask {asked}: phases leaves {needed!r} out, add it")
+        for text in self.repairs:
+            if not re.fullmatch(r"[^=]+=[^=]+", text):
+                raise ValueError(f"repairs {text!r}: write it as written=right")
+
+    def source(self) -> Source:
+        return Calandra(self)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """What is known of one grasp before its images are read; ``damage`` says why they need not be tried."""
+
+    file: Path
+    shard: int
+    index: int
+    object: str = ""
+    gripping: bool = False
+    damage: str = ""
+
+
+class Calandra(Source):
+    """Item = grasp, in order of shard and number. Names and outcomes are read at once, images only by ``read``."""
+
+    sizes_at = "files"
+
+    def __init__(self, config: CalandraConfig) -> None:
+        self.config = config
+        self._files = {file: stamp_of(str(file)) for file in find_shards(config.path, config.shards)}
+        repairs = REPAIRS | dict(text.split("=") for text in config.repairs)
+        everything = [grasp for file in self._files for grasp in list_grasps(file, repairs)]
+        self.counts = Counter(grasp.object for grasp in everything if not grasp.damage)
+        """Attempts per object, over all that was read, whatever the split keeps."""
+        if not self.counts:
+            first = everything[0].damage if everything else "it holds no grasps"
+            raise ValueError(f"{config.path}: no grasp can be read ({first}): download the shards again")
+        self._splits = split_objects(config, sorted(self.counts))
+        # What a split leaves out is not read at all; what is damaged stays, to be listed.
+        self._grasps = [grasp for grasp in everything if grasp.damage or grasp.object in self._splits]
+
+    def spec(self) -> DataSpec:
+        return DataSpec(
+            name="calandra",
+            vision_channels=3,
+            touch_channels=6,
+            tasks=tuple(TASKS[asked] for asked in self.config.ask),
+            group_by="object",
+            licence="CC BY-NC-ND 4.0 (stated by a second source)",
+            source="Calandra et al., The Feeling of Success, doi 10.25532/OPARA-700",
+        )
+
+    def items(self) -> list[str]:
+        return [f"{grasp.file.name} i{grasp.index}" for grasp in self._grasps]
+
+    def fingerprint(self) -> dict[str, Any]:
+        known = [[g.shard, g.index, g.object, g.gripping, bool(g.damage)] for g in self._grasps]
+        return {
+            "reader": f"calandra {VERSION}",
+            "files": {file.name: stamp[0] for file, stamp in self._files.items()},
+            "grasps": digest(known),
+            "options": {k: v for k, v in to_json(self.config).items() if k not in ("path", *KEEPING)},
+        }
+
+    def stamps(self) -> list[int]:
+        numbers = {file: one_stamp([stamp]) for file, stamp in self._files.items()}
+        return [numbers[grasp.file] for grasp in self._grasps]
+
+    def samples_per_item(self) -> list[int]:
+        return [len(self.config.phases)] * len(self._grasps)
+
+    def read(self, item: int) -> list[Sample]:
+        import h5py
+
+        grasp, samples = self._grasps[item], []
+        if grasp.damage:
+            raise ValueError(grasp.damage)
+        split = self._splits[grasp.object]
+        where = f"{grasp.shard:03d}-{grasp.index:03d}"
+        with h5py.File(grasp.file) as file:
+            for phase in (phase for phase in PHASES if phase in self.config.phases):
+                left, right, vision = (
+                    _image(file, f"{name}_{phase}", grasp) for name in ("gelsightA", "gelsightB", "kinectA_rgb")
+                )
+                if left.shape != right.shape:
+                    raise ValueError(
+                        f"{grasp.file.name} i{grasp.index}: gelsightA_{phase} is {left.shape}, gelsightB_{phase} is"
+                        f" {right.shape}: stacked sensors need one size"
+                    )
+                columns = {
+                    "id": f"{where}-{phase}",
+                    "group": grasp.object,
+                    "touch_group": where,
+                    "split": split,
+                    **{
+                        f"label_{TASKS[asked].name}": int(grasp.gripping) if may_ask(asked, phase, split) else -1
+                        for asked in self.config.ask
+                    },
+                    "phase": phase,
+                    "outcome": int(grasp.gripping),
+                    "shard": grasp.shard,
+                }
+                vision = crop_kinect(vision) if self.config.kinect_crop else vision
+                # Pixels of three bytes as elements: five times as fast as by channel.
+                both = np.concatenate([left.view("V3"), right.view("V3")], axis=2).view(np.uint8)
+                samples.append(Sample(vision=vision, touch=both, columns=columns))
+        return samples
+
+    def expected(self) -> list[Count]:
+        """Shards, grasps, and the paper's most attempted 40 against those of the authors' list."""
+        have = {int(_number(file)) for file in self._files}
+        absent = sorted(set(range(NUM_SHARDS)) - have)
+        top, listed = most_attempted(self.counts), {*AUTHORS_TRAIN, *AUTHORS_TEST}
+        lacking, others = sorted(listed - set(top)), sorted(set(top) - listed)
+        swaps = f"listed but not among them: {', '.join(lacking)}; among them: {', '.join(others)}" if lacking else ""
+        return [
+            Count("shards", NUM_SHARDS, len(have), f"missing {' '.join(f'{n:03d}' for n in absent)}" if absent else ""),
+            Count("grasps that can be read", NUM_GRASPS, sum(self.counts.values())),
+            Count("objects of the authors' list among the 40 most attempted", 40, len(listed & set(top)), swaps),
+            Count("object names that look cut or misspelt", 0, len(doubtful(self.counts)), doubtful_text(self.counts)),
+        ]
+
+
+def _number(file: Path) -> str:
+    found = SHARD.fullmatch(file.name)
+    assert found is not None
+    return found[1]
+
+
+def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
+    """The shards in folder ``path``, those numbered ``shards`` if any are; ValueError names what is missing."""
+    if not path.is_dir():
+        raise ValueError(f"{path} is no folder: give the one with calandra_corl2017_000.h5 and its neighbours")
+    files = {int(_number(file)): file for file in sorted(path.iterdir()) if SHARD.fullmatch(file.name)}
+    missing = [number for number in shards if number not in files]
+    if missing or not files:
+        lacking = f"calandra_corl2017_{missing[0]:03d}.h5" if missing else "calandra_corl2017_NNN.h5"
+        raise ValueError(
+            f"{path} has no {lacking}: download it (doi 10.25532/OPARA-700) or give another path or shards"
+        )
+    return [files[number] for number in sorted(shards or files)]
+
+
+def list_grasps(file: Path, repairs: dict[str, str]) -> list[Grasp]:
+    """Every grasp of one shard with its name and outcome. One that cannot be opened at all counts as all its grasps."""
+    import h5py
+
+    shard = int(_number(file))
+    try:
+        with h5py.File(file) as opened:
+            data: Any = opened["data"]
+            indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
+            return [_describe(data, Grasp(file, shard, index), repairs) for index in indices]
+    except (OSError, KeyError, RuntimeError, TypeError) as error:  # the families h5py has for damage
+        damage = f"{file.name} cannot be read as HDF5 ({brief(error)}): download it again or leave it out of shards"
+        num = NUM_GRASPS - NUM_PER_SHARD * shard if shard == NUM_SHARDS - 1 else NUM_PER_SHARD
+        return [Grasp(file, shard, index, damage=damage) for index in range(num)]
+
+
+def _describe(data: Any, grasp: Grasp, repairs: dict[str, str]) -> Grasp:
+    what = "attributes"
+    try:
+        attributes = data[f"i{grasp.index}"].attrs
+        what = "attribute object_name"
+        name = object_name(attributes["object_name"], repairs)
+        what = "attribute is_gripping"
+        gripping = np.asarray(attributes["is_gripping"]).reshape(-1)
+        if len(gripping) != 1 or gripping[0] not in (0, 1):
+            raise ValueError(f"it is {gripping.tolist()}, not one true or false")
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        why = f"{grasp.file.name} i{grasp.index}: {what} cannot be read ({brief(error)})"
+        return Grasp(grasp.file, grasp.shard, grasp.index, damage=why)
+    return Grasp(grasp.file, grasp.shard, grasp.index, name, bool(gripping[0]))
+
+
+def _image(file: Any, name: str, grasp: Grasp) -> np.ndarray:
+    where = f"{grasp.file.name} i{grasp.index}: {name}"
+    try:
+        dataset = file[f"data/i{grasp.index}/{name}"]
+        if dataset.dtype != np.uint8 or len(dataset.shape) != 3 or dataset.shape[2] != 3 or 0 in dataset.shape:
+            raise ValueError(f"is {dataset.dtype} {dataset.shape}, not uint8 H x W x 3")
+        return dataset[()]
+    except (OSError, KeyError, RuntimeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{where} cannot be read ({brief(error)})") from None
+
+
+def crop_kinect(image: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3] cut to the table (``KINECT_CROP``)."""
+    (height, width), (top, bottom, left, right) = image.shape[:2], KINECT_CROP
+    return image[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
+
+
+def may_ask(asked: Ask, phase: str, split: str) -> bool:
+    """Whether a row of ``phase`` in ``split`` carries the label of task ``asked``."""
+    if split == "unlabelled":
+        return False
+    if asked == "authors":
+        return phase == "during" or split == "train"
+    return phase == asked
+
+
+def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str]:
+    """Object -> split for the objects that take part; val is carved out of train, object by object."""
+    if config.split == "authors":
+        splits = {name: "train" for name in names if name in AUTHORS_TRAIN}
+        splits |= {name: "test" for name in names if name in AUTHORS_TEST}
+        others = {name: "unlabelled" for name in names if name not in splits} if config.extra_objects else {}
+    elif config.split == "object":
+        dealt = owners_shuffle(names, config.split_seed)
+        num_train = int(0.75 * len(dealt))
+        splits, others = {name: "train" if i < num_train else "test" for i, name in enumerate(dealt)}, {}
+    else:
+        out = config.split.removeprefix("fold:")
+        if out.isdigit() and out not in names and int(out) < len(names):
+            out = names[int(out)]
+        if out not in names:
+            raise unknown(f"object in split {config.split!r} (or give 0 to {len(names) - 1})", out, names)
+        splits, others = {name: "test" if name == out else "train" for name in names}, {}
+    if not splits:
+        raise ValueError(f"{config.path} holds none of the authors' 40 objects: use split object, or more shards")
+    train = sorted(name for name, split in splits.items() if split == "train")
+    num_val = round(config.val_share * len(train))
+    chosen = np.random.default_rng([40, config.split_seed]).permutation(train)[:num_val].tolist()
+    return others | splits | dict.fromkeys(chosen, "val")

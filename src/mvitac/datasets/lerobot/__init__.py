@@ -1,0 +1,5 @@
+"""LeRobot datasets, read and written."""
+
+from mvitac.datasets.lerobot import reader
+
+__all__ = ["reader"]

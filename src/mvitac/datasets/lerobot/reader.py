@@ -1,0 +1,215 @@
+"""``--data lerobot``: a LeRobotDataset v3 folder (https://huggingface.co/docs/lerobot/lerobot-dataset-v3).
+
+    meta/info.json                                   version, fps, path templates, features (dtype video, image, int64, ...)
+    meta/tasks.parquet                               task text -> task_index
+    meta/episodes/chunk-000/file-000.parquet         per episode: index, and for each camera video/<key>/{chunk_index,
+                                                     file_index, from_timestamp}: several episodes share one file
+    data/chunk-000/file-000.parquet                  per frame: timestamp within its episode, episode_index, features
+    videos/<camera key>/chunk-000/file-000.mp4
+
+A row is a pair: both cameras at the time of a table row. In a video that is the frame whose presentation time is nearest,
+so streams of different rates meet; farther away than ``tolerance`` is a gap.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
+from mvitac.datasets.table.manifest import Manifest, text_of
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.datasets.table.video_times import nearest, timestamps
+from mvitac.registry import unknown
+from mvitac.system.files import digest, read_json
+
+VERSION = "v3.0"
+FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)
+"""What a camera key that shows touch is usually called."""
+RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
+"""The format's own columns -> what they are called in a pack."""
+SCALARS = {"float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool", "string"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeRobotConfig(RowsConfig):
+    """A LeRobotDataset v3 on disk: two of its cameras as vision and touch, paired by time."""
+
+    name: ClassVar[str] = "lerobot"
+
+    path: Path = Path("dataset")
+    """The dataset's folder, with meta/info.json in it."""
+    vision: str | None = None
+    """Camera key, e.g. observation.images.front; default: the first whose name does not sound like touch; "" = none."""
+    touch: tuple[str, ...] = ()
+    """Camera key, or two to stack; default: those whose names say touch, tactile, gelsight, digit or finger."""
+    tolerance: float = 0.04
+    """Seconds by which a video frame may miss the time it is wanted at."""
+    every: int = 1
+    """Take every n-th row of each episode: neighbours in time are near-copies."""
+    group: str | None = "episode"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.tolerance >= 0:
+            raise ValueError(f"tolerance {self.tolerance}: give seconds, 0 or more")
+        if self.every < 1:
+            raise ValueError(f"every {self.every}: give 1 (every row) or more")
+
+    def manifest(self) -> Manifest:
+        info = _info(self.path)
+        cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
+        names = choose(cameras, self.vision, self.touch, self.path)
+        rows, cells = _frames(self.path, info, [key for key in names.values() if key in _embedded(info)], self.every)
+        found: dict[str, list[ImageRef | None]] = {}
+        for column, key in names.items():
+            found[column] = cells[key] if key in cells else self._in_videos(info, key, rows)
+        where = {c: [str(place).removeprefix(str(self.path)) for place in places] for c, places in found.items()}
+        columns = tuple(dict.fromkeys(name for row in rows for name in row))
+        return Manifest(self.path, self.path, columns, rows, digest([rows, where]), found)
+
+    def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[ImageRef | None]:
+        """The frame of camera ``key`` at each row's time, None where none is near enough."""
+        episodes = {str(e["episode_index"]): e for e in _tables(self.path, "meta/episodes", f"videos/{key}/")}
+        wanted: dict[str, list[int]] = {}
+        for i, row in enumerate(rows):
+            wanted.setdefault(row["episode"], []).append(i)
+        times: dict[Path, np.ndarray] = {}
+        places: list[ImageRef | None] = [None] * len(rows)
+        for name, numbers in wanted.items():
+            episode = episodes.get(name)
+            if episode is None or episode.get(f"videos/{key}/from_timestamp") is None:
+                raise ValueError(f"{self.path}: meta/episodes says nothing of {key} in episode {name}")
+            place = {part: episode[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")}
+            file = self.path / info["video_path"].format(video_key=key, **place)
+            if file not in times:
+                if not file.is_file():
+                    raise ValueError(f"{file} is missing: fetch the videos too, or leave {key} out")
+                times[file] = timestamps(file)
+            start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
+            # Several episodes lie in one file: the nearest frame must not be another one's.
+            low, high = np.searchsorted(times[file], [start - 1e-3, (np.inf if end is None else end) - 1e-3])
+            when = start + np.array([float(rows[i]["timestamp"]) for i in numbers])
+            at, away = nearest(times[file][low:high], when)
+            for i, frame, miss, moment in zip(numbers, (low + at).tolist(), away.tolist(), when.tolist(), strict=True):
+                if miss <= self.tolerance:
+                    places[i] = Frame(str(file), frame)
+                elif not self.allow_missing:
+                    raise ValueError(
+                        f"{file}: no frame within {self.tolerance:g} s of {moment:.3f} s (episode {name}, the nearest is"
+                        f" {miss:.3f} s away): give a larger tolerance, or allow_missing"
+                    )
+        return places
+
+
+def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], where: Path) -> dict[str, str]:
+    """Column -> camera key: as asked for under its own name, otherwise guessed under vision, touch, left and right."""
+    felt = [key for key in cameras if FELT.search(key) and key != vision]
+    seen = [key for key in cameras if key not in felt]
+    for key in (*touch, vision):
+        if key and key not in cameras:
+            raise ValueError(f"{where}: {unknown('camera', key, cameras)}")
+    names: dict[str, str] = {key: key for key in touch if key}
+    if not touch and len(felt) > 2:
+        raise ValueError(f"{where} has {len(felt)} cameras that may be touch ({', '.join(felt)}): choose by touch")
+    if not touch and felt:
+        usual: tuple[str, ...] = ("touch",) if len(felt) == 1 else ("left", "right")
+        names = dict(zip(usual, felt, strict=True))
+    if vision:
+        names[vision] = vision
+    elif vision is None and (left := [key for key in seen if key not in touch]):
+        names["vision"] = left[0]
+    if not names:
+        raise ValueError(f"{where} has no cameras to choose from: features of dtype video or image are needed")
+    return names
+
+
+def _info(root: Path) -> dict[str, Any]:
+    info = read_json(root / "meta" / "info.json", "a LeRobotDataset's description")
+    version = str(info.get("codebase_version")) if isinstance(info, dict) else "none"
+    if not version.startswith("v3"):
+        raise ValueError(
+            f"{root} has LeRobotDataset version {version}, this reads {VERSION}: convert it by"
+            " lerobot.datasets.v30.convert_dataset_v21_to_v30"
+        )
+    if not isinstance(info.get("features"), dict) or not all("dtype" in f for f in info["features"].values()):
+        raise ValueError(f"{root / 'meta/info.json'} lists no features: fetch it again")
+    return info
+
+
+def _embedded(info: dict[str, Any]) -> list[str]:
+    return [key for key, feature in info["features"].items() if feature["dtype"] == "image"]
+
+
+def _tables(root: Path, folder: str, *wanted: str) -> list[dict[str, Any]]:
+    """The rows of every parquet below ``folder``, with episode_index and the columns that begin with ``wanted``."""
+    files = sorted((root / folder).glob("*/*.parquet"))
+    if not files:
+        raise ValueError(f"{root / folder} holds no parquet files: fetch the whole dataset")
+    rows: list[dict[str, Any]] = []
+    for file in files:
+        opened = _open(file)
+        names = [n for n in opened.schema_arrow.names if n == "episode_index" or n.startswith(wanted)]
+        rows += opened.read(columns=names).to_pylist()
+    return rows
+
+
+def _open(file: Path) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(file)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(
+            f"{file} is not a parquet file ({' '.join(str(error).split())[:120]}): fetch it again"
+        ) from None
+
+
+def _tasks(root: Path) -> dict[int, str]:
+    file = root / "meta" / "tasks.parquet"
+    if not file.is_file():
+        return {}
+    table = _open(file).read()
+    names = [name for name in table.column_names if name != "task_index"]
+    return dict(zip(table.column("task_index").to_pylist(), table.column(names[0]).to_pylist(), strict=True))
+
+
+def _frames(
+    root: Path, info: dict[str, Any], images: Sequence[str], every: int
+) -> tuple[list[dict[str, str]], dict[str, list[ImageRef | None]]]:
+    """Every table row as text (scalar features only), and where the ``images`` of embedded cameras lie."""
+    tasks = _tasks(root)
+    scalars = [k for k, f in info["features"].items() if f["dtype"] in SCALARS and list(f.get("shape", [1])) == [1]]
+    rows: list[dict[str, str]] = []
+    cells: dict[str, list[ImageRef | None]] = {key: [] for key in images}
+    files = sorted((root / "data").glob("*/*.parquet"))
+    if not files:
+        raise ValueError(f"{root / 'data'} holds no parquet files: fetch the whole dataset")
+    for file in files:
+        opened = _open(file)
+        for name in ("timestamp", "episode_index", "frame_index", *images):
+            if name not in opened.schema_arrow.names:
+                raise ValueError(f"{file} has no column {name!r}: fetch it again")
+        names = [
+            name for name in opened.schema_arrow.names if name in scalars or name in RENAMED or name == "timestamp"
+        ]
+        for group in range(opened.num_row_groups):
+            for place, values in enumerate(opened.read_row_group(group, columns=names).to_pylist()):
+                if values["frame_index"] % every:
+                    continue
+                row = {RENAMED.get(str(name), str(name)): _text(value) for name, value in values.items()}
+                if "task_index" in values:
+                    row["task"] = tasks.get(values["task_index"], "")
+                rows.append(row)
+                for key in images:
+                    cells[key].append(ParquetCell(str(file), group, key, place))
+    return rows, cells
+
+
+def _text(value: Any) -> str:
+    return text_of(value[0] if isinstance(value, list) and len(value) == 1 else value)

@@ -1,0 +1,284 @@
+"""A table that says what belongs together: read from a manifest, or from the folders that amount to one.
+
+Cells are text, however they were stored; rows are counted from 1, the header not counted.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import operator
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mvitac.data.images import IMAGES
+from mvitac.data.pack import SPLITS
+from mvitac.datasets.table.image_refs import VIDEOS, File, Frame, ImageRef
+from mvitac.datasets.table.splits import meant
+from mvitac.registry import unknown
+from mvitac.system.files import digest, digest_file
+
+MANIFESTS = (".csv", ".parquet", ".jsonl")
+COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Rows as text, however they were stored; "" is an empty cell, NaN or null."""
+
+    file: Path
+    """What to call it in errors."""
+    root: Path
+    """What its paths are relative to."""
+    columns: tuple[str, ...]
+    rows: list[dict[str, str]]
+    digest: str
+    found: dict[str, list[ImageRef | None]] = field(default_factory=dict)
+    """Image columns that a reader resolved itself; the others hold paths."""
+    labels: tuple[str, ...] = ()
+    """Columns that are labels unless others are asked for."""
+
+    @classmethod
+    def of(
+        cls, root: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]] | None = None
+    ) -> Manifest:
+        """The table of ``rows`` that a reader made of what lies below ``root``."""
+        columns = tuple(dict.fromkeys(name for row in rows for name in row))
+        return cls(root, root, columns, rows, digest(rows), found or {})
+
+    def check(self, column: str) -> None:
+        if column not in self.columns and column not in self.found:
+            raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
+
+    def places(self, column: str) -> list[ImageRef | None]:
+        """Where each row's image of ``column`` lies; None where the cell is empty.
+
+        A path to a video needs the frame's number, from 0, in column <column>_frame or, if there is none, frame.
+        """
+        if column in self.found:
+            return self.found[column]
+        root, places = str(self.root), []
+        counter = f"{column}_frame" if f"{column}_frame" in self.columns else "frame"
+        for number, row in enumerate(self.rows, 1):
+            cell = row[column]
+            path = os.path.join(root, cell)
+            if not cell:
+                places.append(None)
+            elif not cell.lower().endswith(VIDEOS):
+                places.append(File(path))
+            elif (row.get(counter) or "").isdecimal():
+                places.append(Frame(path, int(row[counter])))
+            else:
+                raise ValueError(
+                    f"{self.file} row {number}: {column} {cell} is a video, column {counter!r} says"
+                    f" {row.get(counter, 'nothing')!r}: give the frame's number, from 0"
+                )
+        return places
+
+
+def text_of(value: Any) -> str:
+    """A cell as text that does not depend on the file format: whole numbers without '.0', NaN and null as ''."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    text = str(value).strip()
+    if text.lower() == "nan":
+        return ""
+    # pandas writes an integer column with one gap as 1.0, 2.0, ...: still the classes 1 and 2.
+    return re.sub(r"^(-?\d+)\.0+$", r"\1", text) if ".0" in text else text
+
+
+def number_of(text: str) -> float | None:
+    """``text`` as a finite number, or None; 1_2 is a name, though Python reads a number."""
+    try:
+        value = float("" if "_" in text else text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
+    """The folder ``inside`` a clone of ``url`` at ``path`` (or itself) that holds ``pattern``; else ValueError."""
+    for root in (path / inside, path):
+        if next(root.glob(pattern), None) is not None:
+            return root
+    lacks = f"holds no {inside}/{pattern}" if path.is_dir() else "does not exist"
+    raise ValueError(f"{path} {lacks}: git clone {url}, and give the clone as path")
+
+
+def find_manifest(path: Path) -> Path | None:
+    """The manifest that ``path`` is or holds; None if it is a folder without one."""
+    if path.is_dir():
+        found = [path / f"manifest{suffix}" for suffix in MANIFESTS if (path / f"manifest{suffix}").is_file()]
+        if len(found) > 1:
+            raise ValueError(f"{path} holds {' and '.join(p.name for p in found)}: give the path of one of them")
+        return found[0] if found else None
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist: give a manifest ({', '.join(MANIFESTS)}) or a folder as path")
+    if path.suffix.lower() not in MANIFESTS:
+        raise ValueError(f"{path} is no manifest: its name must end in {', '.join(MANIFESTS)}")
+    return path
+
+
+def read_manifest(file: Path) -> Manifest:
+    """Read ``file``; ValueError for anything that is not a table with named columns and at least one row."""
+    try:
+        columns, rows = {".csv": _read_csv, ".jsonl": _read_jsonl, ".parquet": _read_parquet}[file.suffix.lower()](file)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file} is not UTF-8 text ({error.reason} at byte {error.start}): save it as UTF-8") from None
+    if not rows:
+        raise ValueError(f"{file} is empty: a manifest needs a row per sample")
+    return Manifest(file, file.parent, tuple(columns), rows, digest_file(file))
+
+
+def _read_csv(file: Path) -> tuple[list[str], list[dict[str, str]]]:
+    with file.open(newline="", encoding="utf-8-sig") as stream:
+        try:
+            lines = [line for line in csv.reader(stream) if line]
+        except csv.Error as error:
+            raise ValueError(f"{file} is not CSV: {error}") from None
+    if not lines:
+        return [], []
+    columns = [name.strip() for name in lines[0]]
+    if len(columns) == 1 and re.search("[;\t]", columns[0]):
+        raise ValueError(f"{file} has one column {columns[0]!r}: separate columns by commas")
+    _check_header(file, columns)
+    for number, line in enumerate(lines[1:], 1):
+        if len(line) != len(columns):
+            raise ValueError(
+                f"{file} row {number} has {len(line)} cells for {len(columns)} columns: quote cells that hold commas"
+            )
+    return columns, [dict(zip(columns, map(text_of, line), strict=True)) for line in lines[1:]]
+
+
+def _read_jsonl(file: Path) -> tuple[list[str], list[dict[str, str]]]:
+    rows: list[dict[str, Any]] = []
+    for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{file} line {number} is not JSON ({error}): write one object per line") from None
+        if not isinstance(row, dict):
+            raise ValueError(f"{file} line {number} is not an object: write one {{...}} per line")
+        rows.append(row)
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    return columns, [{name: text_of(row.get(name)) for name in columns} for row in rows]
+
+
+def _read_parquet(file: Path) -> tuple[list[str], list[dict[str, str]]]:
+    try:
+        table = pq.ParquetFile(file).read()
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(
+            f"{file} is not a parquet file ({' '.join(str(error).split())[:120]}): write it again"
+        ) from None
+    _check_header(file, table.column_names)
+    columns = {name: [text_of(v) for v in table.column(name).to_pylist()] for name in table.column_names}
+    return table.column_names, [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
+
+
+def _check_header(file: Path, columns: Sequence[str]) -> None:
+    twice = [name for name, count in Counter(columns).items() if count > 1]
+    if twice or not all(columns):
+        what = f"column {twice[0]!r} twice" if twice else "a column without a name"
+        raise ValueError(f"{file} has {what}: give every column its own name in the first line")
+
+
+def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bool = False) -> Manifest:
+    """The manifest that a tree of class folders amounts to (see ``folder``'s docstring).
+
+    ``pictures`` is what a tree without folders for the modalities shows; ``allow_missing`` leaves a cell empty where an
+    image has no counterpart.
+    """
+    splits = [split for split in SPLITS if (root / split).is_dir()]
+    for other in sorted(root.iterdir()) if splits else ():
+        if other.name not in SPLITS and other.is_dir() and _images_below(other):
+            hint = f"write {wanted!r} instead" if (wanted := meant(other.name)) else "take it away"
+            raise ValueError(f"{root} has images in folder {other.name!r} beside {' and '.join(splits)}: {hint}")
+    rows: list[dict[str, str]] = []
+    for split in splits or [""]:
+        base = root / split
+        named = [name for name in ("vision", "touch", "left", "right") if (base / name).is_dir()]
+        found = {name: _images_below(base / name) for name in named} or {pictures: _images_below(base)}
+        have = list(found)
+        if not named and not any("/" in key for key in found[pictures]):
+            raise ValueError(
+                f"{base} has no manifest.csv (.parquet, .jsonl) and no folder vision, touch, left or right"
+                " nor class folders with images: make them, or give another path"
+            )
+        for key in sorted(set().union(*found.values())):
+            lacking = next((name for name in have if key not in found[name]), None)
+            if lacking and not allow_missing:
+                other = next(found[name][key] for name in have if key in found[name])
+                raise ValueError(
+                    f"{other} has no counterpart {base / lacking / key}.*: add it, remove the other, or allow_missing"
+                )
+            parts = key.split("/")
+            if len(parts) < 2:
+                where = next(found[name][key] for name in have if key in found[name])
+                raise ValueError(f"{where} is not in a class folder: put it in one, named by its class")
+            row = {name: found[name][key].relative_to(root).as_posix() if key in found[name] else "" for name in have}
+            group = "/".join(parts[:-1]) if len(parts) > 2 else f"{split}/{key}"
+            rows.append({**row, "label": parts[0], "group": group, **({"split": split} if split else {})})
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    for number, row in enumerate(rows, 1):
+        if len(row) < len(columns) and not allow_missing:
+            lacking = next(name for name in columns if name not in row)
+            raise ValueError(
+                f"{root} has {lacking} images in some splits only (row {number} has none): add or remove them"
+            )
+    rows = [{name: row.get(name, "") for name in columns} for row in rows]
+    if not rows:
+        raise ValueError(f"{root} holds no images ({', '.join(IMAGES)}): put them in <class> folders")
+    return Manifest(root, root, tuple(columns), rows, digest(rows), labels=("label",))
+
+
+def _images_below(folder: Path) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in IMAGES and path.is_file():
+            key = path.relative_to(folder).with_suffix("").as_posix()
+            if key in found:
+                raise ValueError(f"{found[key]} and {path} differ in their suffix only: keep one of them")
+            found[key] = path
+    return found
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One row filter: column, one of = != <= >=, value."""
+
+    column: str
+    sign: str
+    value: str
+
+    @classmethod
+    def parse(cls, text: str) -> Condition:
+        match = re.fullmatch(r"\s*([^<>=!]+?)\s*(<=|>=|!=|=)\s*([^<>=!]*?)\s*", text)
+        if match is None:
+            raise ValueError(f"condition {text!r}: write column=value, column!=value, column<=number or column>=number")
+        condition = cls(*match.groups())
+        if condition.sign in COMPARE and number_of(condition.value) is None:
+            raise ValueError(f"condition {text!r}: {condition.sign} needs a number, not {condition.value!r}")
+        return condition
+
+    def __str__(self) -> str:
+        return f"{self.column}{self.sign}{self.value}"
+
+    def holds(self, row: dict[str, str]) -> bool:
+        """Whether ``row`` meets it; an empty cell is neither <= nor >= anything."""
+        cell, wanted = row[self.column], text_of(self.value)
+        if self.sign in COMPARE:
+            number = number_of(cell)
+            return number is not None and COMPARE[self.sign](number, float(wanted))
+        return (cell == wanted) == (self.sign == "=")

@@ -1,0 +1,55 @@
+"""How long a video is, and which of its frames to take: known before any is decoded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import av.error
+import numpy as np
+from av.packet import Packet
+
+
+def num_frames(path: Path) -> int:
+    """How many frames of ``path`` are shown, counted without decoding them; ValueError if it is no video or has none."""
+    try:
+        with av.open(str(path)) as container:
+            num = sum(map(_is_shown, container.demux(video=0)))
+    except (av.error.FFmpegError, IndexError, OSError) as error:
+        raise ValueError(f"{path} cannot be read as a video ({error}): fetch it again") from None
+    if not num:
+        raise ValueError(f"{path} holds no frames: fetch it again")
+    return num
+
+
+def spread(num: int, length: int, start: float = 0.0, end: float = 1.0) -> list[int]:
+    """At most ``num`` different frame numbers, evenly spread from the share ``start`` to ``end`` of ``length`` frames."""
+    places = np.linspace(start * (length - 1), end * (length - 1), num)
+    return sorted({int(place) for place in np.rint(places)})
+
+
+def timestamps(path: Path) -> np.ndarray:
+    """Ascending presentation times in seconds [N] of the frames that ``path`` shows; nothing is decoded."""
+    try:
+        with av.open(str(path)) as container:
+            base = float(container.streams.video[0].time_base or 0)
+            times = [packet.pts for packet in container.demux(video=0) if _is_shown(packet) and packet.pts is not None]
+    except (av.error.FFmpegError, IndexError, OSError) as error:
+        raise ValueError(f"{path} cannot be read as a video ({error}): fetch it again") from None
+    return np.sort(np.array(times, float)) * base
+
+
+def _is_shown(packet: Packet) -> bool:
+    """Not what an edit list cuts off (a trim without re-encoding): neither a player nor ``mvitac.data.video`` counts that."""
+    return packet.size > 0 and not packet.is_discard
+
+
+def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each of ``wanted`` [M] the place of the nearest of ascending ``times`` [N], and how far away it is (seconds)."""
+    if not len(times):
+        return np.zeros(len(wanted), int), np.full(len(wanted), np.inf)
+    after = np.clip(np.searchsorted(times, wanted), 1, max(1, len(times) - 1))
+    before = after - 1
+    after = np.minimum(after, len(times) - 1)
+    at = np.where(np.abs(times[after] - wanted) < np.abs(times[before] - wanted), after, before)
+    return at, np.abs(times[at] - wanted)

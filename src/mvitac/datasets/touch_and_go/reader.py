@@ -1,0 +1,286 @@
+"""``--data touch-and-go``: Touch and Go (Yang et al., NeurIPS 2022) as its owners ship it.
+
+    <root>/label.txt                            every labelled frame, "<rec>/<10 digits>.jpg,<int>"
+    <root>/dataset/<rec>/video.mp4              camera, 640 x 480
+                         gelsight.mp4           touch; frame i of one belongs to frame i of the other, from 0
+                         video_frame/<10 digits>.jpg   gelsight_frame/<10 digits>.jpg    as the owners extract them
+
+Images come straight from the two videos, only the frames that are wanted and each video once, or from the extracted
+JPEGs. The owners' lists are in their repository (see touch_and_go_lists). One pack holds all three tasks; a frame that a
+task's lists do not name has label -1 there.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from mvitac.data.source import Count, Lost, Sample, Source, one_stamp
+from mvitac.data.spec import MODALITIES, DataSpec, Task
+from mvitac.datasets.base import KEEPING, DatasetConfig
+from mvitac.datasets.touch_and_go.lists import (
+    CLASSES,
+    LIST_FILES,
+    LISTS_AT,
+    NUM_ROWS,
+    SOFT,
+    Frame,
+    assign_by_recording,
+    assign_official,
+    find_touches,
+    leaks,
+    read_list,
+    read_lists,
+)
+from mvitac.datasets.touch_and_go.recordings import (
+    HOMEPAGE,
+    Recording,
+    find_recordings,
+    missing_report,
+    on_disk,
+    read_frames,
+)
+from mvitac.registry import to_json
+from mvitac.system.files import digest, digest_file
+
+VERSION = 1
+"""Raised when the same tree would give another pack."""
+CHUNK = 256
+"""Frames of one recording that a packing process holds at a time (100 MB of pairs at 256 px)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchAndGoConfig(DatasetConfig):
+    """Touch and Go: a person touches things in the wild with a GelSight, filmed by a camera; 20 materials, hard/soft,
+    rough/smooth. Get the recordings from its homepage (touch-and-go.github.io) and the four list files from the owners'
+    repository; give the folder that holds dataset/ as root. A first pack of everything:
+
+    mvitac data pack --data touch-and-go --data.root DOWNLOAD --data.lists LISTS --out packs/tag
+    """
+
+    name: ClassVar[str] = "touch-and-go"
+
+    root: Path = Path("touch_and_go")
+    """The download: the folder with dataset/<recording>/ in it, or the one with the recordings themselves."""
+    lists: Path | None = None
+    """Folder with train.txt, test.txt, train_rough.txt and test_rough.txt; default: root, else root's label.txt serves
+    (then there is no rough/smooth and no official split)."""
+    split: Literal["by-recording", "official"] = "by-recording"
+    """by-recording: no recording on two sides, so a score is about places never seen. official: the owners' lists, as the
+    paper uses them; 100 of their 106 test recordings are also in train, and results will say so."""
+    modalities: Literal["both", "vision", "touch"] = "both"
+    """touch packs where only the GelSight videos were downloaded."""
+    frames: Literal["auto", "video", "jpeg"] = "auto"
+    """video: from the mp4 files. jpeg: from the extracted folders. auto: the mp4 where there is one."""
+    partial: bool = False
+    """Pack the recordings that are there and name the missing ones, instead of stopping."""
+    unlabelled: int = 0
+    """Also take every n-th frame that has no label (-1, or not listed) for pre-training, from recordings without test
+    or val frames; 0 = none. Most of these show an untouched gel."""
+    test_share: float = 0.25
+    """Share of the recordings that only score (by-recording)."""
+    val_share: float | None = None
+    """Share of the recordings, all taken from train, that choose; default .15 by-recording and 0 official, whose lists
+    have none (the probe then sets aside a fifth of train's recordings)."""
+    split_seed: int = 0
+    """Another number is another dealing of the recordings."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.unlabelled < 0:
+            raise ValueError(f"unlabelled {self.unlabelled}: give n for every n-th frame, or 0 for none")
+        if not 0 < self.test_share < 1:
+            raise ValueError(f"test_share {self.test_share}: give a share of the recordings in (0, 1)")
+        if not 0 <= self.val_part < 1:
+            raise ValueError(f"val_share {self.val_share}: give a share of the recordings in [0, 1)")
+        if self.split == "by-recording" and self.test_share + self.val_part >= 1:
+            raise ValueError(f"test_share {self.test_share} and val_share {self.val_part} leave nothing to train on")
+        if self.split_seed < 0:
+            raise ValueError(f"split_seed {self.split_seed}: give a number >= 0")
+
+    @property
+    def val_part(self) -> float:
+        """``val_share`` with its default resolved."""
+        return self.val_share if self.val_share is not None else 0.15 if self.split == "by-recording" else 0.0
+
+    def source(self) -> Source:
+        return TouchAndGo(self)
+
+
+class TouchAndGo(Source):
+    """One item is up to ``CHUNK`` wanted frames of one recording, in ascending order: one forward pass of each video."""
+
+    sizes_at = "recordings"
+
+    def __init__(self, config: TouchAndGoConfig) -> None:
+        folder = _lists_folder(config)
+        listed = read_lists(folder)
+        if config.split == "official" and listed[0].listed == "label":
+            raise ValueError(f"{folder} has no train.txt and test.txt, which the official split is: see {LISTS_AT}")
+        self._lists, self._num_listed = folder, len(listed)
+        names = sorted({frame.recording for frame in listed})
+        wanted = MODALITIES if config.modalities == "both" else (config.modalities,)
+        recordings, missing = find_recordings(config.root, names, wanted, config.frames)
+        if config.unlabelled:
+            others = sorted(on_disk(config.root).keys() - set(names))
+            recordings += find_recordings(config.root, others, wanted, config.frames)[0]
+        if not recordings or (missing and not config.partial):
+            hint = "" if config.modalities != "both" else "; modalities=touch needs only gelsight"
+            advice = f"fetch them from {HOMEPAGE}, or let partial pack what is there{hint}"
+            raise ValueError(f"{config.root}: {missing_report(missing, len(names))}; {advice}")
+        listed = [frame for frame in listed if frame.recording not in missing]
+        find_touches(listed)
+        if config.split == "official":
+            assign_official(listed, config.val_part, config.split_seed)
+        else:
+            assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
+        extra = _unlabelled(listed, recordings, config) if config.unlabelled else []
+        if config.unlabelled and not extra:
+            raise ValueError(
+                f"unlabelled {config.unlabelled} adds no frame: recordings with test or val frames give none, and"
+                f" split {config.split} leaves no other with frames to spare; leave it out"
+            )
+
+        self._config = config
+        self._missing, self._num_names = missing, len(names)
+        self._recordings = {recording.name: recording for recording in recordings}
+        by_name: dict[str, list[Frame]] = defaultdict(list)
+        for frame in [*listed, *extra]:
+            by_name[frame.recording].append(frame)
+        self._chunks: list[list[Frame]] = []
+        for name in sorted(by_name):
+            own = sorted(by_name[name], key=lambda frame: frame.number)
+            self._chunks += [own[i : i + CHUNK] for i in range(0, len(own), CHUNK)]
+        self._stamps = [
+            one_stamp(self._recordings[chunk[0].recording].stamps([frame.number for frame in chunk]))
+            for chunk in self._chunks
+        ]
+        notes = leaks(listed) if config.split == "official" else []
+        if missing:
+            notes.append(missing_report(missing, len(names)))
+        self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes))
+        self._fingerprint = {
+            "reader": f"touch-and-go {VERSION}",
+            "lists": {file.name: digest_file(file) for file in sorted(folder.glob("*.txt")) if file.name in LIST_FILES},
+            "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
+            "recordings": digest([recording.state() for recording in recordings]),
+            "missing": dict(sorted(missing.items())),
+        }
+
+    def spec(self) -> DataSpec:
+        return self._spec
+
+    def items(self) -> list[str]:
+        return [f"{c[0].recording} frames {c[0].number} to {c[-1].number}" for c in self._chunks]
+
+    def samples_per_item(self) -> list[int]:
+        return [len(chunk) for chunk in self._chunks]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return self._fingerprint
+
+    def stamps(self) -> list[int]:
+        return self._stamps
+
+    def expected(self) -> list[Count]:
+        """The lists against their published lengths; the recordings and frames they name against those that are there."""
+        counts = []
+        for name in NUM_ROWS:
+            if (self._lists / name).is_file():
+                rows = read_list(self._lists / name, len(CLASSES))
+                counts.append(Count(f"rows of {name}", NUM_ROWS[name], len(rows)))
+        absent = missing_report(self._missing, self._num_names) if self._missing else ""
+        counts.append(Count("listed recordings", self._num_names, self._num_names - len(self._missing), absent))
+        there, short = 0, []
+        by_name: dict[str, list[int]] = defaultdict(list)
+        for frame in (f for chunk in self._chunks for f in chunk if f.listed or f.listed_rough):
+            by_name[frame.recording].append(frame.number)
+        for name, numbers in by_name.items():
+            try:
+                end, why = self._recordings[name].num_frames(), ""
+            except (ValueError, OSError) as error:
+                end, why = 0, f" ({error})"
+            there += sum(number < end for number in numbers)
+            if numbers[-1] >= end:
+                short.append(f"{name} has {end} frames, listed up to {numbers[-1]}{why}")
+        rest = f"; and {len(short) - 8} more" if len(short) > 8 else ""
+        counts.append(Count("listed frames in their recordings", self._num_listed, there, "; ".join(short[:8]) + rest))
+        return counts
+
+    def read(self, item: int) -> list[Sample | Lost]:
+        chunk, lost = self._chunks[item], {}
+        recording = self._recordings[chunk[0].recording]
+        images = {
+            modality: read_frames(place, [frame.number for frame in chunk], self._config.size, lost)
+            for modality, place in recording.places.items()
+        }
+        samples: list[Sample | Lost] = []
+        for frame in chunk:
+            if frame.number in lost:
+                samples.append(Lost(f"{frame.recording}/{frame.number:010d}", lost[frame.number]))
+            else:
+                sizes = {modality: found[frame.number][0] for modality, found in images.items()}
+                own = {modality: found[frame.number][1] for modality, found in images.items()}
+                columns = _columns(frame, self._spec)
+                samples.append(Sample(vision=own.get("vision"), touch=own.get("touch"), columns=columns, sizes=sizes))
+        return samples
+
+
+def _lists_folder(config: TouchAndGoConfig) -> Path:
+    folder = config.lists or config.root
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder: give the one with the lists; get them from {LISTS_AT}")
+    return folder
+
+
+def _unlabelled(listed: Sequence[Frame], recordings: Sequence[Recording], config: TouchAndGoConfig) -> list[Frame]:
+    """Every n-th frame without a label of the recordings that neither choose nor score."""
+    scored = {f.recording for f in listed if {"val", "test"} & {f.split, f.split_rough if f.rough >= 0 else ""}}
+    known = defaultdict(dict)
+    for frame in listed:
+        known[frame.recording][frame.number] = frame
+    extra = []
+    for recording in recordings:
+        if recording.name in scored:
+            continue
+        own, start = known[recording.name], 0
+        for number in range(recording.num_frames()):
+            if number in own:
+                start = number + 1  # between two touches: a run of its own
+            elif number % config.unlabelled == 0:
+                extra.append(Frame(recording.name, number, touch=start))
+    return extra
+
+
+def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
+    columns = {
+        "id": f"{frame.recording}/{frame.number:010d}",
+        "group": frame.recording,
+        "touch_group": f"{frame.recording}/{frame.touch:010d}",
+        "split": frame.split,
+        "frame": frame.number,
+        "label_category": frame.category,
+        "label_soft": -1 if frame.category < 0 else int(frame.category in SOFT),
+    }
+    for task in spec.tasks[2:]:
+        columns |= {"label_rough": frame.rough, **({task.split: frame.split_rough} if task.split != "split" else {})}
+    return columns
+
+
+def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...]) -> DataSpec:
+    # The rough/smooth lists divide other recordings than the category lists do.
+    own = "split_rough" if config.split == "official" else "split"
+    tasks = [Task(name="category", classes=CLASSES), Task(name="soft", classes=("hard", "soft"))]
+    return DataSpec(
+        name=f"touch-and-go ({config.split})",
+        vision_channels=3 * (config.modalities != "touch"),
+        touch_channels=3 * (config.modalities != "vision"),
+        tasks=(*tasks, *([Task(name="rough", classes=("smooth", "rough"), split=own)] if rough else [])),
+        group_by="recording",
+        licence="CC BY 4.0 (says its homepage)",
+        source=f"Touch and Go, Yang et al., NeurIPS 2022, {HOMEPAGE}",
+        notes=notes,
+    )

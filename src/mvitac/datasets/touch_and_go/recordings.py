@@ -1,0 +1,134 @@
+"""Touch and Go's recordings as they lie on disk: which are there, what they lack, and single frames of them.
+
+Each modality of a recording is an mp4 file, or a folder of JPEGs named by frame number (see touch_and_go for the layout).
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mvitac.data.images import decode, shrink
+from mvitac.data.source import Stamp, stamp_of
+from mvitac.data.video import frame_shape, num_frames
+from mvitac.data.video import frames as video_frames
+
+HOMEPAGE = "https://touch-and-go.github.io"
+STEMS = {"vision": "video", "touch": "gelsight"}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Where a recording's images are: for each modality an mp4 file or a folder of JPEGs."""
+
+    name: str
+    places: dict[str, Path]
+
+    def num_frames(self) -> int:
+        """Frames that all modalities have."""
+        return min(num_frames(p) if p.suffix else _num_jpegs(p) for p in self.places.values())
+
+    def state(self) -> list[Any]:
+        """What is there of it, and how large its videos are."""
+        return [self.name, *([p.name, self._movies[p][0] if p.suffix else 0] for p in self.places.values())]
+
+    def stamps(self, numbers: Sequence[int]) -> Iterator[Stamp]:
+        """Of the files that hold the frames ``numbers``."""
+        for place in self.places.values():
+            if place.suffix:
+                yield self._movies[place]
+            else:
+                yield from (stamp_of(f"{place}/{number:010d}.jpg") for number in numbers)
+
+    @functools.cached_property
+    def _movies(self) -> dict[Path, Stamp]:
+        return {place: stamp_of(str(place)) for place in self.places.values() if place.suffix}
+
+
+def _num_jpegs(folder: Path) -> int:
+    numbers = (int(name[:10]) for name in os.listdir(folder) if re.fullmatch(r"\d{10}\.jpg", name))
+    return 1 + max(numbers, default=-1)
+
+
+def _base(root: Path) -> Path:
+    base = root / "dataset" if (root / "dataset").is_dir() else root
+    if not base.is_dir():
+        raise ValueError(
+            f"{base} is no folder: give the download (with dataset/ in it) as root; get it from {HOMEPAGE}"
+        )
+    return base
+
+
+def on_disk(root: Path) -> dict[str, str]:
+    """Recording -> its folder; some mirrors append the material, as in 20220319_002026_rock."""
+    names = sorted(entry.name for entry in os.scandir(_base(root)) if entry.is_dir())
+    return {name[:15]: name for name in names if re.fullmatch(r"\d{8}_\d{6}(_.*)?", name)}
+
+
+def find_recordings(
+    root: Path, names: Iterable[str], modalities: Sequence[str], frames: Literal["auto", "video", "jpeg"]
+) -> tuple[list[Recording], dict[str, str]]:
+    """The recordings among ``names`` that have all ``modalities``, and why each of the others cannot be used."""
+    base, folders = _base(root), on_disk(root)
+    found, missing = [], {}
+    for name in names:
+        folder = base / folders.get(name, name)
+        places, lacking = {}, []
+        for modality in modalities:
+            movie, images = folder / f"{STEMS[modality]}.mp4", folder / f"{STEMS[modality]}_frame"
+            if frames != "jpeg" and movie.is_file() and movie.stat().st_size:
+                places[modality] = movie
+            elif frames != "video" and images.is_dir():
+                places[modality] = images
+            else:
+                lacking.append({"auto": movie, "video": movie, "jpeg": images}[frames].name)
+        if lacking:
+            missing[name] = f"no {' and '.join(lacking)}" if folder.is_dir() else "no folder"
+        else:
+            found.append(Recording(name, places))
+    return found, missing
+
+
+def missing_report(missing: dict[str, str], num: int) -> str:
+    """'3 of 126 listed recordings cannot be packed: no folder (2): a, b; no video.mp4 (1): c'."""
+    by_reason: dict[str, list[str]] = defaultdict(list)
+    for name, why in missing.items():
+        by_reason[why].append(name)
+    parts = [
+        f"{why} ({len(names)}): {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}"
+        for why, names in sorted(by_reason.items())
+    ]
+    return f"{len(missing)} of {num} listed recordings cannot be packed: {'; '.join(parts)}"
+
+
+Shape = tuple[int, int]
+"""Height and width."""
+
+
+def read_frames(
+    place: Path, numbers: list[int], size: int, lost: dict[int, str]
+) -> dict[int, tuple[Shape, np.ndarray]]:
+    """By frame number the shape in which one modality lies there and its image [size, size, 3]; what cannot be had goes
+    to ``lost`` with its reason."""
+    if place.suffix:
+        why: dict[int, str] = {}
+        shape = frame_shape(place)
+        found = {number: (shape, image) for number, image in video_frames(place, numbers, size, lost=why)}
+        lost.update({number: f"{place.name}: frame {reason}" for number, reason in why.items()})
+        return found
+    found = {}
+    for number in numbers:
+        try:
+            image = decode(place / f"{number:010d}.jpg")
+            found[number] = (image.height, image.width), shrink(image, size)
+        except (ValueError, OSError) as error:
+            lost[number] = str(error)
+    return found

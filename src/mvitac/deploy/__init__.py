@@ -1,0 +1,1 @@
+"""Trained models in use: artifacts, exports, search, policies."""

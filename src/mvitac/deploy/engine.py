@@ -1,0 +1,163 @@
+"""Run an export where the robot is: numpy in, numpy out, one engine; no torch unless the engine is torch.
+
+    <export>/export.json          inputs, outputs, classes, preprocessing, digests, the report of how it was checked
+             model.onnx           or model.xml and model.bin (OpenVINO), or model.pt2 (torch.export)
+             check.safetensors    a few real inputs and what the trained model made of them
+
+``Engine(folder)`` verifies the digests and repeats those few inputs on this machine before the first prediction.
+Pickles in a torch export are refused; torch calls its format unsafe all the same, so open only those you trust.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+
+from mvitac.system.files import brief, digest, digest_file, read_json
+
+FORMAT, FORMAT_VERSION = "mvitac-export", 1
+MANIFEST, CHECK = "export.json", "check.safetensors"
+FILES = {"torch": ("model.pt2",), "onnx": ("model.onnx",), "openvino": ("model.xml", "model.bin")}
+TORCH_MEMBERS = re.compile(
+    r"data/weights/(weight_\d+|model_weights_config\.json)|data/constants/(tensor_\d+|model_constants_config\.json)"
+    r"|data/sample_inputs/model\.pt|models/model\.json|archive_format|archive_version|byteorder|\.data/\w+"
+)
+"""What torch.export writes of a model; compiled libraries and pickled objects, which it would run, are not among it."""
+Images = Mapping[str, np.ndarray]
+Call = Callable[[list[np.ndarray]], list[np.ndarray]]
+
+
+class Engine:
+    """An export, opened: call it with uint8 [B, S, S, C] by modality, get float32 [B, ...] by output name."""
+
+    def __init__(self, folder: str | Path, *, threads: int = 0) -> None:
+        """``threads``: CPU threads (0 = all cores). ValueError if anything differs from what was exported."""
+        folder = Path(folder)
+        self.meta = read_manifest(folder)
+        self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
+        self.classes: dict[str, list[str]] = self.meta["classes"]
+        self.difference: bool = self.meta["preprocessing"].get("difference", False)
+        """Whether touch is to be given as (touch - background) / 2 + 128."""
+        self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
+        check = safetensors.numpy.load_file(folder / CHECK)
+        found = self(**{m: check[f"input_{m}"] for m in self.inputs})
+        for name in (n for n in self.meta["outputs"] if n.startswith("embedding_")):
+            least = float(cosines(found[name], check[name]).min())
+            if not least >= self.meta["tolerance"]["min_cosine"]:
+                raise ValueError(
+                    f"{folder}: on this machine {name} has cosine {least:.4f} to what the trained model gave,"
+                    f" at least {self.meta['tolerance']['min_cosine']} is allowed: export it again with this engine"
+                )
+
+    def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+        """Outputs of one batch; ValueError names an input that is missing, unknown or of a foreign shape."""
+        if images.keys() != self.inputs.keys():
+            raise ValueError(f"this export takes {', '.join(self.inputs)}; got {', '.join(images) or 'nothing'}")
+        for name, shape in self.inputs.items():
+            value = images[name]
+            if value.dtype != np.uint8 or value.ndim != 4 or value.shape[1:] != shape:
+                raise ValueError(f"{name}: expected uint8 [B, {shape}], got {value.dtype} {value.shape}")
+        found = self._call([np.ascontiguousarray(images[m]) for m in self.inputs])
+        return dict(zip(self.meta["outputs"], found, strict=True))
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """export.json of ``folder`` after every file was checked against its digest."""
+    meta = read_json(folder / MANIFEST, "an export's description")
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        raise ValueError(f"{folder / MANIFEST} does not describe an export: give a folder `mvitac export` wrote")
+    if meta.get("format_version") != FORMAT_VERSION or meta.get("kind") not in FILES:
+        raise ValueError(f"{folder / MANIFEST} is of another version: export it again")
+    if meta.get("digest") != digest({key: value for key, value in meta.items() if key != "digest"}):
+        raise ValueError(f"{folder / MANIFEST} does not match its digest: it was changed or damaged, copy it again")
+    if set(meta["files"]) != {CHECK, *FILES[meta["kind"]]}:
+        raise ValueError(f"{folder / MANIFEST} names other files than {', '.join(FILES[meta['kind']])}: refused")
+    for name, expected in meta["files"].items():
+        if not (folder / name).is_file() or digest_file(folder / name) != expected:
+            raise ValueError(f"{folder / name} does not match its digest: it was changed or damaged, copy it again")
+    return meta
+
+
+def open_engine(folder: Path, kind: str, precision: str = "fp32", threads: int = 0) -> Call:
+    """The model file of ``folder`` as a function from input arrays to output arrays."""
+    threads = threads or os.cpu_count() or 1
+    path = folder / FILES[kind][0]
+    try:
+        return {"torch": _torch, "onnx": _onnx, "openvino": _openvino}[kind](path, precision, threads)
+    except ImportError as error:
+        raise ValueError(f"{path} needs {error.name}: pip install 'mvitac[export]'") from None
+    except Exception as error:  # each engine has its own kinds
+        raise ValueError(f"{path} cannot be opened ({brief(error)}): export it again") from None
+
+
+def _onnx(path: Path, precision: str, threads: int) -> Call:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    names = [i.name for i in session.get_inputs()]
+    return lambda arrays: session.run(None, dict(zip(names, arrays, strict=True)))  # type: ignore[return-value]
+
+
+def _openvino(path: Path, precision: str, threads: int) -> Call:
+    import openvino
+
+    config = {
+        "PERFORMANCE_HINT": "LATENCY",
+        "INFERENCE_NUM_THREADS": threads,
+        "INFERENCE_PRECISION_HINT": {"fp32": "f32", "bf16": "bf16"}[precision],
+    }
+    request = openvino.Core().compile_model(path, "CPU", config).create_infer_request()
+
+    def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        found = request.infer(arrays, share_inputs=True)
+        return [np.array(found[i]) for i in range(len(found))]  # the engine reuses its own buffers
+
+    return call
+
+
+def _torch(path: Path, precision: str, threads: int) -> Call:
+    import torch
+
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            if not TORCH_MEMBERS.fullmatch(name.partition("/")[2]):
+                raise ValueError(f"it holds {name!r}, which mvitac does not write and which may be a program: refused")
+    # Else torch falls back to unpickling whatever it finds.
+    forced = os.environ.get("TORCH_FORCE_WEIGHTS_ONLY_LOAD")
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
+    try:
+        module = torch.export.load(path).module()
+    finally:
+        del os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"]
+        if forced is not None:
+            os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = forced
+
+    def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            with torch.inference_mode():
+                return [
+                    x.numpy() for x in module(*(torch.tensor(a) for a in arrays))
+                ]  # a copy: memory-mapped images are read-only
+        finally:
+            torch.set_num_threads(before)
+
+    return call
+
+
+def cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cosine [B] of each row of ``a`` with the same row of ``b``, both [B, D]; 1 for two rows of zeros."""
+    product, norms = (a * b).sum(1), np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    zeros = (np.linalg.norm(a, axis=1) == 0) & (np.linalg.norm(b, axis=1) == 0)
+    return np.where(zeros, 1.0, product / np.maximum(norms, 1e-12))

@@ -1,0 +1,91 @@
+"""The whole road from pixels to probabilities as one module: uint8 in, resizing and normalisation inside.
+
+Shapes: B images, S stored side, C channels (3, or 6 for two sensors), D features, E shared space, K classes.
+Inputs: one uint8 [B, S, S, C] RGB per modality, as a pack stores them. Outputs, by ``ExportModule.outputs``:
+embedding_<modality> [B, D], shared_<modality> [B, E] (L2-normalised; absent without a shared space),
+probability_<task> [B, K].
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mvitac.model import Model
+from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
+
+
+class ExportModule(nn.Module):
+    """What is exported. Its arithmetic is written anew, so that comparing it with ``Model.features`` is a real check."""
+
+    filter: Tensor
+    head_filter: Tensor
+    scale: Tensor
+    shift: Tensor
+
+    def __init__(self, model: Model, modalities: tuple[str, ...] | None = None) -> None:
+        """``modalities``: the inputs it is to have; None = all the model has. ValueError where the model lacks one."""
+        super().__init__()
+        self.modalities = modalities or tuple(model.encoders)
+        for modality in self.modalities:
+            if modality not in model.encoders:
+                raise ValueError(f"this model has no {modality} encoder: it has {', '.join(model.encoders)}")
+        asked = "both" if len(self.modalities) == 2 else self.modalities[0]
+        self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.modalities})
+        self.projectors = nn.ModuleDict({m: p for m, p in model.projectors.items() if m in self.modalities})
+        self.readouts = nn.ModuleList([r for r in model.readouts.values() if r.question.modality == asked])
+        self.classes: dict[str, list[str]] = {r.question.task: list(r.question.classes) for r in self.readouts}  # type: ignore[union-attr]
+        self.inputs = {m: (model.stored, model.stored, model.spec.channels(m)) for m in self.modalities}
+        self.outputs = tuple(
+            [f"embedding_{m}" for m in self.modalities]
+            + [f"shared_{m}" for m in self.projectors]
+            + [f"probability_{task}" for task in self.classes]
+        )
+        sides = model.run.augment
+        self.twice = (
+            bool(self.projectors) and sides.size != sides.eval_size
+        )  # heads want views of the side they learned from
+        self.register_buffer("filter", _filter(sides.eval_size, model.stored))
+        self.register_buffer("head_filter", _filter(sides.size, model.stored) if self.twice else torch.empty(0))
+        mean, std = (torch.tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
+        self.register_buffer("scale", 1 / (255 * std))
+        self.register_buffer("shift", -mean / std)
+        self.eval()
+
+    def view(self, images: Tensor, filter: Tensor) -> Tensor:
+        """Normalised [B, C, size, size] of uint8 [B, S, S, C], by a ``filter`` [size, S]."""
+        x = images.permute(0, 3, 1, 2).float()
+        if filter.shape[0] != filter.shape[1]:
+            x = _along_width(_along_width(x, filter).transpose(2, 3), filter).transpose(2, 3)
+        sensors = [x[:, i : i + 3] * self.scale + self.shift for i in range(0, x.shape[1], 3)]
+        return torch.cat(sensors, dim=1) if len(sensors) > 1 else sensors[0]
+
+    def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
+        """The outputs, in the order of ``outputs``, of the images, in the order of ``modalities``."""
+        given = dict(zip(self.modalities, images, strict=True))
+        features = {m: self.encoders[m](self.view(x, self.filter)) for m, x in given.items()}
+        wanted = features
+        if self.twice:
+            wanted = {m: self.encoders[m](self.view(given[m], self.head_filter)) for m in self.projectors}
+        shared = [F.normalize(head(wanted[m]), dim=1) for m, head in self.projectors.items()]
+        joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
+        return (*features.values(), *shared, *(readout(joined) for readout in self.readouts))
+
+
+def _filter(size: int, stored: int) -> Tensor:
+    """[size, stored]: antialiased bilinear resizing is linear along each axis, so one matrix, read off the identity.
+
+    In the 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel comes out the same.
+    """
+    rows = F.interpolate(torch.eye(stored)[None, None], (size, stored), mode="bilinear", antialias=True)[0, 0]
+    step = 2.0 ** max(p for p in range(24) if (rows.max() * 2**p).round() < 2**15)
+    return (rows * step).round() / step
+
+
+def _along_width(x: Tensor, filter: Tensor) -> Tensor:
+    """[B, C, H, S] -> [B, C, H, size] in whole grey levels, rounded after each pass as torch's uint8 kernel does.
+
+    As a plain matrix product: OpenVINO 2026.4 cannot compile a batched one followed by a scale per channel.
+    """
+    return (x.flatten(0, 2) @ filter.T + 0.5).floor().unflatten(0, x.shape[:3])

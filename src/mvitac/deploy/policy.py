@@ -1,0 +1,114 @@
+"""Trained encoders as the observation encoder of a robot policy: a dict of images in, one feature vector out.
+
+    encoder = ObservationEncoder(mvitac.load("runs/demo/seed0"), {"observation.images.wrist": "vision",
+                                                                  "observation.images.gel": "touch"})
+    policy = nn.Sequential(encoder, nn.Linear(encoder.out_features, num_actions))
+
+Follows LeRobot's convention: images are [B, 3, H, W] (or [B, T, 3, H, W]), float in [0, 1] or uint8, RGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mvitac.model import Model
+from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
+
+STATE = "observation.state"
+
+
+class ObservationEncoder(nn.Module):
+    """Features [B, D] (or [B, T, D]) of an observation, in the order of ``keys``, with the robot's state at the end.
+
+    Touch is what the model learned from: where ``model.spec.difference``, (touch - background) / 2 + one half.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, model: Model, keys: Mapping[str, str], *, state: int = 0, tune: bool = False) -> None:
+        """``keys``: observation key -> modality. Two gels of one gripper are two keys of "touch", left first.
+
+        ``state``: length of "observation.state" to append; 0 = none. ``tune``: let the policy's loss train the encoders too
+        (BatchNorm keeps its statistics all the same); otherwise they are frozen. ValueError names what does not fit.
+        """
+        super().__init__()
+        self.keys: dict[str, list[str]] = {}
+        for key, modality in keys.items():
+            if modality not in model.encoders:
+                raise ValueError(f"{key}: this model has no {modality} encoder, it has {', '.join(model.encoders)}")
+            self.keys.setdefault(modality, []).append(key)
+        for modality, names in self.keys.items():
+            if 3 * len(names) != model.spec.channels(modality):
+                raise ValueError(
+                    f"the {modality} encoder takes {model.spec.channels(modality) // 3} image(s), {len(names)} given:"
+                    f" {', '.join(names)}"
+                )
+        self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.keys})
+        self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.eval_size, state, tune
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+        self._looked: set[str] = set()
+        self.encoders.requires_grad_(tune)
+        self.encoders.eval()
+        features = (int(e.num_features) for e in self.encoders.values())  # type: ignore[arg-type]
+        self.out_features = sum(features) + state
+
+    def train(self, mode: bool = True) -> ObservationEncoder:
+        """As for any module, but the encoders stay in eval mode: a policy's small batches would spoil their BatchNorm."""
+        super().train(mode)
+        self.encoders.eval()
+        return self
+
+    def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """ValueError names a key that is missing or has a foreign shape."""
+        found, lead = [], ()
+        for modality, names in self.keys.items():
+            views = []
+            for name in names:
+                image = self._get(observation, name)
+                if image.ndim not in (4, 5) or image.shape[-3] != 3:
+                    raise ValueError(
+                        f"{name}: expected images [B, 3, H, W] or [B, T, 3, H, W], got {tuple(image.shape)}"
+                    )
+                self._check_range(name, image)
+                lead = image.shape[:-3]
+                views.append(self._view(image.flatten(0, -4)))
+            with torch.set_grad_enabled(self.tune and torch.is_grad_enabled()):
+                found.append(self.encoders[modality](torch.cat(views, dim=1)).float())
+        features = torch.cat(found, dim=1).unflatten(0, lead)
+        if not self.state:
+            return features
+        state = self._get(observation, STATE)
+        if state.shape != (*lead, self.state):
+            raise ValueError(f"{STATE}: expected {(*lead, self.state)}, got {tuple(state.shape)}")
+        return torch.cat([features, state.float()], dim=-1)
+
+    def _get(self, observation: Mapping[str, Tensor], name: str) -> Tensor:
+        if name not in observation:
+            raise ValueError(f"the observation has no {name!r}: it has {', '.join(observation)}")
+        return observation[name]
+
+    def _check_range(self, name: str, image: Tensor) -> None:
+        """The first images of a key only: looking at all would make a GPU wait for each."""
+        if name in self._looked:
+            return
+        low, high = (float(x) for x in image.aminmax())
+        if image.dtype != torch.uint8 and not (low >= -1e-3 and high <= 1 + 1e-3):
+            raise ValueError(
+                f"{name}: expected floats in [0, 1] or uint8, got {image.dtype} from {low:.3g} to {high:.3g}: the encoder"
+                " normalises images itself, give them as they come from the camera"
+            )
+        self._looked.add(name)
+
+    def _view(self, image: Tensor) -> Tensor:
+        """Normalised [N, 3, size, size], resized in the two steps that training took."""
+        x = image.float() / 255 if image.dtype == torch.uint8 else image.float()
+        for side in (self.stored, self.size):
+            if x.shape[-2:] != (side, side):
+                x = F.interpolate(x, (side, side), mode="bilinear", antialias=True)
+        return (x - self.mean) / self.std

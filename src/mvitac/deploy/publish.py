@@ -1,0 +1,194 @@
+"""Runs -> artifacts: fit the probes on a finished run's data, describe everything, write one folder, push it to the Hub."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+
+from mvitac.data.pack import Pack
+from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
+from mvitac.evaluation.classifiers import fit_linear, spread_out
+from mvitac.evaluation.features import features
+from mvitac.evaluation.probe import parts
+from mvitac.evaluation.scores import score
+from mvitac.model import Model, load
+from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
+from mvitac.registry import to_json
+from mvitac.run import load_run
+from mvitac.system.files import brief, check_place, digest_file, write_atomic, write_json
+
+
+def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
+    """The linear probe of every task and modality of ``pack``, fitted and scored exactly as ``mvitac probe`` does.
+
+    Tasks without labelled rows in train and test have none: what cannot be scored is not published.
+    """
+    readouts = {}
+    modalities = [m for m in pack.spec.modalities if m in model.encoders]
+    for task in pack.spec.tasks:
+        labels = pack.column(f"label_{task.name}").astype(int)
+        for modality in [*modalities, *(["both"] if len(modalities) == 2 else [])]:
+            try:
+                rows = parts(pack, task, modality)
+            except ValueError:
+                continue
+            names = modalities if modality == "both" else [modality]
+            everything = np.concatenate([rows.train, rows.val, rows.test])
+            groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
+            seen = labels[np.concatenate([rows.train, rows.val])]
+            common = int(np.bincount(seen).argmax())
+            x = np.concatenate([features(model, pack, m, everything) for m in names], axis=1)
+            learn, choose, test = np.split(x, np.cumsum([len(rows.train), len(rows.val)]))
+            given: dict[str, Any] = {"task": task.name, "modality": modality, "classes": task.classes}
+            given |= {"majority": float((labels[rows.test] == common).mean()), "num_test": len(rows.test)}
+            if len(set(labels[rows.train])) < 2:
+                label = int(labels[rows.train][0])
+                accuracy = float((labels[rows.test] == label).mean())
+                readout = constant(ProbeInfo(**given, accuracy=accuracy), label, x.shape[1])
+            else:
+                fitted, _ = fit_linear(learn, labels[rows.train], choose, labels[rows.val])
+                guess = spread_out(fitted(test), np.unique(seen), len(task.classes))
+                accuracy = score(labels[rows.test], guess, groups, len(task.classes))["accuracy"]
+                question = ProbeInfo(**given, accuracy=accuracy)
+                readout = from_logistic(question, fitted.model, fitted.mean, fitted.std)
+            readouts[readout.question.name] = readout
+    return readouts
+
+
+def own_data(model: Model, instead: str) -> Pack:
+    """The data ``model`` was trained on; ValueError says what to do ``instead`` where it is not at hand."""
+    try:
+        return model.run.data.open()
+    except ValueError as error:
+        raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None
+
+
+def with_readouts(model: Model, pack: Pack | None = None) -> Model:
+    """``model`` with probes: an artifact's own, else fitted on ``pack`` or, without one, on the run's own data."""
+    if not model.readouts:
+        model.readouts = fit_readouts(model, pack or model.run.data.open())
+    return model
+
+
+def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
+    """Write the artifact of the finished ``run`` into the new folder ``out`` and return it.
+
+    ``pack`` fits the probes on other data than the run was trained on. The result was loaded once before it is shown.
+    """
+    if out.exists():
+        raise ValueError(f"{out} already exists: choose another place, or delete it first")
+    check_place(out)
+    model = load(run)
+    _, record = load_run(run)
+    pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
+    model = with_readouts(model, pack)
+    partial = out.with_name(out.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        model.save(partial / "model.safetensors")
+        write_json(partial / "run.json", record)
+        if model.readouts:
+            tensors = {f"{r.question.name}.{k}": v for r in model.readouts.values() for k, v in r.state_dict().items()}
+            data = safetensors.torch.save(tensors)
+            write_atomic(partial / "probes.safetensors", lambda file: file.write(data))
+        sensors = sorted(set(pack.column("sensor").astype(str))) if "sensor" in pack.table.column_names else []
+        manifest: dict[str, Any] = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "preprocessing": preprocessing(model, tuple(sensors)),
+            "probes": [to_json(r.question) for r in model.readouts.values()],
+            "data": {
+                "name": pack.spec.name,
+                "licence": pack.spec.licence,
+                "source": pack.spec.source,
+                "digest": pack.digest,
+            },
+            "trained_on": {key: getattr(model.spec, key) for key in ("name", "licence", "source")},
+        }
+        write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
+        manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
+        write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})
+        read(partial)
+        os.rename(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return out
+
+
+def card(model: Model, manifest: dict[str, Any]) -> str:
+    """The model card (Markdown with the Hub's front matter)."""
+    data, given, learned = manifest["data"], manifest["preprocessing"], manifest["trained_on"]
+    run = model.run
+    sets = {"Encoders and probes": learned}
+    if learned != {key: data[key] for key in learned}:
+        sets = {"Encoders": learned, "Probes": data}
+    licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
+    lines = [
+        "---",
+        "library_name: mvitac",
+        "tags: [tactile, robotics, self-supervised, visual-tactile]",
+        "license: other",
+        f"license_name: {json.dumps('weights: as their owner says; trained on data under: ' + licences)}",
+        "---",
+        "",
+        f"# {run.method.name} on {learned['name']}",
+        "",
+        f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}),"
+        f" {'trained with labels' if model.tasks else 'pre-trained without labels'} by"
+        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes on {data['name']}.",
+        "",
+        "```python",
+        "import mvitac",
+        'model = mvitac.load("this folder, or owner/name on the Hub")   # never unpickles, checks every digest',
+        f"probabilities = model.predict({', '.join(f'{m}={m}_image' for m in model.encoders)})   # uint8 RGB, any size",
+        "```",
+        "",
+        "## Scores",
+        "",
+        "Accuracy on rows of groups that neither encoders nor probes saw, beside always saying the commonest class.",
+        "",
+        "| task | from | accuracy % | majority % | test rows |",
+        "|---|---|---:|---:|---:|",
+    ]
+    for readout in model.readouts.values():
+        q = readout.question
+        lines.append(f"| {q.task} | {q.modality} | {100 * q.accuracy:.1f} | {100 * q.majority:.1f} | {q.num_test} |")
+    lines += ["", "## Classes", ""]
+    lines += [f"- {task}: {', '.join(names)}" for task, names in model.classes.items()]
+    lines += [
+        "",
+        "## Preprocessing",
+        "",
+        f"{given['input']}. {given['resize']}: stored {given['stored']} px, size {given['size']} px."
+        f" Then (x / 255 - {given['mean']}) / {given['std']}. Background: {given['background']}.",
+        f"Sensors seen: {', '.join(given['sensors']) or 'not recorded'}."
+        " Another sensor, lamp or gel needs its own check before these predictions mean anything.",
+        "",
+        "## Data",
+        "",
+        *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
+        "The whole configuration, library versions and commit are in run.json.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def push(artifact: Path, repo: str, *, private: bool = False) -> str:
+    """Upload a checked ``artifact`` to the Hugging Face Hub as ``repo`` ("owner/name") and return its address."""
+    if not HUB_ID.fullmatch(repo) or "@" in repo:
+        raise ValueError(f"{repo!r} is no name on the Hub: give owner/name")
+    model = read(artifact)
+    try:
+        address = model.push_to_hub(repo, private=private, commit_message=f"{model.run.method.name} by mvitac publish")
+    except Exception as error:  # offline, no login, no right to write: the client has a kind for each
+        raise ValueError(
+            f"{repo} could not be written on the Hugging Face Hub ({brief(error)}): check the network and the login"
+            f" (`hf auth login`); the artifact itself is whole, in {artifact}"
+        ) from None
+    return str(address)

@@ -1,0 +1,245 @@
+"""Find the nearest known touches and pictures: exact cosine over any number of rows, in memory that does not grow with it.
+
+    <index>/index.json          format, space, digests
+            model.safetensors   what embeds a query
+            rows.parquet        id, group, split, labels and pack row of each indexed pair
+            vision.npy          float32 [N, E], unit length, memory-mapped
+            touch.npy
+
+Shapes: N rows, Q queries, E dimensions.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+
+from mvitac.data.pack import Pack, has_difference
+from mvitac.model import Images, Model, load
+from mvitac.registry import unknown
+from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
+from mvitac.system.locks import hold_lock
+
+
+def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str, np.ndarray]], list[str]]:
+    """``Live``'s ``nearest`` from a ``search.Index``: "id (label, ...)" of the k nearest known touches.
+
+    By touch, or by vision where the engine's ``inputs`` have no touch. ValueError if the index does not hold it.
+    """
+
+    modality = "touch" if "touch" in inputs else "vision"
+    if modality not in index.banks:
+        raise ValueError(f"{index.folder} holds no {modality} to compare with: index a pack that has it")
+    key = f"shared_{modality}" if index.meta["space"] == "shared" else f"embedding_{modality}"
+
+    def find(outputs: dict[str, np.ndarray]) -> list[str]:
+        query = outputs[key] / np.maximum(np.linalg.norm(outputs[key], axis=1, keepdims=True), 1e-12)
+        rows, _ = nearest(index.banks[modality], query, k)
+        return [f"{index.table.column('id')[r]} ({', '.join(index.labels(r).values())})" for r in rows[0].tolist()]
+
+    return find
+
+
+FORMAT, FORMAT_VERSION = "mvitac-index", 1
+BLOCK = 1 << 16
+"""Rows compared at once: 128 MB of float32 at E = 512, and the largest part of a search's own memory."""
+
+
+def nearest(bank: np.ndarray, queries: np.ndarray, k: int, *, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
+    """Row numbers and cosines [Q, k] (best first) of the rows of ``bank`` [N, E] nearest to ``queries`` [Q, E].
+
+    Exact. Both must have unit length. Equal cosines come in row order. ``bank`` may be memory-mapped.
+    """
+    if queries.ndim != 2 or queries.shape[1] != bank.shape[1]:
+        raise ValueError(f"queries are {queries.shape}, the index holds {bank.shape[1]} dimensions: embed them alike")
+    if not k >= 1:
+        raise ValueError(f"k {k}: give at least 1")
+    k = min(k, len(bank))
+    queries = np.ascontiguousarray(queries, np.float32)
+    rows = np.empty((len(queries), 0), np.int64)
+    scores = np.empty((len(queries), 0), np.float32)
+    for start in range(0, len(bank), block):
+        found = queries @ bank[start : start + block].T
+        if rows.shape[1] == k and not (found.max(1) > scores[:, -1]).any():
+            continue  # nothing here is better than what every query has
+        if found.shape[1] > k:
+            best = np.argpartition(-found, k - 1, axis=1)[:, :k]
+            # A tie across the edge of the k best is cut anywhere by argpartition: take the earliest rows instead.
+            edge = np.take_along_axis(found, best, 1).min(1, keepdims=True)
+            for q in np.flatnonzero((found >= edge).sum(1) > k):
+                best[q] = np.argsort(-found[q], kind="stable")[:k]
+        else:
+            best = np.broadcast_to(np.arange(found.shape[1]), found.shape)
+        rows = np.concatenate([rows, best + start], axis=1)
+        scores = np.concatenate([scores, np.take_along_axis(found, best, 1)], axis=1)
+        order = np.lexsort((rows, -scores))[:, :k]
+        rows, scores = np.take_along_axis(rows, order, 1), np.take_along_axis(scores, order, 1)
+    return rows, scores
+
+
+def embeddings(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, shared: bool) -> Iterator[np.ndarray]:
+    """Embeddings of pack rows in chunks of at most 256: features, or the unit vectors of the shared space."""
+    device = next(model.parameters()).device
+    for chunk in np.array_split(rows, max(1, -(-len(rows) // 256))):
+        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
+        x = model.features(modality, images, for_heads=shared)
+        yield (model.project(modality, x) if shared else x).cpu().numpy()
+
+
+def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
+    """The modalities that model and pack share; ValueError if there are none, or the pack's images do not fit."""
+    names = tuple(m for m in pack.spec.modalities if m in model.encoders)
+    for modality in names:
+        if pack.spec.channels(modality) != model.spec.channels(modality):
+            raise ValueError(
+                f"{pack.path} has {pack.spec.channels(modality)} channels of {modality}, the model was trained with"
+                f" {model.spec.channels(modality)}: pack the data alike"
+            )
+    if "touch" in names and model.spec.difference and not has_difference(pack):
+        raise ValueError(
+            f"{pack.path} has touch as the sensor gives it, the model was trained on difference images: pack the data"
+            " with --difference"
+        )
+    if not names:
+        raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
+    return names
+
+
+def describe(pack: Pack, rows: np.ndarray) -> pa.Table:
+    """id, group, split and labels of pack rows, as a table; column ``row`` is the pack's row number."""
+    names = ["id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)]
+    return pack.table.select(names).take(rows).append_column("row", pa.array(rows, pa.int64()))
+
+
+def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> Index:
+    """Index the whole pairs of ``pack`` (of ``splits``; none = all) into the new folder ``out``.
+
+    In the space both modalities share if the model has one (touch finds vision and vision finds touch), else by features
+    (each finds only its own kind). Busy if another process builds there.
+    """
+    check_place(out)
+    busy = f"{out} is being written by another process: let it end, or choose another --out"
+    with hold_lock(out, busy, wait=False):
+        return _build(model, pack, out, splits)
+
+
+def _build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...]) -> Index:
+    if out.exists():
+        raise ValueError(f"{out} already exists: choose another --out, or delete it first")
+    modalities = check_pack(model, pack)
+    rows = pack.rows(*(splits or np.unique(pack.column("split"))), having=modalities)
+    if not len(rows):
+        raise ValueError(f"{pack.path} has no whole pairs{' in ' * bool(splits)}{', '.join(splits)}: nothing to index")
+    shared = all(m in model.projectors for m in modalities)
+    partial = out.with_name(out.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        for modality in modalities:
+            at = 0
+            bank: np.ndarray | None = None
+            for x in embeddings(model, pack, modality, rows, shared=shared):
+                x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+                if bank is None:
+                    path = partial / f"{modality}.npy"
+                    bank = np.lib.format.open_memmap(path, "w+", np.float32, (len(rows), x.shape[1]))
+                bank[at : at + len(x)] = x
+                at += len(x)
+            assert bank is not None and at == len(rows)
+            bank.flush()  # type: ignore[attr-defined]
+            del bank
+        model.save(partial / "model.safetensors")
+        pq.write_table(describe(pack, rows), partial / "rows.parquet")
+        names = sorted(p.name for p in partial.iterdir())
+        meta = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "num": len(rows),
+            "space": "shared" if shared else "features",
+            "pack": str(pack.path.absolute()),
+            "pack_digest": pack.digest,
+            "weights": model.weights_digest(),
+            "classes": {task.name: list(task.classes) for task in pack.spec.tasks},
+            "files": {name: digest_file(partial / name) for name in names},
+        }
+        write_json(partial / "index.json", {**meta, "digest": digest(meta)})
+        os.rename(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Index(out, verify=False)
+
+
+class Index:
+    """An opened index: ``table`` describes the rows, ``banks[modality]`` are their unit vectors, memory-mapped."""
+
+    def __init__(self, folder: str | Path, *, verify: bool = True) -> None:
+        """ValueError says what is wrong; ``verify`` recomputes the digests (about 1 s per GB)."""
+        self.folder = folder = Path(folder)
+        meta = read_json(folder / "index.json", "an index's description")
+        if not isinstance(meta, dict) or meta.get("format") != FORMAT or meta.get("format_version") != FORMAT_VERSION:
+            raise ValueError(f"{folder / 'index.json'} does not describe an index: make one with `mvitac index`")
+        if meta.get("digest") != digest({key: value for key, value in meta.items() if key != "digest"}):
+            raise ValueError(f"{folder / 'index.json'} does not match its digest: it was changed, make it again")
+        allowed = {"model.safetensors", "rows.parquet", "vision.npy", "touch.npy"}
+        if not {"model.safetensors", "rows.parquet"} <= set(meta["files"]) <= allowed:
+            raise ValueError(f"{folder / 'index.json'} names other files than {', '.join(sorted(allowed))}: refused")
+        for name, expected in meta["files"].items():
+            if not (folder / name).is_file() or (verify and digest_file(folder / name) != expected):
+                raise ValueError(f"{folder / name} is missing or does not match its digest: make the index again")
+        self.meta: dict[str, Any] = meta
+        self.table: pa.Table = pq.read_table(folder / "rows.parquet")
+        self.banks: dict[str, np.ndarray] = {}
+        for modality in ("vision", "touch"):
+            if f"{modality}.npy" in meta["files"]:
+                bank = np.load(folder / f"{modality}.npy", mmap_mode="r", allow_pickle=False)
+                if bank.ndim != 2 or bank.dtype != np.float32 or len(bank) != self.table.num_rows:
+                    raise ValueError(f"{folder}: {modality}.npy does not fit its table: make the index again")
+                self.banks[modality] = bank
+
+    def model(self) -> Model:
+        """The model that embedded the rows, to embed queries."""
+        return load(self.folder / "model.safetensors")
+
+    def find(
+        self,
+        model: Model,
+        images: Images,
+        source: str,
+        target: str,
+        k: int = 5,
+        *,
+        background: Images | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and cosines [Q, k] of the ``target`` images nearest to ``images`` of modality ``source``.
+
+        ``background`` as for ``Model.embed``: what the touch sensor shows without contact.
+        """
+        for name in (source, target):
+            if name not in self.banks:
+                raise unknown("modality", name, self.banks)
+        shared = self.meta["space"] == "shared"
+        if source != target and not shared:
+            raise ValueError(
+                f"{self.folder} has no space that vision and touch share (its method trains none):"
+                f" search {source} -> {source}"
+            )
+        x = model.embed(**{source: images}, background=background, shared=shared)[source]
+        x = torch.nn.functional.normalize(x, dim=1).cpu().numpy()
+        return nearest(self.banks[target], x, k)
+
+    def labels(self, row: int) -> dict[str, str]:
+        """Class names of one row by task, where it has a label."""
+        found = {}
+        for task, classes in self.meta["classes"].items():
+            label = self.table.column(f"label_{task}")[row].as_py()
+            if label >= 0:
+                found[task] = classes[label]
+        return found

@@ -1,0 +1,176 @@
+"""A probing session: finished runs and their controls probed together, in one result that tables and reports read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import Task
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.controls import controls_of, start_weights
+from mvitac.evaluation.probe import PROBES, Probe, cross_modal, parts, probe_model
+from mvitac.evaluation.scores import summarise
+from mvitac.model import Model, load
+from mvitac.nn.encoders import build_trunk
+from mvitac.registry import to_json, unknown
+from mvitac.run import load_run
+from mvitac.system.files import check_place, digest, write_json
+from mvitac.system.processes import in_threads
+
+END_TO_END = ", end to end"
+"""Added to a source's name where its own classifiers are scored, which it trained along with its encoders."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbeConfig:
+    """What to probe, and which controls to put beside it."""
+
+    probes: tuple[Probe, ...] = ("linear",)
+    """linear: logistic regression, C chosen on held-out groups of train; paper: the paper's Adam probe; knn: 20 nearest."""
+    tasks: tuple[str, ...] = ()
+    """Tasks to probe; none given = all."""
+    modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
+    """none given = all the data has."""
+    controls: bool = True
+    """Also score majority, untrained trunk, pixels, border, and the dataset's own controls."""
+    imagenet: Path | None = None
+    """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
+
+    def __post_init__(self) -> None:
+        for name, values in (("probe", self.probes), ("task", self.tasks), ("modality", self.modalities)):
+            for value in values:
+                if values.count(value) > 1:
+                    raise ValueError(f"{name} {value!r} is given twice: give it once")
+        if self.imagenet and not self.imagenet.is_file():
+            raise ValueError(f"imagenet {self.imagenet}: give a file that exists")
+
+
+def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None) -> dict[str, Any]:
+    """Probe finished runs (seeds of one method, or several methods, on one dataset) and their controls.
+
+    Returns {"data", "pack", "records": [...], "retrieval": [...], "summary": {...}}, and leaves each run's own part in
+    its probe.json. ``pack`` probes on other data than the run was trained on.
+    """
+    if not paths:
+        raise ValueError("give at least one run's folder")
+    for path in paths:
+        if path.is_file():
+            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
+        if [p.resolve() for p in paths].count(path.resolve()) > 1:
+            raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
+    models = [load(path) for path in paths]
+    names = names_of(paths, models)
+    packs = [pack or model.run.data.open() for model in models]
+    if len({p.digest for p in packs}) > 1:
+        raise ValueError(
+            "these runs were trained on different data: probe them apart, or give one pack for all with --on"
+        )
+    pack = packs[0]
+    tasks, modalities = chosen(pack, session)
+    for path, model in zip(paths, models, strict=True):
+        check_place(path / "probe.json")
+        for modality in pack.spec.modalities:
+            if model.spec.channels(modality) != pack.spec.channels(modality):
+                raise ValueError(
+                    f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
+                    f" it was trained on {model.spec.name!r}"
+                )
+    for task in tasks:
+        for modality in modalities:
+            parts(pack, task, modality)
+    if session.controls:  # fetched now, so that one that cannot be had is not found out at the end
+        for weights in start_weights([m.run for m in models], session.imagenet):
+            build_trunk(replace(models[0].run.encoder, weights=weights), 3)
+    records: list[dict[str, Any]] = []
+    retrieval: list[dict[str, Any]] = []
+
+    def one(path: Path, model: Model, source: str) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        own = {"source": source, "seed": model.run.seed, "run": str(path)}
+        mine = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
+        for record in mine:
+            record["source"] += END_TO_END if record["probe"] == "own" else ""
+        found = [{**own, **r} for r in cross_modal(model, pack)]
+        write_json(
+            path / "probe.json", {"data": pack.spec.name, "pack": pack.digest, "records": mine, "retrieval": found}
+        )
+        return mine, found
+
+    for mine, found in in_threads(lambda each: one(*each), list(zip(paths, models, names, strict=True))):
+        records += mine
+        retrieval += found
+    if session.controls:
+        runs, specs = [m.run for m in models], [m.spec for m in models]
+        controls, found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
+        records += controls
+        retrieval += found
+    return {
+        "data": pack.spec.name,
+        "pack": pack.digest,
+        "group_by": pack.spec.group_by,
+        "notes": list(pack.spec.notes),
+        "classes": {task.name: list(task.classes) for task in tasks},
+        "records": records,
+        "retrieval": retrieval,
+        "summary": summarise(records, session.probes[0]),
+    }
+
+
+def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
+    """What each run is called: its method, and its recipe where these differ, and its folder where runs of one such name
+    differ in more than their seed. ValueError if two differ in nothing: they would count as two seeds."""
+    several = len({model.run.recipe for model in models}) > 1
+    names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]
+    alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> settings -> seed -> folder
+    for name, path, model in zip(names, paths, models, strict=True):
+        seeds = alike.setdefault(name, {}).setdefault(_settings(path, model), {})
+        if model.run.seed in seeds:
+            raise ValueError(
+                f"{seeds[model.run.seed]} and {path} are the same run (equal settings, seed {model.run.seed}):"
+                " they would count as two seeds, give one of them"
+            )
+        seeds[model.run.seed] = path
+    where: dict[Path, str] = {}
+    for kinds in alike.values():
+        folders = [list(seeds.values()) for seeds in kinds.values()]
+        for group, place in zip(folders, _places(folders), strict=True):
+            where |= dict.fromkeys(group, f" ({place})" if len(folders) > 1 else "")
+    return [name + where[path] for name, path in zip(names, paths, strict=True)]
+
+
+def _settings(path: Path, model: Model) -> str:
+    """Whose seeds belong together: all settings but the seed, and the data by its content, wherever it lies."""
+    record = load_run(path)[1] if (path / "run.json").exists() else {}
+    data = record.get("pack") or to_json(model.run.data)
+    return digest([replace(model.run, seed=0, data=PackConfig()).digest(), data])
+
+
+def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
+    """A name for each of these groups of folders: the folder it shares, or its own; the least of the path that tells them
+    apart."""
+    whole = [[path.resolve() for path in group] for group in groups]
+    shared = [Path(os.path.commonpath(group)) for group in whole]
+    listed = [[place] for place in shared] if len(set(shared)) == len(groups) else whole
+    every = [place for group in listed for place in group]
+    num = next(n for n in range(1, 1000) if len({place.parts[-n:] for place in every}) == len(every))
+    return [", ".join("/".join(place.parts[-num:]) for place in group) for group in listed]
+
+
+def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[Task], list[str]]:
+    """The tasks and modalities of ``session`` on this data; ValueError names what it lacks."""
+    known = {task.name: task for task in pack.spec.tasks}
+    if not known:
+        raise ValueError(f"dataset {pack.spec.name!r} has no labels: nothing to probe")
+    for name in session.tasks:
+        if name not in known:
+            raise unknown("task", name, known)
+    have = [*pack.spec.modalities, *(["both"] if len(pack.spec.modalities) == 2 else [])]
+    for modality in session.modalities:
+        if modality not in have:
+            raise unknown("modality", modality, have)
+    if not session.probes:
+        raise ValueError(f"no probes asked for: choose from {', '.join(PROBES)}")
+    return [known[name] for name in session.tasks or known], list(session.modalities or have)

@@ -1,0 +1,53 @@
+"""Features of a pack's rows by a frozen model, computed once: kept in the cache by weights, data and rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvitac.data.pack import Pack
+from mvitac.model import Model
+from mvitac.system.files import cache_dir, digest, write_atomic
+from mvitac.system.malloc import keep_freed_memory
+
+
+def pack_features(
+    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, precision: str = "fp32"
+) -> Tensor:
+    """Features [len(rows), D] of pack rows, as ``Model.features``, in chunks on the model's device; back on the CPU."""
+    device = next(model.parameters()).device
+    if device.type == "cpu":
+        keep_freed_memory()  # else every activation is mapped anew: twice the time and more on a virtual machine
+    chunks = []
+    for chunk in np.array_split(rows, max(1, len(rows) // 256)):
+        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
+        chunks.append(model.features(modality, images, for_heads=for_heads, precision=precision).cpu())
+    return torch.cat(chunks)
+
+
+def sample(rows: np.ndarray, num: int) -> np.ndarray:
+    """At most ``num`` of ``rows``, in their order, the same ones at every call.
+
+    By chance: packs take their classes in turn, and every n-th row would be of the same few.
+    """
+    return np.sort(np.random.default_rng(0).choice(rows, min(num, len(rows)), replace=False))
+
+
+def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:
+    """Features [len(rows), D] float32, computed once and cached by weights, data, rows and side (``Model.features``)."""
+    device = next(model.parameters()).device
+    sides = model.run.augment
+    side = (
+        [sides.size] if for_heads and sides.size != sides.eval_size else []
+    )  # the usual one is in the weights' digest
+    key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type, *side])
+    path = cache_dir() / "features" / f"{key[:32]}.npy"
+    if path.exists():
+        try:
+            return np.load(path, allow_pickle=False)
+        except (ValueError, EOFError, OSError):
+            path.unlink()  # damaged: compute it again
+    values = pack_features(model, pack, modality, rows, for_heads=for_heads).numpy()
+    write_atomic(path, lambda file: np.save(file, values))
+    return values

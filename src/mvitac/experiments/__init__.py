@@ -1,0 +1,1 @@
+"""Comparisons of many runs, and the demo."""

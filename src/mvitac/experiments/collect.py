@@ -1,0 +1,227 @@
+"""``mvitac compare``: a plan -> runs -> one result. What is finished is skipped, what was cut is resumed.
+
+    <out>/plan.json                      what was asked for
+          runs/<row>/seed<k>/            a run like any other, with scores.json in place of its checkpoint
+          controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet where asked
+          result.json  table.*           the tables (``paper_tables``)
+
+A run whose loss stops being a number is a result too: it is kept as failed.json and told in the table.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import Task
+from mvitac.evaluation.controls import controls_of
+from mvitac.evaluation.evaluate import ProbeConfig, chosen
+from mvitac.experiments.jobs import Job, Work, seconds_of
+from mvitac.experiments.plan import Plan, Row, slug
+from mvitac.nn.encoders import SCRATCH
+from mvitac.registry import to_json
+from mvitac.run import Run
+from mvitac.system.device import describe, pick_device
+from mvitac.system.files import digest, read_json, write_json
+from mvitac.system.provenance import provenance
+from mvitac.training.loop import check_same
+from mvitac.training.sampler import training_rows
+from mvitac.training.views import gel_mirror
+
+
+def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str = "auto") -> Work:
+    """The jobs of ``plan`` on the data of its rows, seeds outermost; ValueError if not one row is possible, or if ``out``
+    holds other runs.
+
+    Rows that need what the data lacks (labels, a camera) and rows that are the same run as an earlier one are left out. A
+    row may read the same samples in another way (difference images of touch), not other samples.
+    """
+    assert plan.data is not None
+    chosen(pack, session)
+    session = replace(session, controls=False)
+    possible: list[tuple[Row, Pack]] = []
+    left_out: dict[str, str] = {}
+    seen: dict[str, str] = {}
+    for row in plan.rows:
+        if row.label in pack.spec.controls:
+            raise ValueError(f"row {row.label!r} has the name of a control of this data: give it another label")
+        if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
+            left_out[row.label] = f"dataset {plan.data.name!r} has no {', '.join(missing)}"
+            continue
+        run = plan.run(row, plan.data, 0)
+        try:
+            own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
+            run.check(own.spec, len(training_rows(run, own)), own.size)
+            gel_mirror(run, own, torch.device("cpu"))
+            run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+        except ValueError as error:
+            left_out[row.label] = str(error)
+            continue
+        if (key := run.without_idle(own.spec).digest()) in seen:
+            left_out[row.label] = f"the same run as {seen[key]!r} under recipe {plan.recipe!r}"
+            continue
+        seen[key] = row.label
+        possible.append((row, own))
+    if not possible:
+        raise ValueError(f"plan {plan.name!r} has no row that this data allows: {next(iter(left_out.values()))}")
+    jobs = [
+        Job(row.label, replace(plan.run(row, plan.data, seed), device=device), place, session, plan.stress)
+        for seed in range(plan.seeds)
+        for row, _ in possible
+        for place in (out / "runs" / slug(row.label) / f"seed{seed}",)
+    ]
+    packs = {row.label: own for row, own in possible}
+    for job in jobs:
+        if (job.out / "run.json").exists():
+            check_same(job.run, packs[job.label], job.out)
+    return Work(plan, pack, jobs, left_out)
+
+
+def _same_samples(own: Pack, pack: Pack) -> Pack:
+    """``own``, if it holds the samples of ``pack`` on the same sides, with the same labels."""
+    for name in ("id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)):
+        if name not in own.table.column_names or not np.array_equal(own.column(name), pack.column(name)):
+            raise ValueError(
+                f"its data {own.path} has another column {name} than {pack.path}: compare the same samples"
+            )
+    return own
+
+
+def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
+    """Everything the tables are made of, from the finished runs; ValueError if there is none."""
+    finished = [job for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
+    failed = {
+        job.name: read_json(job.out / "failed.json", "a failure")["error"]
+        for job in work.jobs
+        if (job.out / "failed.json").exists()
+    }
+    if not finished:
+        lost = "; ".join(f"{name}: {error}" for name, error in failed.items())
+        raise ValueError(f"no run of {out} is finished: nothing to tell yet{f' ({lost})' if lost else ''}")
+    records: list[dict[str, Any]] = []
+    retrieval: list[dict[str, Any]] = []
+    for job in finished:
+        scores = read_json(job.out / "scores.json", "a run's scores")
+        method = job.run.method.name
+        worse = read_json(job.out / "stress.json", "a run's stress")["records"] if job.stress else []
+        for record in scores["records"] + worse:
+            records.append({**record, "source": job.label + record["source"].removeprefix(method)})
+        retrieval += [{**found, "source": job.label} for found in scores["retrieval"]]
+    controls, found = _controls(work, out, session)
+    made = [read_json(job.out / "run.json", "a run's record") for job in finished]
+    rows = {row.label: row for row in work.plan.rows}
+    return {
+        "plan": to_json(work.plan),
+        "data": work.pack.spec.name,
+        "pack": work.pack.digest,
+        "group_by": work.pack.spec.group_by,
+        "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
+        "leaks": leaks(work.pack, chosen(work.pack, session)[0]),
+        "records": records + controls,
+        "retrieval": retrieval + found,
+        "rows": [label for label in rows if label not in work.left_out],
+        "left_out": work.left_out,
+        "failed": failed,
+        "unfinished": [job.name for job in work.jobs if not job.done],
+        "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
+        "device": describe(pick_device(work.jobs[0].run.device)),
+        "run_commits": list(dict.fromkeys(record.get("commit") for record in made)),
+        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for record in made)),
+        **provenance(),
+    }
+
+
+def _labels(jobs: Sequence[Job]) -> Iterator[str]:
+    yield from dict.fromkeys(job.label for job in jobs)
+
+
+def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The controls beside the reference row, made once."""
+    if not session.controls:
+        return [], []
+    beside = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
+    key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in beside]])
+    path = out / "controls.json"
+    if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
+        return kept["records"], kept["retrieval"]
+    tasks, modalities = chosen(work.pack, session)
+    records, retrieval = controls_of(beside, work.pack, tasks, modalities, session.probes, session.imagenet)
+    write_json(path, {"key": key, "records": records, "retrieval": retrieval})
+    return records, retrieval
+
+
+def leaks(pack: Pack, tasks: Sequence[Task]) -> str:
+    """A sentence for each split of ``tasks`` of which groups (instances, objects, recordings) lie in train and in test, and
+    for each of their own whose test rows were pre-trained on; "" if there is none."""
+    groups, said = pack.column("group").astype(str), []
+    for column in dict.fromkeys(("split", *(task.split for task in tasks))):
+        train, test = (pack.rows(split, by=column) for split in ("train", "test"))
+        own = "" if column == "split" else f" of {' and '.join(t.name for t in tasks if t.split == column)}"
+        shared, num = len(set(groups[train]) & set(groups[test])), len(set(groups[test]))
+        if shared:
+            said.append(f"{shared} of {num} test {pack.spec.group_by}s{own} are also in train: this split leaks")
+        seen = len(np.intersect1d(test, pack.rows("train", "unlabelled")))
+        if seen and column != "split":
+            said.append(f"{seen} of {len(test)} test rows{own} were pre-trained on")
+    return "; ".join(said)
+
+
+def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
+    """Steps, pairs, images and median seconds of one run of a row, and its peak GPU memory where it was measured."""
+    run = jobs[0].run
+    rows = len(training_rows(run, pack))
+    method = run.method.build(pack.spec, replace(run.encoder, weights=SCRATCH))
+    steps = run.num_steps(rows)
+    peaks = [read_json(p, "peak memory")["peak_bytes"] for job in jobs if (p := job.out / "memory.json").exists()]
+    return {
+        "row": label,
+        "seeds": len(jobs),
+        "steps": steps,
+        "pairs": steps * run.batch_size,
+        "pairs_of": pairs_of(run, method.views, pack),
+        "images": steps * run.batch_size * method.views * len(method.encoders()),
+        "trained_parameters": sum(p.numel() for p in method.parameters() if p.requires_grad),
+        "seconds": statistics.median(seconds_of(job.out) for job in jobs),
+        "peak_gpu_bytes": int(np.max(peaks)) if peaks else None,
+    }
+
+
+def pairs_of(run: Run, views: int, pack: Pack) -> str:
+    """What the method is told belongs together, which decides more than most methods do (``Run.positives``)."""
+    other = run.positives != "same-image" if views > 1 else run.positives == "same-touch-pairs"
+    several = len(np.unique(pack.touch_groups)) < pack.num
+    return "two rows of a touch" if other and several else "one row"
+
+
+def forecast(work: Work) -> list[str]:
+    """The plan in words: runs, what is finished, steps and pairs, and the time left where finished runs tell it."""
+    rows = {label: next(job for job in work.jobs if job.label == label) for label in _labels(work.jobs)}
+    num = len({job.fold for job in work.jobs})
+    folds = f" x {num} folds" if num > 1 else ""
+    lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
+    known = [seconds_of(job.out) for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
+    for label, job in rows.items():
+        num = len(training_rows(job.run, work.pack))
+        steps = job.run.num_steps(num)
+        mine = [j for j in work.jobs if j.label == label]
+        lines.append(
+            f"  {label}: {job.run.method.name}, {steps} steps x {job.run.batch_size} pairs of {num} rows,"
+            f" {sum(j.done for j in mine)} of {len(mine)} finished"
+        )
+    lines += [f"  left out: {label} ({reason})" for label, reason in work.left_out.items()]
+    left = sum(not job.done for job in work.jobs)
+    if known and left:
+        hours = left * statistics.median(known) / 3600
+        lines.append(f"{left} runs left, about {hours:.1f} h of training one after another (median of finished runs)")
+    elif left:
+        lines.append(f"{left} runs left; run one for a forecast of the time")
+    else:
+        lines.append("all runs are finished")
+    return lines

@@ -1,0 +1,83 @@
+"""Cross-validation: a plan's rows on each fold of its data, and the folds' test groups as one result.
+
+Runs and controls lie in a folder per fold; the tables are of all folds' test groups pooled (``scores.pool``). A plan
+without folds is one fold without a name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvitac.evaluation.evaluate import ProbeConfig, chosen
+from mvitac.evaluation.probe import MIN_GALLERY
+from mvitac.evaluation.scores import pool
+from mvitac.experiments.collect import gather, lay_out
+from mvitac.experiments.jobs import Work
+from mvitac.experiments.plan import Plan
+from mvitac.registry import to_json
+from mvitac.system.files import digest
+
+
+def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "auto") -> list[Work]:
+    """The work of every fold of ``plan``, or of the plan; ValueError if two folds test the same group.
+
+    A row that one fold does not allow is left out of all: its other folds could not be pooled.
+    """
+    works: list[Work] = []
+    tested: dict[tuple[str, str], str] = {}
+    for fold, part in plan.in_folds():
+        assert part.data is not None
+        pack = part.data.open()
+        groups = pack.column("group").astype(str)
+        for side in dict.fromkeys(("split", *(task.split for task in chosen(pack, session)[0]))) if fold else ():
+            own = "" if side == "split" else f" (column {side})"
+            for group in np.unique(groups[pack.rows("test", by=side)]).tolist():
+                if (side, group) in tested:
+                    raise ValueError(
+                        f"folds {tested[side, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}: each"
+                        " group must be tested once"
+                    )
+                tested[side, group] = fold
+        work = lay_out(part, pack, out / fold, session, device)
+        works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
+    left_out = {label: reason for work in works for label, reason in work.left_out.items()}
+    works = [
+        replace(work, jobs=[job for job in work.jobs if job.label not in left_out], left_out=left_out) for work in works
+    ]
+    if not works[0].jobs:
+        raise ValueError(f"plan {plan.name!r} has no row that all folds allow: {next(iter(left_out.values()))}")
+    return works
+
+
+def together(works: Sequence[Work]) -> Work:
+    """The jobs of all folds as one work, seeds outermost."""
+    jobs = sorted((job for work in works for job in work.jobs), key=lambda job: job.run.seed)
+    return replace(works[0], jobs=jobs)
+
+
+def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeConfig) -> dict[str, Any]:
+    """``gather`` of every fold as one result: test groups pooled (``scores.pool``), cost that of the first fold."""
+    results = [gather(work, out / fold, session) for work, (fold, _) in zip(works, plan.in_folds(), strict=True)]
+    if len(results) == 1:
+        return {**results[0], "plan": to_json(plan)}
+    retrieval = [r for result in results for r in result["retrieval"] if r["num_groups"] >= MIN_GALLERY]
+
+    def all_of(key: str) -> list[Any]:
+        return list(dict.fromkeys(value for result in results for value in result[key]))
+
+    return {
+        **results[0],
+        "plan": to_json(plan),
+        "pack": digest([result["pack"] for result in results]),
+        "records": pool([result["records"] for result in results]),
+        "retrieval": retrieval,
+        "failed": {name: error for result in results for name, error in result["failed"].items()},
+        **{key: all_of(key) for key in ("notes", "run_commits", "run_devices")},
+        "unfinished": [name for result in results for name in result["unfinished"]],
+        "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),
+    }

@@ -1,0 +1,249 @@
+"""Doing the runs of a comparison: one after another, several at a time, as a SLURM array, or by the same command on several
+machines; safe to kill at any instant.
+
+A run whose loss stops being a number is done too: it is kept as failed.json. One that fails otherwise is told, and tried
+again by the next call.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import TaskID
+
+from mvitac.data.pack import Pack
+from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
+from mvitac.evaluation.robustness import stress
+from mvitac.experiments.plan import Plan
+from mvitac.model import load
+from mvitac.registry import to_json
+from mvitac.run import Run
+from mvitac.system.device import pick_device
+from mvitac.system.files import brief, read_json, write_json
+from mvitac.system.locks import Busy, hold_lock
+from mvitac.system.processes import my_device, side_by_side
+from mvitac.training.log import bars, last_line
+from mvitac.training.loop import Diverged, Interrupted, train
+from mvitac.training.sampler import training_rows
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one row: where it goes, and how it is scored."""
+
+    label: str
+    run: Run
+    out: Path
+    session: ProbeConfig
+    stress: bool = False
+    fold: str = ""
+
+    @property
+    def name(self) -> str:
+        """Its row and seed, and its fold where there are several."""
+        return f"{self.label}, {f'{self.fold}, ' if self.fold else ''}seed {self.run.seed}"
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """What its scores are of, as it stands beside them."""
+        return to_json(
+            ProbeConfig(probes=self.session.probes, tasks=self.session.tasks, modalities=self.session.modalities)
+        )
+
+    @property
+    def done(self) -> bool:
+        kept = ["scores.json", *(["stress.json"] if self.stress else [])]
+        return (self.out / "failed.json").exists() or all(_scored(self.out / name) == self.asked for name in kept)
+
+    def drop_checkpoint(self) -> None:
+        """Once scored, a run needs none; they are four times its weights, and hundreds of runs would fill a disk."""
+        (self.out / "checkpoint.pt").unlink(missing_ok=True)
+
+
+def _scored(path: Path) -> dict[str, Any] | None:
+    """What the scores in ``path`` are of; None if there are none."""
+    try:
+        return _asked(path, path.stat().st_mtime_ns)
+    except FileNotFoundError:
+        return None
+
+
+@cache
+def _asked(path: Path, changed: int) -> dict[str, Any]:
+    return read_json(path, "a run's scores").get("asked", to_json(ProbeConfig()))  # older ones do not say
+
+
+@dataclass(frozen=True)
+class Work:
+    """A plan on one dataset (one fold of it): the jobs to do, and the rows that cannot be part of it, with the reason."""
+
+    plan: Plan
+    pack: Pack
+    jobs: list[Job]
+    left_out: dict[str, str]
+
+
+def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
+    """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant, and from several
+    processes at once: what one is at, the others leave to it."""
+    try:
+        with hold_lock(
+            job.out, "another process is at it; this command makes the whole table once it is done", wait=False
+        ):
+            return "finished before" if job.done else _do(job, pack, quiet)
+    except Busy as busy:
+        return str(busy)
+
+
+def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
+    pack = pack or job.run.data.open(quiet=True)
+    gpu = pick_device(job.run.device)
+    measured = gpu.type == "cuda" and not (job.out / "model.safetensors").exists()
+    if measured:
+        torch.cuda.reset_peak_memory_stats(gpu)
+    try:
+        train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
+    except Diverged as error:
+        write_json(job.out / "failed.json", {"error": str(error)})
+        return f"diverged: {error}"
+    if measured:
+        write_json(job.out / "memory.json", {"peak_bytes": torch.cuda.max_memory_allocated(gpu)})
+    result = probe_runs([job.out], job.session, pack)
+    if job.stress:
+        records = stress(load(job.out), pack, *chosen(pack, job.session))
+        own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
+        write_json(job.out / "stress.json", {"asked": job.asked, "records": [{**own, **record} for record in records]})
+    write_json(
+        job.out / "scores.json", {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
+    )
+    job.drop_checkpoint()
+    return f"{seconds_of(job.out):.0f} s of training"
+
+
+def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
+    """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several.
+
+    ``console``, if it is a terminal, shows how far they are. A job that fails is told; the first one's error is raised after
+    all others are done. ValueError if a process dies. Interrupted after Ctrl-C, when the runs under way have saved
+    their checkpoints.
+    """
+    todo = [job for job in work.jobs if not job.done]
+    for job in work.jobs:
+        if job.done and not (job.out / "failed.json").exists():
+            job.drop_checkpoint()  # of a run that was killed when it had been scored
+    shown = console if console and console.is_terminal else None
+    errors: list[Exception] = []
+
+    def told(job: Job, result: Callable[[], str]) -> None:
+        try:
+            line = result()
+        except (Interrupted, BrokenProcessPool):
+            raise
+        except Exception as error:  # the other runs need not wait for someone to mend it
+            errors.append(error)
+            line = f"failed: {brief(error)}"
+        say(f"[{sum(j.done for j in work.jobs)}/{len(work.jobs)}] {job.name}: {line}")
+
+    try:
+        if num_jobs == 1 or len(todo) < 2:
+            for job in todo:
+                say(f"{job.name} ...")
+                pack = work.pack if job.run.data == work.plan.data else None
+                told(job, lambda job=job, pack=pack: do(job, pack, quiet=not shown))
+        else:
+            _side_by_side(work, todo, num_jobs, told, shown)
+    except (KeyboardInterrupt, Interrupted):
+        raise Interrupted("stopped; the same command goes on from here") from None
+    except BrokenProcessPool:
+        raise ValueError(
+            f"one of {num_jobs} processes was killed, most likely for lack of memory: give fewer --jobs; the same command"
+            " goes on from here"
+        ) from None
+    if errors:
+        raise errors[0]
+
+
+def _side_by_side(
+    work: Work,
+    todo: Sequence[Job],
+    num_jobs: int,
+    told: Callable[[Job, Callable[[], str]], None],
+    console: Console | None,
+) -> None:
+    gpus = torch.cuda.device_count()
+    devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
+    shown = bars(console or Console(), disable=console is None, transient=True, speed_estimate_period=600)
+    with shown as progress, side_by_side(num_jobs, devices) as pool:
+        overall = progress.add_task("all runs", total=len(todo), text="")
+        tasks: dict[Path, tuple[TaskID, int]] = {}  # of the runs under way, with their steps
+        jobs = {pool.submit(_do_here, job): job for job in todo}
+        waiting = set(jobs)
+        while waiting:
+            done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
+            for future in done:
+                told(job := jobs[future], future.result)
+                if job.out in tasks:
+                    progress.remove_task(tasks.pop(job.out)[0])
+            part = 0.0
+            for job in (jobs[future] for future in waiting if future.running()) if console else ():
+                step, text = last_line(job.out)
+                if step and job.out not in tasks:
+                    steps = job.run.num_steps(len(training_rows(job.run, work.pack)))
+                    tasks[job.out] = progress.add_task(job.name, total=steps, text=""), steps
+                if job.out in tasks:
+                    task, steps = tasks[job.out]
+                    progress.update(task, completed=step, text=text)
+                    part += min(1, step / steps)  # a fold's own steps may be more
+            progress.update(overall, completed=len(todo) - len(waiting) + part)
+
+
+def _do_here(job: Job) -> str:
+    device = my_device()
+    return do(job if device == "auto" else replace(job, run=replace(job.run, device=device)))
+
+
+def submit(work: Work, options: str) -> str:
+    """Hand the unfinished jobs to SLURM as one array by submitit and return its id; nothing waits for them here.
+
+    ``options``: comma-separated name=value of submitit's ``update_parameters``, e.g. "slurm_partition=gpu,timeout_min=600".
+    """
+    try:
+        import submitit  # type: ignore[import-not-found]
+    except ImportError:
+        raise ValueError(
+            "--slurm needs submitit, which is not installed: pip install 'mvitac[slurm]', or leave --slurm out"
+        ) from None
+    parameters: dict[str, Any] = {}
+    for pair in options.split(","):
+        name, equals, value = pair.partition("=")
+        if not equals:
+            raise ValueError(f"--slurm {pair}: give name=value pairs, e.g. slurm_partition=gpu,timeout_min=600")
+        parameters[name] = int(value) if value.isdigit() else value
+    todo = [job for job in work.jobs if not job.done]
+    if not todo:
+        return "nothing to submit: all runs are finished"
+    executor = submitit.AutoExecutor(folder=work.jobs[0].out.parents[3 if work.jobs[0].fold else 2] / "slurm")
+    executor.update_parameters(name=f"mvitac-{work.plan.name}", **parameters)
+    handles = executor.map_array(do, todo)
+    return f"{len(handles)} runs submitted as {handles[0].job_id.split('_')[0]}"
+
+
+def seconds_of(path: Path) -> float:
+    """Seconds of training that a run's log tells, over all its resumptions; steps lost to a kill are not in it."""
+    total, before = 0.0, 0
+    batch_size = read_json(path / "run.json", "a run's record")["run"]["batch_size"]
+    for line in (path / "log.jsonl").read_text().splitlines():
+        entry = json.loads(line)
+        if entry.get("pairs_per_s"):
+            total += (entry["step"] - before) * batch_size / entry["pairs_per_s"]
+        before = entry["step"]
+    return total

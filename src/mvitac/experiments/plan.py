@@ -1,0 +1,165 @@
+"""What a comparison is, as data: rows, tasks, probes, seeds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.controls import CONTROLS
+from mvitac.evaluation.probe import Probe
+from mvitac.recipes import recipe, with_method
+from mvitac.registry import to_json, unknown
+from mvitac.run import Run
+
+Printed = dict[str, dict[str, float]]
+"""modality -> task -> top-1 % as printed in the paper."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of the comparison: a method with its settings, run once per seed."""
+
+    label: str
+    """Its name in the table."""
+    method: str = "mvitac"
+    """A registered method."""
+    recipe: str | None = None
+    """If given, another recipe than the plan's."""
+    set: dict[str, Any] = field(default_factory=dict)
+    """Fields of the run to change, by dotted name, e.g. {"method.temperature": 0.2, "optim.lr": 0.03}."""
+    printed: Printed = field(default_factory=dict)
+    """The paper's numbers for this row."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is compared with what."""
+
+    name: str
+    """Names the folder of its runs."""
+    rows: tuple[Row, ...]
+    """The lines of the table, in order."""
+    title: str = ""
+    """Heading of the table."""
+    reference: str = "MViTac"
+    """Label of the row that every other one is tested against."""
+    recipe: str = "demo"
+    """The recipe of every row that names none; the same budget for all."""
+    seeds: int = 3
+    """Seeds 0 .. seeds - 1."""
+    set: dict[str, Any] = field(default_factory=dict)
+    """Fields to change in every row; a row's own come after them."""
+    data: DatasetConfig | None = None
+    """The dataset, with its name; --data overrules it."""
+    folds: tuple[str, ...] = ()
+    """Cross-validation: fields of the data that make each fold, e.g. ("split=fold1", "split=fold2"); every row runs on all
+    folds, and their test groups, which must differ, are pooled."""
+    probes: tuple[Probe, ...] = ("linear",)
+    """How features are scored; the table shows the first."""
+    tasks: tuple[str, ...] = ()
+    """Tasks to score; none given = all of the data's."""
+    modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
+    """Modalities to score; none given = all."""
+    stress: bool = False
+    """Also score few labels, noisy test images, a modality missing at test time, a leaking split (``mvitac.evaluation.robustness``)."""
+    printed_on: str = ""
+    """Name of the dataset that the paper's numbers are about."""
+    printed_majority: dict[str, float] = field(default_factory=dict)
+    """task -> majority rate as printed."""
+
+    def __post_init__(self) -> None:
+        if not self.rows:
+            raise ValueError(f"plan {self.name!r} has no rows: give at least one")
+        if not 1 <= self.seeds <= 1000:
+            raise ValueError(f"seeds {self.seeds}: give 1 to 1000")
+        labels = [row.label for row in self.rows]
+        for label in labels:
+            if label in CONTROLS:
+                raise ValueError(f"row {label!r} has the name of a control: give it another label")
+            if labels.count(label) > 1:
+                raise ValueError(f"row {label!r} is there twice: give each row its own label")
+        if len({slug(label) for label in labels}) < len(labels):
+            raise ValueError(f"plan {self.name!r}: labels differ only in signs that a folder's name cannot hold")
+        for fold in self.folds:
+            if self.folds.count(fold) > 1:
+                raise ValueError(f"fold {fold!r} is there twice: its test groups would count twice")
+            for pair in fold.split(","):
+                setting(pair, "fold")
+        if self.reference not in labels:
+            raise unknown("reference row", self.reference, labels)
+
+    def only(self, labels: Sequence[str]) -> Plan:
+        """The plan with the rows of these labels and the reference; all rows if none is given."""
+        known = [row.label for row in self.rows]
+        for label in labels:
+            if label not in known:
+                raise unknown("row", label, known)
+        wanted = {*labels, self.reference} if labels else set(known)
+        return replace(self, rows=tuple(row for row in self.rows if row.label in wanted))
+
+    def in_folds(self) -> list[tuple[str, Plan]]:
+        """A plan for each fold, with its name; the plan itself, without a name, where there are none."""
+        if not self.folds:
+            return [("", self)]
+        assert self.data is not None
+        whole = recipe(self.recipe, self.data)  # not a row's run: what a row alone changes in its data stays its own
+        parts = [
+            {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
+        ]
+        names = [slug(" ".join(str(value) for value in part.values())) for part in parts]
+        if len(set(names)) < len(names):
+            names = [slug(fold) for fold in self.folds]
+        if "" in names or len(set(names)) < len(names):
+            raise ValueError(
+                f"folds {', '.join(self.folds)}: each needs a folder of its own, but letters and digits do not tell them"
+                " apart: give them other names"
+            )
+        datas = [changed(whole, part).data for part in parts]
+        return [(name, replace(self, data=data, folds=())) for name, data in zip(names, datas, strict=True)]
+
+    def run(self, row: Row, data: DatasetConfig, seed: int) -> Run:
+        """The whole run of one row and seed; ValueError names a field that does not exist or fit."""
+        try:
+            base = with_method(recipe(row.recipe or self.recipe, data), row.method)
+            return replace(changed(base, {**self.set, **row.set}), seed=seed)
+        except ValueError as error:
+            raise ValueError(f"row {row.label!r}: {error}") from None
+
+
+def slug(label: str) -> str:
+    """A label as the name of a folder."""
+    return "-".join("".join(c if c.isalnum() or c in ".=" else " " for c in label.lower()).split())
+
+
+def changed(run: Run, changes: Mapping[str, Any]) -> Run:
+    """``run`` with fields changed by dotted name, values as in JSON."""
+    value = to_json(run)
+    for name, new in changes.items():
+        *path, last = name.split(".")
+        inner = value
+        for part in path:
+            inner = inner.get(part) if isinstance(inner, dict) else None
+        if (
+            not isinstance(inner, dict)
+            or last not in inner
+            or (last == "name" and path and path[-1] in ("method", "data"))
+        ):
+            known = [key for key in inner if key != "name"] if isinstance(inner, dict) else list(value)
+            raise unknown("field of a run", name, [".".join((*path, key)) for key in known] if inner else known)
+        inner[last] = list(new) if isinstance(new, tuple) else new
+    return Run.load(value)
+
+
+def setting(text: str, what: str = "--set") -> tuple[str, Any]:
+    """``field=value`` as a pair; the value is JSON where it can be, else text."""
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        example = "split=fold1" if what == "fold" else "steps=100 or method.temperature=0.2"
+        raise ValueError(f"{what} {text}: give field=value, e.g. {example}")
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value

@@ -1,0 +1,230 @@
+"""Where live frames come from: cameras, video files, folders of pictures, and a simulated sensor.
+
+A ``Source`` opens, reads and closes; clocks, threads and faults are ``live/streams.py``'s. Frames are uint8 RGB [H, W, 3].
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from abc import ABC, abstractmethod
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+
+from mvitac.system.files import brief
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+
+
+class Ended(Exception):
+    """A source has no more frames, and never will."""
+
+
+class Source(ABC):
+    """Where frames come from. ``read`` raises OSError where the device is gone, ValueError for one damaged frame."""
+
+    fps: float = 30.0
+    """Nominal rate."""
+    paced: bool = True
+    """Whether the device itself makes ``read`` wait for the next frame."""
+
+    @abstractmethod
+    def open(self) -> None: ...
+
+    @abstractmethod
+    def read(self) -> np.ndarray: ...
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to close
+        pass
+
+
+class Camera(Source):
+    """A UVC camera by index, device path or USB serial number; DIGIT and GelSight Mini are such cameras."""
+
+    def __init__(self, which: str, size: tuple[int, int] | None = None, fps: float | None = None) -> None:
+        """``size`` (width, height) and ``fps`` to ask the camera for; None leaves it as it is."""
+        self.which, self.size, self.asked = which, size, fps
+
+    def open(self) -> None:
+        import cv2
+
+        target: int | str = int(self.which) if self.which.isdigit() else self.which
+        if isinstance(target, str) and not target.startswith("/"):
+            links = sorted(Path("/dev/v4l/by-id").glob(f"*{target}*-index0")) if Path("/dev/v4l/by-id").is_dir() else []
+            if not links:
+                raise OSError(f"no camera with serial {target} is plugged in")
+            target = str(links[0].resolve())
+        self.capture = cv2.VideoCapture(target)
+        self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame in a queue is worse than none
+        if not self.capture.isOpened():
+            raise OSError(f"camera {self.which} cannot be opened")
+        asked = (
+            (cv2.CAP_PROP_FRAME_WIDTH, self.size and self.size[0]),
+            (cv2.CAP_PROP_FRAME_HEIGHT, self.size and self.size[1]),
+            (cv2.CAP_PROP_FPS, self.asked),
+        )
+        for name, value in asked:
+            if value:
+                self.capture.set(name, value)
+        given = [self.capture.get(name) for name, _ in asked]
+        # A driver takes what it likes and says nothing; some report no rate at all.
+        if any(value and has and abs(has - value) > 0.05 * value for has, (_, value) in zip(given, asked, strict=True)):
+            raise OSError(
+                f"camera {self.which} has no such mode: it gives {given[0]:g}x{given[1]:g} at {given[2]:g} fps"
+            )
+        self.fps = given[2] or 30.0
+
+    def read(self) -> np.ndarray:
+        good, image = self.capture.read()
+        if not good:
+            raise OSError(f"camera {self.which} gives no frames")
+        return np.ascontiguousarray(image[..., ::-1])  # OpenCV's frames are BGR
+
+    def close(self) -> None:
+        if hasattr(self, "capture"):
+            self.capture.release()
+
+
+class Video(Source):
+    """A video file, at its own rate."""
+
+    paced = False
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def open(self) -> None:
+        import cv2
+
+        self.capture = cv2.VideoCapture(str(self.path))
+        if not self.capture.isOpened():
+            raise OSError(f"{self.path} cannot be read as a video")
+        self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
+
+    def read(self) -> np.ndarray:
+        good, image = self.capture.read()
+        if not good:
+            raise Ended
+        return np.ascontiguousarray(image[..., ::-1])
+
+    def close(self) -> None:
+        if hasattr(self, "capture"):
+            self.capture.release()
+
+
+class Folder(Source):
+    """The pictures of a folder in name order."""
+
+    paced = False
+
+    def __init__(self, path: Path, fps: float = 30.0) -> None:
+        self.path, self.fps = path, fps
+
+    def open(self) -> None:
+        self.left = deque(sorted(p for p in self.path.iterdir() if p.suffix.lower() in PICTURES))
+        if not self.left:
+            raise OSError(f"{self.path} holds no pictures ({', '.join(PICTURES)})")
+
+    def read(self) -> np.ndarray:
+        from PIL import Image
+
+        if not self.left:
+            raise Ended
+        path = self.left.popleft()
+        try:
+            with Image.open(path) as image:
+                return np.array(image.convert("RGB"))
+        except Exception as error:  # Pillow has a kind for each damage
+            raise ValueError(f"{path.name}: {brief(error)}") from None
+
+
+class Simulated(Source):
+    """A simulated sensor: one second of nothing, two of a touch of a new material, and so on; camera and gel agree.
+
+    Nothing for longer at first: live input learns the free gel from its first second, on a slow machine from later ones.
+    """
+
+    paced = False
+    first, rest, hold = 3.0, 1.0, 2.0
+
+    def __init__(self, modality: str, seed: int = 0, fps: float = 30.0, size: int = 72) -> None:
+        self.modality, self.seed, self.fps, self.size = modality, seed, fps, size
+
+    def open(self) -> None:
+        self.number, self.touch = 0, -1
+        self.noise = np.random.default_rng([self.seed, self.modality == "touch"])
+
+    def read(self) -> np.ndarray:
+        from mvitac.sim import gel, materials
+
+        when = max(0.0, self.number / self.fps - self.first + self.rest)
+        touch, phase = divmod(when, self.rest + self.hold)
+        if int(touch) != self.touch:
+            self.touch = int(touch)
+            rng = np.random.default_rng([self.seed, self.touch])
+            sensors = {name: s for name, s in materials.SENSORS.items() if not s.held_out}
+            while True:  # all touches by one sensor, as a robot has one
+                address = int(rng.integers(len(materials.CLASSES))), int(rng.integers(60)), int(rng.integers(5))
+                pair = materials.touch(self.seed, *address, size=self.size)
+                if pair["sensor"] == min(sensors):
+                    break
+            quiet = np.zeros((self.size, self.size), np.float32)
+            blank = gel.render(quiet, sensors[pair["sensor"]], rng, pixel_mm=12.8 / self.size, unit=1)
+            self.pictures = {"vision": (pair["vision"],) * 2, "touch": (blank, pair["touch"])}
+        self.number += 1
+        image = self.pictures[self.modality][phase >= self.rest].astype(np.float32)
+        image += self.noise.normal(0, 1.0, image.shape[:2])[..., None]
+        return np.clip(image + 0.5, 0, 255).astype(np.uint8)
+
+
+MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d+(\.\d+)?))?")
+
+
+def source(text: str, modality: str) -> Source:
+    """A source from its name: a camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` asks it for that mode), a
+    video, a folder[@fps], or ``sim``[:seed]. ValueError if there is no such thing, or a file that cannot be read.
+    """
+    if text == "sim" or text.startswith("sim:"):
+        seed = text.partition(":")[2] or "0"
+        if not seed.isdigit():
+            raise ValueError(f"source {text!r}: give sim or sim:NUMBER")
+        return Simulated(modality, int(seed))
+    mode = MODE.fullmatch(text)
+    if mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
+        _need_opencv(text)
+        size = (int(mode["width"]), int(mode["height"])) if mode["width"] else None
+        return Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
+    name, at, rate = text.rpartition("@")
+    path, fps = (Path(name), rate) if at and not Path(text).exists() else (Path(text), "30")
+    if path.is_dir():
+        try:
+            if not 0 < float(fps) < float("inf"):
+                raise ValueError
+        except ValueError:
+            raise ValueError(f"source {text!r}: {fps!r} is no frame rate, give e.g. {path}@30") from None
+        return _readable(Folder(path, float(fps)), text)
+    if path.is_file() and path.suffix.lower() in VIDEOS:
+        _need_opencv(text)
+        return _readable(Video(path), text)
+    raise ValueError(
+        f"source {text!r}: give a camera number, /dev/videoN, serial:NAME, a video file ({', '.join(VIDEOS)}),"
+        " a folder of pictures[@fps], or sim"
+    )
+
+
+def _readable(files: Source, text: str) -> Source:
+    """``files`` again, if they can be opened: unlike a camera, they will not come back by waiting."""
+    try:
+        files.open()
+    except OSError as error:
+        raise ValueError(f"source {text!r}: {brief(error)}, give another") from None
+    files.close()
+    return files
+
+
+def _need_opencv(text: str) -> None:
+    if importlib.util.find_spec("cv2") is None:
+        raise ValueError(f"source {text!r} needs OpenCV: pip install 'mvitac[live]'")

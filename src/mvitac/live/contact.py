@@ -1,0 +1,86 @@
+"""Contact: one touch sensor's background, and whether something touches it now."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from mvitac.data.images import fit
+
+SIDE = 32
+"""Side of the small gray pictures in which contact is looked for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveConfig:
+    """How live input is judged."""
+
+    calibration: int = 30
+    """Frames without contact from which a sensor's background and noise are learned."""
+    contact: float = 6.0
+    """Contact is this many times the no-contact noise; it ends at half of that."""
+    least_change: float = 1.0
+    """Grey levels of mean change below which nothing counts as contact, however quiet the sensor."""
+    follow: float = 0.01
+    """How fast the background follows the sensor while nothing is touched (share per frame)."""
+    min_confidence: float = 0.5
+    """Probability below which an answer is shown as unsure."""
+    neighbours: int = 3
+    """Nearest known touches to show, if there is an index."""
+
+    def __post_init__(self) -> None:
+        if self.calibration < 2:
+            raise ValueError(f"calibration {self.calibration}: give at least 2 frames")
+        if not (self.contact > 0 and self.least_change >= 0 and 0 <= self.follow < 1):
+            raise ValueError("contact must be > 0, least_change >= 0 and follow in [0, 1)")
+        if not (self.neighbours >= 1 and 0 <= self.min_confidence <= 1):
+            raise ValueError("neighbours must be >= 1 (leave --index out for none) and min_confidence in [0, 1]")
+
+
+class Contact:
+    """Whether one touch sensor is touched: learns its background, then compares."""
+
+    def __init__(self, config: LiveConfig, side: int = 0) -> None:
+        """``side``: of the picture of no contact to keep, for a model that wants it subtracted; 0 = none."""
+        self.config, self.side = config, side
+        self.forget()
+
+    def forget(self) -> None:
+        """Calibrate anew, as after a change of resolution or a replugged sensor."""
+        self.first: list[tuple[np.ndarray, np.ndarray | None]] = []
+        self.background: np.ndarray | None = None
+        self.picture: np.ndarray | None = None
+        """The background [side, side, 3] as the model would see it, float32."""
+        self.noise = self.level = 0.0
+        self.touched = self.uneasy = False
+
+    def __call__(self, image: np.ndarray) -> bool | None:
+        """True in contact, False without, None while calibrating. ``level`` is the change in units of the threshold."""
+        small = np.asarray(Image.fromarray(image).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
+        whole = fit(image, self.side) if self.side else None
+        if self.background is None:
+            self.first.append((small, whole))
+            if len(self.first) < self.config.calibration:
+                return None
+            frames = np.stack([small for small, _ in self.first])
+            pictures = [whole for _, whole in self.first if whole is not None]
+            self.first = []
+            middle = np.median(frames, axis=0)
+            changes = np.abs(frames - middle).mean((1, 2))
+            self.noise = float(np.median(changes))
+            self.uneasy = bool(changes.max() > max(self.config.least_change, self.config.contact * self.noise))
+            if self.uneasy:
+                return None  # something moved: learn it again
+            self.background = middle
+            self.picture = np.stack(pictures).mean(0, dtype=np.float32) if pictures else None
+        change = float(np.abs(small - self.background).mean())
+        threshold = max(self.config.least_change, self.config.contact * self.noise)
+        self.level = change / threshold
+        self.touched = self.level > (0.5 if self.touched else 1.0)
+        if not self.touched:
+            self.background += self.config.follow * (small - self.background)
+            if whole is not None and self.picture is not None:
+                self.picture += self.config.follow * (whole - self.picture)
+        return self.touched

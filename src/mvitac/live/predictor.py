@@ -1,0 +1,224 @@
+"""Live: the newest frames in, contact, a smoothed answer per touch and its age out. No training code.
+
+Each touch sensor's background (no contact) is learned from its first frames and followed slowly while nothing is
+touched; it decides *whether* there is contact. The model sees frames as they are, or minus that background if it learned
+from difference images. Probabilities are averaged over one touch and forgotten with it. Time comes from a clock that is
+given. Shapes: frames uint8 RGB [H, W, 3].
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mvitac.data.images import difference, fit
+from mvitac.deploy.engine import Engine
+from mvitac.live.contact import Contact, LiveConfig
+from mvitac.live.streams import Event, Frame, Stream
+
+NUM_AGES = 10_000
+"""Predictions that the percentiles of the age are of: the latest ones, minutes of them, in memory that stays the same."""
+
+
+@dataclass
+class Touch:
+    """One touch, from contact to release: the mean of what was predicted."""
+
+    number: int
+    start: float
+    end: float | None = None
+    num_frames: int = 0
+    totals: dict[str, np.ndarray] = field(default_factory=dict)
+    known: list[str] = field(default_factory=list)
+    """The known touches it is most like, if there is an index."""
+
+    def add(self, probabilities: dict[str, np.ndarray]) -> None:
+        self.num_frames += 1
+        for task, p in probabilities.items():
+            self.totals[task] = self.totals.get(task, 0) + p
+
+    def answer(self, task: str, classes: Sequence[str]) -> tuple[str, float]:
+        """The likeliest class so far, and its mean probability."""
+        mean = self.totals[task] / self.num_frames
+        return classes[int(mean.argmax())], float(mean.max())
+
+
+class Live:
+    """Streams -> contact, predictions, ages. ``tick`` once whenever a frame may have come."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        streams: dict[str, Sequence[Stream]],
+        config: LiveConfig = LiveConfig(),
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        nearest: Callable[[dict[str, np.ndarray]], list[str]] | None = None,
+        record: Callable[[dict[str, np.ndarray], dict[str, Any]], None] | None = None,
+        tell: Callable[[Event], None] = lambda event: None,
+    ) -> None:
+        """``streams``: one stream per camera and sensor, by modality; two touch sensors are stacked on channels.
+
+        ``nearest`` turns the engine's outputs into names of known touches; ``record`` gets every pair that was used;
+        ``tell`` hears of every fault as it happens, in whichever thread noticed.
+        ValueError if the engine takes other inputs.
+        """
+        for modality, (_, _, channels) in engine.inputs.items():
+            have = 3 * len(streams.get(modality, ()))
+            if have != channels:
+                raise ValueError(
+                    f"the model takes {channels // 3} {modality} stream(s), {have // 3} given:"
+                    f" give {channels // 3} --{modality} (or export a model with other inputs)"
+                )
+        if extra := set(streams) - set(engine.inputs):
+            raise ValueError(f"the model has no input for {', '.join(sorted(extra))}: leave it out")
+        self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
+        self.nearest, self.record, self.tell = nearest, record, tell
+        self.all = [s for several in streams.values() for s in several]
+        self.leading = (streams.get("touch") or streams["vision"])[0]
+        """A new frame of this stream starts a prediction."""
+        side = engine.inputs["touch"][0] if engine.difference and "touch" in streams else 0
+        self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
+        self.counts: Counter[str] = Counter()
+        self._ages = np.zeros(NUM_AGES)
+        self.age = self.max_age = 0.0
+        """Seconds from capture to answer of the latest prediction, and the most of any; of the leading modality's frames."""
+        self.num_predictions = self.num_stale = self.num_touches = 0
+        self.touch: Touch | None = None
+        self.last: Touch | None = None
+        self.contact: bool | None = None
+        self._seen = -1
+        self._judged: dict[str, int] = {}
+        self._changed: set[str] = set()
+        for stream in self.all:
+            stream.tell = self._heard
+
+    def tick(self) -> bool:
+        """Use the newest frames, if the leading stream has a new one; True if that made a prediction."""
+        for stream in self.all:
+            stream.check()
+        leading = self.leading.newest(take=False)
+        if leading is None or leading.number == self._seen:
+            if any(stream.fault for stream in self.all):
+                self._lose(self.clock())
+            return False
+        frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
+        # A frame may have come since ``leading`` was looked at: the one that is used counts.
+        self._seen = (frames[self._leading_modality][0] or leading).number
+        now = self.clock()
+        for several, found in zip(self.streams.values(), frames.values(), strict=True):
+            for stream, frame in zip(several, found, strict=True):
+                # An old frame is not the present: rather no answer than one about the past.
+                if frame is None or stream.fault == "frozen" or now - frame.time > stream.stale_after:
+                    self.num_stale += 1
+                    self._lose(now)
+                    return False
+        self.contact = self._contact(frames.get("touch", []))
+        images = {
+            m: np.concatenate([fit(f.image, self.engine.inputs[m][0]) for f in found if f], axis=2)
+            for m, found in frames.items()
+        }
+        made = False
+        if self.contact:
+            if self.touch is None:
+                self.num_touches += 1
+                self.touch = Touch(self.num_touches, now)
+            outputs = self.engine(**{m: x[None] for m, x in self._wanted(images).items()})
+            self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
+            if self.nearest:
+                self.touch.known = self.nearest(outputs)
+            self.age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
+            self._ages[self.num_predictions % NUM_AGES] = self.age
+            self.max_age = max(self.max_age, self.age)
+            self.num_predictions += 1
+            made = True
+        else:
+            self._release(now)
+        if self.record:
+            self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
+        return made
+
+    def finish(self) -> None:
+        """End a touch that was still going on: no more frames will come."""
+        self._release(self.clock())
+
+    @property
+    def _leading_modality(self) -> str:
+        return "touch" if self.streams.get("touch") else "vision"
+
+    def _contact(self, frames: Sequence[Frame | None]) -> bool | None:
+        """Whether any touch sensor is in contact, None while one is calibrated; without a sensor always True."""
+        if not self.contacts:
+            return True
+        while self._changed:
+            self.contacts[self._changed.pop()].forget()
+        for name, frame in zip(self.contacts, frames, strict=True):
+            if frame is None or self._judged.get(name) == frame.number:
+                continue
+            self._judged[name] = frame.number
+            contact = self.contacts[name]
+            before = contact.background is None, contact.uneasy
+            contact(frame.image)
+            if contact.uneasy and not before[1]:
+                text = f"{name} was touched or moved while its background was learned: release it, it is learned again"
+                self._heard(Event(self.clock(), name, "uneasy calibration", text))
+            if before[0] and contact.background is not None:
+                self._heard(Event(self.clock(), name, "calibrated", f"{name} is calibrated without contact"))
+        states = self.contacts.values()
+        return None if any(c.background is None for c in states) else any(c.touched for c in states)
+
+    def _wanted(self, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """``images`` as the model learned from them; what is recorded stays as it came."""
+        if not (self.engine.difference and self.contacts):
+            return images
+        free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
+        return {**images, "touch": difference(images["touch"], np.rint(free).astype(np.uint8))}
+
+    def _lose(self, now: float) -> None:
+        """What cannot be seen is neither touched nor free."""
+        self._release(now)
+        self.contact = None
+
+    def _release(self, now: float) -> None:
+        if self.touch is not None:
+            self.touch.end = now
+            self.last, self.touch = self.touch, None
+
+    def _heard(self, event: Event) -> None:
+        self.counts[event.what] += 1
+        self.tell(event)
+        # Another lens, crop or gel: what was learned of the background no longer holds. The capture thread says so here
+        # before it shows the frame, and ``tick``, in its own thread, may be at work on the one before: it forgets.
+        if event.what in ("resolution changed", "back") and event.stream in self.contacts:
+            self._changed.add(event.stream)
+
+    def state(self, stream: Stream) -> str:
+        """What a stream is doing, in a word: its fault, "calibrating" or "good"."""
+        contact = self.contacts.get(stream.name)
+        return stream.fault or ("calibrating" if contact and contact.background is None else "good")
+
+    def answers(self, touch: Touch | None) -> dict[str, tuple[str, float]]:
+        """(class, confidence) by task of a touch."""
+        if touch is None or not touch.num_frames:
+            return {}
+        return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """What a run of live input came to, JSON-ready; ages in ms from capture to prediction."""
+        ages = 1000 * self._ages[: self.num_predictions]
+        p50, p99 = (float(np.percentile(ages, q)) if len(ages) else None for q in (50, 99))
+        return {
+            "predictions": self.num_predictions,
+            "touches": self.num_touches,
+            "age_ms": {"p50": p50, "p99": p99, "max": 1000 * self.max_age if len(ages) else None},
+            "stale": self.num_stale,
+            "streams": {
+                s.name: {"frames": s.num_frames, "dropped": s.num_dropped, "damaged": s.num_damaged} for s in self.all
+            },
+            "events": dict(self.counts),
+        }

@@ -1,0 +1,149 @@
+"""Record live input: pairs go to a spool on disk as they come, and become a pack or a LeRobotDataset at the end (or later,
+after a crash)."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mvitac.data.build import build
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec
+from mvitac.datasets.lerobot.writer import check_fps, write_lerobot
+from mvitac.registry import from_json, to_json
+from mvitac.system.files import check_place, digest_file, read_json, write_atomic, write_json
+
+SPOOL = 64
+"""Pairs per file of the spool: what a crash can lose."""
+
+
+class Recorder:
+    """Call it with every pair; ``close`` makes the pack or dataset. At most ``fps`` pairs a second are kept."""
+
+    def __init__(
+        self, out: Path, channels: dict[str, int], *, fps: float = 10.0, form: Literal["pack", "lerobot"] = "pack"
+    ) -> None:
+        """``channels`` by modality, of the images that will come, uint8 [S, S, C].
+
+        ``form``: what ``out`` becomes; a LeRobotDataset has a whole ``fps``. ValueError says what is not possible.
+        """
+        if not fps > 0:
+            raise ValueError(f"fps {fps:g}: give pairs a second, more than 0")
+        if form == "lerobot":
+            check_fps(fps)
+        if out.exists():
+            raise ValueError(f"{out} already exists: choose another --record, or delete it first")
+        check_place(out)
+        self.out, self.every = out, 1 / fps
+        self.spool = out.with_name(out.name + ".spool")
+        if self.spool.exists():
+            raise ValueError(
+                f"{self.spool} holds a recording that was not finished: `mvitac live --finish {out}` finishes it"
+            )
+        spec = DataSpec(
+            name="recording",
+            vision_channels=channels.get("vision", 0),
+            touch_channels=channels.get("touch", 0),
+            tasks=(),
+            group_by="contact",
+            licence="as the one who recorded it decides",
+            source="mvitac live",
+        )
+        self.spool.mkdir(parents=True)
+        write_json(self.spool / "recording.json", {"spec": to_json(spec), "form": form, "fps": fps})
+        self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
+        self.num = 0
+        self._next = float("-inf")
+
+    def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
+        """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch_number."""
+        time = columns["time"]
+        if time < self._next:
+            return
+        # Counted from the last due time, not from this pair's: else every delay would lower the rate. But what was missed
+        # (at the start, in a gap) is not made up for.
+        self._next += self.every
+        if time >= self._next:
+            self._next = time + self.every
+        self.waiting.append((images, columns))
+        if len(self.waiting) == SPOOL:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self.waiting:
+            return
+        arrays = {m: np.stack([images[m] for images, _ in self.waiting]) for m in self.waiting[0][0]}
+        columns = {f"column_{name}": np.array([c[name] for _, c in self.waiting]) for name in self.waiting[0][1]}
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays, **columns)  # type: ignore[arg-type]
+        write_atomic(self.spool / f"{self.num:08d}.npz", lambda file: file.write(buffer.getvalue()))
+        self.num += len(self.waiting)
+        self.waiting = []
+
+    def close(self) -> int:
+        """Write what is left and make the pack or dataset; how many pairs it has (0: nothing is made)."""
+        self._flush()
+        return finish(self.out)
+
+
+def finish(out: Path) -> int:
+    """Make ``out`` of its spool, which is then deleted; returns how many pairs it has (0: nothing is made)."""
+    spool = Recorded(out.with_name(out.name + ".spool"))
+    if not spool.files:  # a crash came before the first of them
+        shutil.rmtree(spool.path)
+        return 0
+    if spool.form == "lerobot":
+        packed = spool.path / "pack"
+        shutil.rmtree(packed, ignore_errors=True)
+        num = write_lerobot(build(spool, packed, size=spool.size(), quiet=True), out, fps=int(spool.fps))
+    else:
+        num = build(spool, out, size=spool.size(), quiet=True).num
+    shutil.rmtree(spool.path)
+    return num
+
+
+class Recorded(Source):
+    """A spool as a source of a pack; an item is one of its files."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_dir():
+            raise ValueError(f"{path} does not exist: there is no unfinished recording to finish")
+        self.files = sorted(path.glob("*.npz"))
+        meta = read_json(path / "recording.json", "an unfinished recording")
+        self.form, self.fps, self._spec = meta["form"], meta["fps"], meta["spec"]
+
+    def spec(self) -> DataSpec:
+        return from_json(DataSpec, self._spec, "spec")
+
+    def size(self) -> int:
+        return next(len(s.touch if s.touch is not None else s.vision) for s in self.read(0))  # type: ignore[arg-type]
+
+    def items(self) -> Sequence[str]:
+        return [path.name for path in self.files]
+
+    def samples_per_item(self) -> list[int]:
+        return [SPOOL] * len(self.files)
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"recording": [digest_file(path) for path in self.files]}
+
+    def read(self, item: int) -> list[Sample]:
+        samples = []
+        with np.load(self.files[item], allow_pickle=False) as part:
+            arrays = {name: part[name] for name in part.files}
+        first = int(self.files[item].stem)
+        columns = {n.removeprefix("column_"): x.tolist() for n, x in arrays.items() if n.startswith("column_")}
+        pick: Callable[[str, int], np.ndarray | None] = lambda m, i: arrays[m][i] if m in arrays else None  # noqa: E731
+        for i in range(len(columns["time"])):
+            own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
+            # Frames between touches belong to nothing; each touch is a group of near-copies.
+            group = f"touch-{own['touch_number']:06d}" if own["contact"] else f"rest-{own['touch_number']:06d}"
+            own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled"}
+            samples.append(Sample(vision=pick("vision", i), touch=pick("touch", i), columns=own))
+        return samples

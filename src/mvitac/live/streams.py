@@ -1,0 +1,188 @@
+"""Streams of frames: the newest one wins, and every fault is named.
+
+A ``Stream`` keeps its source's newest frame (``live/cameras.py``), counts what was dropped and says what is wrong with it. Time
+comes from a clock that is given, so all of it runs on a fake one. Frames are uint8 RGB [H, W, 3].
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvitac.live.cameras import Ended, Source
+from mvitac.system.files import brief
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture and when it was taken (seconds of the stream's clock)."""
+
+    image: np.ndarray
+    time: float
+    number: int
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something a user must know: ``what`` is the kind of fault (or its end), ``text`` the whole sentence."""
+
+    time: float
+    stream: str
+    what: str
+    text: str
+
+
+class Stream:
+    """One source's newest frame and its health. ``pump`` belongs to one thread, everything else to any."""
+
+    def __init__(
+        self,
+        name: str,
+        origin: Source,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        tell: Callable[[Event], None] = lambda event: None,
+        stale_after: float = 0.5,
+        frozen_after: float = 1.0,
+        retry_every: float = 1.0,
+    ) -> None:
+        """``stale_after``: age in seconds from which a frame is no longer used; ``frozen_after``: how long pictures may be
+        identical to the last byte; ``retry_every``: pause between tries to open a lost device."""
+        self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
+        self.stale_after, self.frozen_after, self.retry_every = stale_after, frozen_after, retry_every
+        self.fault: str | None = None
+        self.ended = False
+        self.num_frames = self.num_dropped = self.num_damaged = 0
+        self.events: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._newest: Frame | None = None
+        self._taken = True
+        self._open = False
+        self._retry_at = float("-inf")
+        self._lost_at = self._moved_at = self._opened_at = clock()
+        self._stalled = False
+        self._arrivals: deque[float] = deque(maxlen=30)
+
+    def pump(self) -> None:
+        """Read one frame, or try once to open the source; blocks as long as the device does."""
+        if self.ended:
+            return
+        try:
+            if not self._open:
+                if self.clock() < self._retry_at:
+                    return
+                self.origin.open()
+                self._open, self._opened_at = True, self.clock()
+            image = self.origin.read()
+        except Ended:
+            self.ended = True
+            self._say("ended", "has no more frames")
+            return
+        except ValueError as error:
+            self.num_damaged += 1
+            self._say("damaged frame", f"skipped a damaged frame ({brief(error)})")
+            return
+        except Exception as error:  # OSError; OpenCV and the drivers under it have kinds of their own
+            self._lost(error)
+            return
+        self._take(image)
+
+    def newest(self, *, take: bool = True) -> Frame | None:
+        """The newest frame, whatever its age; with ``take`` it then counts as used, not as dropped."""
+        with self._lock:
+            self._taken = self._taken or take
+            return self._newest
+
+    def check(self) -> None:
+        """Say so if the device has stopped giving frames; ``pump`` cannot, it is what waits."""
+        now = self.clock()
+        last = self._newest.time if self._newest else self._opened_at
+        if self._open and not self.ended and not self._stalled and now - last > self.stale_after:
+            self._stalled = True
+            self._say("stalled", f"gives no frames since {now - last:.1f} s")
+
+    def age(self) -> float:
+        """Seconds since the newest frame was taken; infinite before the first."""
+        frame = self._newest
+        return self.clock() - frame.time if frame else float("inf")
+
+    def rate(self) -> float:
+        """Frames per second over the last thirty."""
+        arrivals = list(self._arrivals)
+        return (len(arrivals) - 1) / (arrivals[-1] - arrivals[0]) if len(arrivals) > 1 and self._open else 0.0
+
+    def close(self) -> None:
+        self.origin.close()
+        self._open = False
+
+    def _take(self, image: np.ndarray) -> None:
+        now, before = self.clock(), self._newest
+        if self.fault == "unplugged":
+            self._say("back", f"is back after {now - self._lost_at:.1f} s")
+        elif self._stalled:
+            self._say("running again", "gives frames again")
+        self._stalled = False
+        if before is None or before.image.shape != image.shape:
+            if before is not None:
+                self._say("resolution changed", f"changed from {_shape(before.image)} to {_shape(image)}")
+            self._moved_at = now
+        elif not np.array_equal(before.image, image):
+            if self.fault == "frozen":
+                self._say("moving again", f"moves again after {now - self._moved_at:.1f} s")
+            self._moved_at = now
+        elif self.fault != "frozen" and now - self._moved_at >= self.frozen_after:
+            self._say("frozen", f"shows the same picture since {now - self._moved_at:.1f} s")
+        self.num_frames += 1
+        self._arrivals.append(now)
+        with self._lock:
+            self.num_dropped += not self._taken
+            self._newest, self._taken = Frame(image, now, self.num_frames), False
+
+    def _lost(self, error: Exception) -> None:
+        self.origin.close()
+        self._open, self._stalled = False, False
+        self._retry_at = self.clock() + self.retry_every
+        if self.fault != "unplugged":
+            self._lost_at = self.clock()
+            self._arrivals.clear()
+            self._say("unplugged", f"is gone ({brief(error)}): trying again every {self.retry_every:g} s")
+
+    def _say(self, what: str, text: str) -> None:
+        self.events[what] += 1
+        if what in ("unplugged", "frozen", "stalled", "ended"):
+            self.fault = what
+        elif what in ("back", "moving again", "running again"):
+            self.fault = None
+        self.tell(Event(self.clock(), self.name, what, f"{self.name} {text}"))
+
+
+def _shape(image: np.ndarray) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+class CaptureThread(threading.Thread):
+    """Pumps one stream until ``stop``; files are slowed down to their own rate."""
+
+    def __init__(self, stream: Stream, wake: Callable[[], None]) -> None:
+        super().__init__(name=f"capture {stream.name}", daemon=True)
+        self.stream, self.wake, self.stopping = stream, wake, threading.Event()
+
+    def run(self) -> None:
+        due = time.monotonic()
+        while not self.stopping.is_set() and not self.stream.ended:
+            self.stream.pump()
+            self.wake()
+            wait = 0.0
+            if self.stream.fault == "unplugged":
+                wait = min(0.1, self.stream.retry_every)
+            elif not self.stream.origin.paced:
+                due = max(due + 1 / self.stream.origin.fps, time.monotonic() - 0.1)
+                wait = due - time.monotonic()
+            if wait > 0:
+                self.stopping.wait(wait)
+        self.stream.close()

@@ -1,0 +1,1 @@
+"""Network parts: trunks, momentum copies, memory banks, losses."""

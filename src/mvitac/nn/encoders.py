@@ -1,0 +1,122 @@
+"""Trunks (any timm model by name), their weights, and the projection heads."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import timm
+from timm.models import register_model
+from timm.models.resnet import BasicBlock, ResNet
+from torch import Tensor, nn
+
+from mvitac.data.spec import DataSpec
+from mvitac.nn.small_conv import use_products
+from mvitac.system.files import brief
+
+IMAGENET, SCRATCH = "imagenet", "scratch"
+
+
+@register_model
+def mvitac_tiny(pretrained: bool = False, **kwargs: Any) -> ResNet:
+    """A ResNet of one thin block per stage (64-d features, 78 k parameters): for tests and the smoke recipe."""
+    if pretrained:
+        raise ValueError("mvitac_tiny has no ImageNet weights: use --encoder.weights scratch")
+    for key in ("pretrained_cfg", "pretrained_cfg_overlay", "cache_dir"):
+        kwargs.pop(key, None)
+    shape: dict[str, Any] = {"block": BasicBlock, "layers": (1, 1, 1, 1), "channels": (8, 16, 32, 64)}
+    return ResNet(**shape, stem_width=8, stem_type="deep", **kwargs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderConfig:
+    """The network under both modalities."""
+
+    trunk: str = "resnet18.tv_in1k"
+    """Any timm model name; the paper uses ResNet-18 (resnet18.tv_in1k is torchvision's)."""
+    weights: str = IMAGENET
+    """`imagenet` (downloaded by timm), `scratch` (random), or a file with the trunk's state dict (.safetensors, .pth)."""
+
+    def __post_init__(self) -> None:
+        if not timm.is_model(self.trunk.split(".")[0]):
+            near = difflib.get_close_matches(self.trunk.split(".")[0], timm.list_models(), n=3)
+            hint = f"; did you mean {', '.join(near)}?" if near else ""
+            raise ValueError(f"unknown trunk {self.trunk!r}: give the name of a timm model, e.g. resnet18{hint}")
+
+
+def build_trunk(config: EncoderConfig, channels: int) -> nn.Module:
+    """A trunk from ``channels`` x H x W to pooled features [B, D]; attribute ``num_features`` is D.
+
+    More than three input channels keep the pretrained stem: timm repeats and rescales its filters. Never falls back to
+    random weights in silence: ValueError if the asked-for weights cannot be had.
+    """
+    return use_products(_from_timm(config, channels))
+
+
+def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
+    arguments: dict[str, Any] = {"num_classes": 0, "in_chans": channels}
+    if config.weights == SCRATCH:
+        try:
+            return timm.create_model(config.trunk, **arguments)
+        except Exception as error:  # an unknown tag, or a trunk that cannot have these channels
+            raise ValueError(
+                f"trunk {config.trunk} cannot be made for {channels} channels ({brief(error)}): give another --encoder.trunk"
+            ) from None
+    if config.weights != IMAGENET:
+        # Checked here, not when the config is made: a finished run must load where its start weights are gone.
+        if not Path(config.weights).is_file():
+            raise ValueError(f"weights {config.weights!r}: give imagenet, scratch, or a file that exists")
+        try:
+            return timm.create_model(
+                config.trunk, pretrained=True, pretrained_cfg_overlay={"file": config.weights}, **arguments
+            )
+        except Exception as error:  # torch, safetensors and timm each raise their own kinds on a foreign file
+            raise ValueError(f"{config.weights} does not hold weights for {config.trunk}: {brief(error)}") from None
+    try:
+        return timm.create_model(config.trunk, pretrained=True, **arguments)
+    except Exception as error:
+        raise ValueError(
+            f"ImageNet weights for {config.trunk} could not be loaded ({brief(error)}): check the network,"
+            " give --encoder.weights FILE, or start from random weights with --encoder.weights scratch"
+        ) from None
+
+
+class Head(nn.Sequential):
+    """Projection head g(.; phi): a 2-layer MLP, ReLU after the first layer, nothing after the last (paper, appendix A)."""
+
+    def __init__(self, features: int, hidden: int, out: int, *, dropout: float = 0.0, norm: bool = False) -> None:
+        layers: list[nn.Module] = [nn.Linear(features, hidden, bias=not norm)]
+        if norm:
+            layers.append(nn.BatchNorm1d(hidden))
+        layers.append(nn.ReLU())
+        if dropout:
+            layers.append(nn.Dropout(dropout))
+        super().__init__(*layers, nn.Linear(hidden, out))
+
+
+class Projected(nn.Module):
+    """A trunk with one head: images [B, C, H, W] to embeddings [B, D]."""
+
+    def __init__(self, trunk: nn.Module, head: nn.Module) -> None:
+        super().__init__()
+        self.trunk, self.head = trunk, head
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.head(self.trunk(images))
+
+
+def num_features(trunk: nn.Module) -> int:
+    """Width D of a trunk's pooled features."""
+    return int(trunk.num_features)  # type: ignore[arg-type]
+
+
+def build_towers(config: EncoderConfig, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
+    """A ``Projected`` per modality of ``spec``, with fresh weights drawn in its order; ``head`` makes one for D features."""
+    towers = nn.ModuleDict()
+    for modality in spec.modalities:
+        trunk = build_trunk(config, spec.channels(modality))
+        towers[modality] = Projected(trunk, head(num_features(trunk)))
+    return towers

@@ -1,0 +1,161 @@
+"""A contact sheet of a pack: a few pairs of every class or object, camera beside touch, for a person to judge.
+
+What to look for: do camera and touch belong together, are labels right and colours natural, is anything blank or upside
+down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mvitac.data.pack import SPLITS, Pack
+from mvitac.registry import unknown
+
+GAP, LINE = 6, 22
+"""Pixels between pairs, and of a line of text."""
+TASK = "label_"
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One class or object: its name, how many rows it has, and the rows to show."""
+
+    name: str
+    num_rows: int
+    num_groups: int
+    rows: np.ndarray
+
+
+def strips(
+    pack: Pack, by: str = "", *, split: str = "", num: int = 6, limit: int = 40, seed: int = 0
+) -> tuple[list[Strip], int]:
+    """At most ``limit`` strips of ``num`` random rows, and how many strips there would be in all.
+
+    ``by`` is a task or a column; default the first task, else the group. Rows of other groups (of one group: of other
+    touches) come first: the others look alike.
+    """
+    if split and split not in SPLITS:
+        raise unknown("split", split, SPLITS)
+    if num < 1 or limit < 1:
+        raise ValueError(f"num {num}, limit {limit}: give at least 1")
+    names = [task.name for task in pack.spec.tasks]
+    by = by or (names[0] if names else "group")
+    if by in names:
+        task = pack.spec.tasks[names.index(by)]
+        words = np.array([*task.classes, "(no label)"])[pack.column(f"{TASK}{by}")]
+        order = [*task.classes, "(no label)"]
+    elif by in pack.table.column_names:
+        words = pack.column(by).astype(str)
+        order = sorted(set(words))
+    else:
+        raise unknown("task or column", by, [*names, *pack.table.column_names])
+    allowed = np.isin(pack.column("split"), (split,) if split else SPLITS)
+    groups = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
+    rng = np.random.default_rng(seed)
+    found = []
+    for name in order:
+        rows = np.flatnonzero((words == name) & allowed)
+        if len(rows):
+            several = len(set(groups[rows]))
+            apart = groups[rows] if several > 1 else pack.touch_groups[rows]
+            found.append(Strip(name, len(rows), several, _spread(rows, apart, num, rng)))
+    if not found:
+        raise ValueError(f"{pack.path} has no rows in split {split}: choose another")
+    return found[:limit], len(found)
+
+
+def _spread(rows: np.ndarray, groups: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
+    """``num`` of ``rows``, one of every group before a second of any."""
+    order = rng.permutation(len(rows))
+    turns: dict[int, int] = {}
+    keys = []
+    for group in groups[order].tolist():
+        keys.append(turns.get(group, 0))
+        turns[group] = keys[-1] + 1
+    return rows[order[np.argsort(keys, kind="stable")][:num]]
+
+
+def pair(pack: Pack, row: int, side: int) -> Image.Image:
+    """Row ``row`` as one picture ``side`` pixels high: camera, then each tactile sensor; a gap is a crossed-out tile."""
+    tiles = []
+    for modality in pack.spec.modalities:
+        image, there = pack.images[modality][row], bool(pack.has(modality)[row])
+        for sensor in np.split(image, image.shape[2] // 3, axis=2):
+            tile = Image.fromarray(np.ascontiguousarray(sensor)) if there else _nothing(pack.size)
+            tiles.append(tile.resize((side, side), Image.Resampling.LANCZOS))
+    joined = Image.new("RGB", (side * len(tiles), side))
+    for place, tile in enumerate(tiles):
+        joined.paste(tile, (place * side, 0))
+    return joined
+
+
+def _nothing(side: int) -> Image.Image:
+    tile = Image.new("RGB", (side, side), (225, 225, 225))
+    draw = ImageDraw.Draw(tile)
+    draw.line([(0, 0), (side, side)], fill=(150, 150, 150), width=max(1, side // 40))
+    draw.line([(0, side), (side, 0)], fill=(150, 150, 150), width=max(1, side // 40))
+    return tile
+
+
+def heading(strip: Strip, pack: Pack) -> str:
+    """``wood: 48 rows, 12 objects``; an object's own strip need not count itself."""
+    groups = f", {strip.num_groups} {pack.spec.group_by}s" * (strip.num_groups > 1)
+    return f"{strip.name}: {strip.num_rows} row{'s' * (strip.num_rows > 1)}{groups}"
+
+
+def contents(pack: Pack) -> str:
+    """What every pair shows, left to right."""
+    sensors = pack.spec.touch_channels // 3
+    touch = {0: [], 1: ["touch"], 2: ["left touch", "right touch"]}.get(sensors, [f"{sensors} touch images"])
+    return ", ".join([*(["camera"] if pack.spec.vision_channels else []), *touch])
+
+
+def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96) -> Image.Image:
+    """All strips in one picture."""
+    font = ImageFont.load_default(size=14)
+    first = pair(pack, int(found[0].rows[0]), side)
+    width = max(480, max(len(strip.rows) for strip in found) * (first.width + GAP) + GAP)
+    left_out = f"; {num_all - len(found)} more not shown" * (num_all > len(found))
+    height = LINE + 4 + len(found) * (side + LINE + GAP) + GAP
+    sheet = Image.new("RGB", (width, height), "white")
+    draw = ImageDraw.Draw(sheet)
+    title = f"{pack.spec.name}, {pack.num} rows at {pack.size} px; each pair: {contents(pack)}{left_out}"
+    draw.text((GAP, 4), title, fill=(90, 90, 90), font=font)
+    top = LINE + 4
+    for strip in found:
+        draw.text((GAP, top + 2), heading(strip, pack), fill="black", font=font)
+        for place, row in enumerate(strip.rows):
+            sheet.paste(pair(pack, int(row), side), (GAP + place * (first.width + GAP), top + LINE))
+        top += side + LINE + GAP
+    return sheet
+
+
+def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128) -> str:
+    """All strips as one self-contained page; every pair with its id, group, split and labels."""
+    from mvitac.report import html
+
+    tasks = {task.name: (task.classes, pack.column(f"{TASK}{task.name}")) for task in pack.spec.tasks}
+    names = {name: pack.column(name).astype(str) for name in ("id", "group", "split")}
+
+    def caption(row: int) -> str:
+        labels = [f"{t}: {classes[v[row]]}" for t, (classes, v) in tasks.items() if v[row] >= 0]
+        return "; ".join([*(found[row] for found in names.values()), *labels])
+
+    sections = []
+    for number, strip in enumerate(found):
+        cards = [
+            html.figure(html.picture(np.asarray(pair(pack, int(r), side)), caption(int(r)), side), caption(int(r)))
+            for r in strip.rows
+        ]
+        sections.append((f"s{number}", heading(strip, pack), html.grid(cards)))
+    left_out = f" {num_all - len(found)} more are not shown." * (num_all > len(found))
+    head = f"<h1>{escape(pack.spec.name)}</h1>" + html.paragraph(
+        f"{pack.num} rows at {pack.size} px, drawn at random; each pair: {contents(pack)}.{left_out}"
+    )
+    foot = escape(f"source {pack.spec.source}; licence {pack.spec.licence}; pack {pack.digest[:16]}")
+    return html.html_page(f"{pack.spec.name}: contact sheet", head, sections, foot)

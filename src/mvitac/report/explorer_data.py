@@ -1,0 +1,154 @@
+"""What the explorer shows, without the page: a run's features laid out in a plane, their neighbours, their mistakes.
+
+Shapes: N rows of the pack that are shown, D features.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from mvitac.data.pack import Pack
+from mvitac.deploy.publish import with_readouts
+from mvitac.deploy.search import check_pack, nearest
+from mvitac.evaluation.features import features, sample
+from mvitac.model import Model
+from mvitac.registry import unknown
+
+COLOURS = (
+    *("#2490fc", "#fc783c", "#008400", "#a80048", "#fc54fc", "#604800", "#00f000", "#6c00a8", "#e4cc90", "#0c8490"),
+    *("#0000f0", "#fc0c78", "#54c078", "#9c7830", "#6cccfc", "#c000c0", "#004878", "#fcb4fc", "#7848fc", "#b484b4"),
+)
+"""Twenty hues and lightnesses as far apart in OKLab as a search found (least distance .165, and .067 as seen without
+green cones), legible on white and on black; classes beyond the twentieth begin again."""
+
+
+class ExplorerData:
+    """One run's rows: ``rows`` [N] pack rows, ``x[modality]`` [N, D] unit features, ``guess[task]`` [N]."""
+
+    def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
+        """At most ``limit`` rows are shown, a sample of those that lack no image. A model without probes gets them fitted on
+        ``pack``. ValueError if the pack's images do not fit the model.
+        """
+        names = check_pack(model, pack)
+        self.model, self.pack = with_readouts(model, pack), pack
+        whole = np.flatnonzero(np.all([pack.has(m) for m in names], axis=0))
+        if not len(whole):
+            raise ValueError(f"{pack.path} has no row with {' and '.join(names)}: there is nothing to show")
+        self.rows = sample(whole, limit)
+        raw = {m: features(model, pack, m, self.rows) for m in names}
+        self.x = {m: _unit(f) for m, f in raw.items()}
+        self.modalities = (*raw, *(["both"] if len(raw) == 2 else []))
+        self.split = pack.column("split")[self.rows].astype(str)
+        self.labels = {t.name: pack.column(f"label_{t.name}")[self.rows].astype(int) for t in pack.spec.tasks}
+        self.classes: dict[str, tuple[str, ...]] = {t.name: t.classes for t in pack.spec.tasks}
+        self.guess: dict[str, np.ndarray] = {}
+        for task in tuple(self.classes):
+            readout = self.model.readouts.get(f"{task}.{self.modalities[-1]}")
+            if readout:
+                joined = np.concatenate([raw[m] for m in readout.question.modalities], axis=1)
+                # By name: the probe may be of other data, which has the classes in another order, or other classes.
+                known = readout.question.classes
+                names = self.classes[task] = tuple(dict.fromkeys((*self.classes[task], *known)))
+                found = readout(torch.from_numpy(joined)).argmax(1).numpy()
+                self.guess[task] = np.array([names.index(name) for name in known])[found]
+        self._planes: dict[str, np.ndarray] = {}
+
+    def plane(self, modality: str) -> np.ndarray:
+        """[N, 2] in [0, 1]: the two directions in which the unit features vary most (principal components)."""
+        if modality not in self.modalities:
+            raise unknown("modality", modality, self.modalities)
+        if modality not in self._planes:
+            x = np.concatenate([self.x[m] for m in self.x], axis=1) if modality == "both" else self.x[modality]
+            x = x - x.mean(0)
+            _, vectors = np.linalg.eigh(x.T @ x)
+            xy = x @ vectors[:, -2:][:, ::-1]
+            low, high = np.percentile(xy, [0.5, 99.5], axis=0)  # a lone outlier must not squeeze the rest
+            self._planes[modality] = np.clip((xy - low) / np.maximum(high - low, 1e-9), 0, 1)
+        return self._planes[modality]
+
+    def shown(self, split: str, task: str | None, *, mistakes: bool = False) -> np.ndarray:
+        """Indices into ``rows`` of one split ("all" = every one), of ``task``'s mistakes only if asked."""
+        keep = np.ones(len(self.rows), bool) if split == "all" else self.split == split
+        if mistakes and task in self.guess:
+            keep &= (self.labels[task] >= 0) & (self.guess[task] != self.labels[task])
+        return np.flatnonzero(keep)
+
+    def points(self, modality: str, colour: str, split: str, task: str | None, *, mistakes: bool = False) -> str:
+        """The map as JSON for scatter.js; ``colour`` is "label", "error" or "split"."""
+        index = self.shown(split, task, mistakes=mistakes)
+        if colour == "split" or task is None:
+            names: Sequence[str] = sorted(set(self.split))
+            values = np.searchsorted(names, self.split)
+        elif colour == "error":
+            names = ("right", "wrong", "unlabelled")
+            wrong = self.guess[task] != self.labels[task] if task in self.guess else np.zeros(len(self.rows), bool)
+            values = np.where(self.labels[task] < 0, 2, wrong.astype(int))
+        else:
+            names = (*self.classes[task], "unlabelled")
+            values = np.where(self.labels[task] < 0, len(names) - 1, self.labels[task])
+        used = np.unique(values[index])
+        palette = {"right": "#9ecae1", "wrong": "#d62728", "unlabelled": "#bbbbbb"}
+        legend = [[str(names[v]), palette.get(names[v], COLOURS[v % len(COLOURS)])] for v in used.tolist()]
+        xy = (65535 * self.plane(modality)[index].T).astype("<u2")
+        return json.dumps(
+            {
+                "xy": _base64(xy),
+                "colour": _base64(np.searchsorted(used, values[index]).astype("<u2")),
+                "row": _base64(index.astype("<i4")),
+                "legend": legend,
+            }
+        )
+
+    def neighbours(self, queries: np.ndarray, modality: str, k: int, without: int = -1) -> list[tuple[int, float]]:
+        """(index, cosine) of the k rows nearest to a unit vector [1, D]; ``without`` is left out."""
+        index, scores = nearest(self.x[modality], queries, k + 1)
+        pairs = zip(index[0].tolist(), scores[0].tolist(), strict=True)
+        return [(i, s) for i, s in pairs if i != without][:k]
+
+    def describe(self, i: int) -> str:
+        """One line on row ``i``: id, labels, what the probes say where they err."""
+        row = int(self.rows[i])
+        parts = [str(self.pack.table.column("id")[row]), str(self.split[i])]
+        for task, labels in self.labels.items():
+            if labels[i] >= 0:
+                text = self.classes[task][labels[i]]
+                if task in self.guess and self.guess[task][i] != labels[i]:
+                    text += f" (probe: {self.classes[task][self.guess[task][i]]})"
+                parts.append(text)
+        return " · ".join(parts)
+
+    def name(self, i: int) -> str:
+        """The labels of row ``i``, or its id where it has none."""
+        said = [self.classes[task][labels[i]] for task, labels in self.labels.items() if labels[i] >= 0]
+        return ", ".join(said) or str(self.pack.table.column("id")[int(self.rows[i])])
+
+    def picture(self, i: int, modality: str) -> np.ndarray:
+        """uint8 [S, S, 3], or [S, 2 S, 3] for two sensors."""
+        image = self.pack.images[modality][int(self.rows[i])]
+        return np.concatenate([image[..., c : c + 3] for c in range(0, image.shape[2], 3)], axis=1)
+
+    def query(self, image: np.ndarray, modality: str, k: int) -> tuple[dict[str, Any], list[tuple[int, float]]]:
+        """(probabilities by class name by task, neighbours) of a foreign uint8 picture [H, W, 3]."""
+        num = self.pack.spec.channels(modality) // 3
+        given = np.concatenate([image] * num, axis=2)
+        pictures: dict[str, Any] = {modality: given}
+        said = {}
+        if any(r.question.modality == modality for r in self.model.readouts.values()):
+            for task, p in self.model.predict(**pictures).items():
+                said[task] = dict(zip(self.model.classes[task], p[0].tolist(), strict=True))
+        x = _unit(self.model.embed(**pictures)[modality].cpu().numpy())
+        return said, self.neighbours(x, modality, k)
+
+
+def _unit(x: np.ndarray) -> np.ndarray:
+    return (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

@@ -1,0 +1,293 @@
+"""Finished runs as one page to look at: verdict, curves, tables with controls, pictures, settings, cost. No network."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from rich.console import Console
+
+from mvitac import __version__
+from mvitac.data.pack import Pack
+from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs
+from mvitac.evaluation.probe import cross_modal, parts
+from mvitac.model import load
+from mvitac.registry import to_json
+from mvitac.report import galleries, tables
+from mvitac.report import html as page
+from mvitac.report import sections as evidence
+from mvitac.report.sections import WORDS, Finished, Study
+from mvitac.run import load_run
+from mvitac.system.files import write_atomic
+
+
+def write_report(
+    paths: Sequence[Path],
+    out: Path,
+    *,
+    result: dict[str, Any] | None = None,
+    pack: Pack | None = None,
+    quiet: bool = False,
+) -> Path:
+    """Write ``out``/report.html and ``out``/figures/*.png about finished runs on the same data; return the page's path.
+
+    ``result`` is what ``probe.probe_runs`` returned for these runs; without it they are probed here: logistic
+    regression, all tasks, all controls. ``pack`` is what to look at instead of the runs' own data. ValueError for runs
+    that are not finished.
+    """
+    runs = open_runs([Path(path) for path in paths])
+    if pack is None and len({r.record.get("pack") for r in runs}) > 1:
+        raise ValueError("these runs were trained on different data: report them apart")
+    console = Console(stderr=True, quiet=quiet)
+    pack = pack or runs[0].run.data.open(quiet=quiet)
+    if result is None:
+        with console.status("probing"):
+            result = _probe(runs, pack)
+    elif not isinstance(result, dict) or {"pack", "records", "retrieval", "summary", "classes"} - set(result):
+        raise ValueError("this is not a probe result: make one with `mvitac probe RUN... --json FILE`")
+    elif result["pack"] != pack.digest:
+        raise ValueError(
+            "the probe result is about other data than these runs: make it again with `mvitac probe --json`"
+        )
+    _check_scored(runs, result)
+    runs = _as_scored(runs, result)
+    with console.status("drawing"):
+        html = _page(Study(runs, pack, result, Path(out)))
+    write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
+    return Path(out) / "report.html"
+
+
+def open_runs(paths: Sequence[Path]) -> list[Finished]:
+    """Load finished runs; ValueError says which folder is not one, and what to do."""
+    if not paths:
+        raise ValueError("give at least one run's folder")
+    for path in paths:
+        if not (path / "run.json").is_file():
+            raise ValueError(f"no run at {path}: give the folder that `mvitac pretrain --out` wrote")
+        if not (path / "model.safetensors").exists():
+            again = shlex.join(["mvitac", "pretrain", "--from", str(path / "run.json"), "--resume", "--out", str(path)])
+            raise ValueError(f"the run in {path} is not finished: continue it with `{again}`")
+    opened = [(path, *load_run(path), read_log(path / "log.jsonl"), load(path)) for path in paths]
+    names = names_of([path for path, *_ in opened], [model for *_, model in opened])
+    return [Finished(*each, name) for each, name in zip(opened, names, strict=True)]
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The lines of a log.jsonl; a missing file is an empty log, a half-written line ends it."""
+    lines = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            lines.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
+    usable = []
+    for task in pack.spec.tasks:
+        try:
+            parts(pack, task, "both")
+        except ValueError:  # no labelled rows to learn from or to be scored on
+            continue
+        usable.append(task.name)
+    if usable:
+        return probe_runs([r.path for r in runs], ProbeConfig(tasks=tuple(usable)), pack)
+    own = [{"source": r.source, "seed": r.run.seed, "run": str(r.path)} for r in runs]
+    found = [{**o, **f} for o, r in zip(own, runs, strict=True) for f in cross_modal(r.model, pack)]
+    shared: dict[str, Any] = {"records": [], "retrieval": found, "summary": {}, "classes": {}}
+    return {"data": pack.spec.name, "pack": pack.digest, "group_by": pack.spec.group_by, **shared}
+
+
+def _check_scored(runs: Sequence[Finished], result: dict[str, Any]) -> None:
+    """Refuse numbers of other runs than those shown."""
+    scored = {Path(r["run"]).resolve() for r in [*result["records"], *result["retrieval"]] if "run" in r}
+    shown = {run.path.resolve(): run.path for run in runs}
+    again = "make it again with `mvitac probe --json`"
+    for path in shown.keys() - scored if scored else ():
+        raise ValueError(f"the probe result does not score {shown[path]}: {again}")
+    for path in scored - shown.keys():  # its means are of all its runs, and it calls them by what tells those apart
+        raise ValueError(f"the probe result scores {path} too: show that run as well, or {again}")
+
+
+def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finished]:
+    """``runs`` by the names that ``result`` has for them: it may be older."""
+    records = [*result["retrieval"], *result["records"]]
+    names = {Path(r["run"]).resolve(): r["source"].removesuffix(END_TO_END) for r in records if "run" in r}
+    return [replace(run, source=names.get(run.path.resolve(), run.source)) for run in runs]
+
+
+# -- the page ---------------------------------------------------------------------------------------------------------
+
+
+def _page(study: Study) -> str:
+    title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
+    sections = [
+        ("scores", "What the frozen features are worth", evidence.probe(study)),
+        ("retrieval", "Finding the other modality", evidence.retrieval(study)),
+        ("loss", "Loss", evidence.loss(study)),
+        ("collapse", "Learning or collapsing?", evidence.collapse(study)),
+        ("confusion", "What is taken for what", evidence.confusions(study)),
+        ("map", "A map of the features", galleries.feature_maps(study)),
+        ("gallery", "Retrieval gallery", galleries.gallery(study)),
+        ("settings", "Settings", _settings(study)),
+        ("cost", "What it cost", _cost(study)),
+        ("again", "Do it again", _again(study)),
+    ]
+    spec = study.pack.spec
+    notes = "".join(f" Note: {note}." for note in spec.notes)
+    foot = page.paragraph(
+        f"Data: {spec.name}, from {spec.source}; licence {spec.licence}.{notes}"
+        f" All intervals are 95 %, by bootstrap over test {spec.group_by}s and seeds."
+        f" Written by mvitac {__version__}; this page makes no network request."
+    )
+    return page.html_page(title, _head(study, title), [s for s in sections if s[2]], foot)
+
+
+def _head(study: Study, title: str) -> str:
+    runs = study.runs
+    seeds = sorted({r.run.seed for r in runs})
+    chips = {
+        "method": ", ".join(dict.fromkeys(r.run.method.name for r in runs)),
+        "data": study.pack.spec.name,
+        "recipe": ", ".join(dict.fromkeys(r.run.recipe for r in runs)),
+        "seeds" if len(seeds) > 1 else "seed": ", ".join(map(str, seeds)),
+        "trunk": ", ".join(dict.fromkeys(r.run.encoder.trunk for r in runs)),
+        "input": ", ".join(dict.fromkeys(f"{r.run.augment.eval_size} px" for r in runs)),
+    }
+    items = "".join(f"<li>{escape(name)} <b>{escape(value)}</b></li>" for name, value in chips.items())
+    text = "; ".join(verdicts(study)) or "nothing is scored on this data, there is only something to look at"
+    text = f"{text[0].upper()}{text[1:]}."
+    verdict = page.paragraph(text, "verdict")
+    tiles = "".join(_tile(study, task) for task in study.result["summary"])
+    top = f'<p class="eyebrow">Pre-training report</p><h1>{escape(title)}</h1><ul class="chips">{items}</ul>'
+    return f'{top}{verdict}<div class="tiles">{tiles}</div>'
+
+
+def verdicts(study: Study) -> list[str]:
+    """One clause per main result (first task, touch -> vision), of numbers only."""
+    clauses = []
+    for task in list(study.result["summary"])[:1]:
+        modality, own, controls = evidence.headline(study, task)
+        names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk"}
+        beside = [f"{names.get(name, name)} {100 * cell['mean']:.1f}" for name, cell in controls.items()]
+        methods = study.result["summary"][task][modality]
+        others = [f"{s} {100 * methods[s]['mean']:.1f}" for s in study.sources[1:] if s in methods]
+        by = f" with {study.sources[0]}" if others else ""
+        clauses.append(
+            ", ".join([f"{WORDS[modality]} reaches {100 * own['mean']:.1f} % on {task}{by}", *others, *beside])
+        )
+    found = tables.retrieval_means(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
+    if found:
+        clauses.append(
+            f"a touch finds its {study.pack.spec.group_by} among the first five by camera in {100 * found['R@5']:.1f} %"
+            f" (chance {100 * found['chance R@5']:.1f})"
+        )
+    return clauses
+
+
+def _tile(study: Study, task: str) -> str:
+    modality, own, controls = evidence.headline(study, task)
+    below = [name for name, cell in controls.items() if cell["low"] > own["high"]]
+    level = [name for name, cell in controls.items() if cell["high"] >= own["low"] and name not in below]
+    found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
+    told = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
+    told = told if controls else ""
+    numbers = f"{100 * own['mean']:.1f}<small> % [{100 * own['low']:.1f}, {100 * own['high']:.1f}]</small>"
+    by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
+    what = f"<h3>{escape(task)} <small>{escape(WORDS[modality] + by)}</small></h3>"
+    return f'<div class="card tile">{what}<div class="big">{numbers}</div>{told}</div>'
+
+
+def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as {"optim.lr": ...}."""
+    flat: dict[str, Any] = {}
+    for key, each in value.items():
+        flat |= flatten(each, f"{prefix}{key}.") if isinstance(each, dict) else {f"{prefix}{key}": each}
+    return flat
+
+
+def _settings(study: Study) -> str:
+    each = [flatten(to_json(r.run)) for r in study.runs]
+    groups: dict[str, list[list[str]]] = {}
+    for key in dict.fromkeys(key for flat in each for key in flat):
+        values = list(dict.fromkeys(_plain(flat[key]) for flat in each if key in flat))
+        group, _, name = key.rpartition(".")
+        groups.setdefault(group or "run", []).append([name, "  |  ".join(values)])
+    order = ["run", *(group for group in groups if group != "run")]
+    shown = [page.table([group, ""], groups[group], words=True, label=group) for group in order]
+    records = "".join(
+        page.fold(f"{r.path / 'run.json'} in full", page.code(json.dumps(r.record, indent=1))) for r in study.runs
+    )
+    differ = page.paragraph("Where the runs differ, their values stand side by side.") if len(study.runs) > 1 else ""
+    return f"{differ}{page.grid(shown, 'pillars')}{records}"
+
+
+def _plain(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "none", True: "yes", False: "no"}[value]
+    return ", ".join(_plain(v) for v in value) if isinstance(value, list) else str(value)
+
+
+def wall_seconds(run: Finished) -> float | None:
+    """Seconds of training by the logged speeds (steps x batch / pairs per second), or None without a usable log."""
+    seconds, before = 0.0, 0
+    for entry in run.log:
+        if "loss" in entry:
+            if not entry["pairs_per_s"] > 0:
+                return None
+            seconds += (entry["step"] - before) * run.run.batch_size / entry["pairs_per_s"]
+            before = entry["step"]
+    return seconds or None
+
+
+def _cost(study: Study) -> str:
+    rows: dict[str, list[str]] = {}
+    for r in study.runs:
+        lines = [entry for entry in r.log if "loss" in entry]
+        steps, seconds = lines[-1]["step"] if lines else 0, wall_seconds(r)
+        trunks = sum(p.numel() for p in r.model.encoders.parameters())
+        heads = sum(p.numel() for p in r.model.projectors.parameters())
+        known: dict[str, str] = {
+            "steps": f"{steps:,}",
+            "pairs seen": f"{steps * r.run.batch_size:,} (the data has {r.record.get('num_pairs', 0):,})",
+            "speed": f"{median(e['pairs_per_s'] for e in lines):,.0f} pairs/s (median)" if lines else "",
+            "wall time": _duration(seconds) if seconds else "",
+            "parameters kept": f"{trunks / 1e6:.2f} M in trunks" + (f", {heads / 1e6:.2f} M in heads" if heads else ""),
+            "machine": f"{r.record.get('machine', '')}; device {r.run.device}",
+            "versions": ", ".join(f"{k} {v}" for k, v in r.record.get("versions", {}).items()),
+            "python": str(r.record.get("python", "")),
+            "commit": str(r.record.get("commit") or "not from a checkout"),
+            "data digest": str(r.record.get("pack", "")),
+            "folder": str(r.path),
+        }
+        for name, value in known.items():
+            rows.setdefault(name, []).append(value)
+    names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
+    shown = page.table(["", *names], [[name, *values] for name, values in rows.items()], words=True, label="cost")
+    return page.paragraph("Wall time is estimated from the logged speeds; the last scoring is not in it.") + shown
+
+
+def _duration(seconds: float) -> str:
+    minutes, hours = seconds / 60, seconds / 3600
+    return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if hours < 2 else f"{hours:.1f} h"
+
+
+def _again(study: Study) -> str:
+    folders = [str(r.path) for r in study.runs]
+    lines = [
+        shlex.join(["mvitac", "pretrain", "--from", f"{folder}/run.json", "--out", f"{folder}-again"])
+        for folder in folders
+    ]
+    again = [f"{folder}-again" for folder in folders]
+    lines += [shlex.join(["mvitac", "probe", *again]), shlex.join(["mvitac", "report", *again])]
+    commits = {str(r.record.get("commit") or "")[:12] for r in study.runs}
+    commit = f" at commit {commits.pop()}" if len(commits) == 1 and "" not in commits else ""
+    intro = f"With the versions above{commit}, on data of the same digest:"
+    return page.paragraph(intro) + page.code("\n".join(lines))

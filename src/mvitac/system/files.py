@@ -1,0 +1,108 @@
+"""Files written atomically, read with clear errors, and told by their digests."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+
+def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:
+    """Let ``write`` fill a neighbouring file, then rename it over ``path``: a reader never sees half of it.
+
+    Without ``sync`` that holds against a killed process, not against lost power, and nothing waits for the disk.
+    On any failure (a full disk, Ctrl-C) the half-written neighbour is removed and ``path`` keeps its old content.
+    """
+    made = [parent for parent in path.parents if not parent.exists()]
+    neighbour = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with neighbour.open("wb") as file:
+            write(file)
+            file.flush()
+            if sync:
+                os.fsync(file.fileno())
+        os.replace(neighbour, path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            neighbour.unlink(missing_ok=True)
+            for parent in made:  # deepest first; only empty ones go
+                parent.rmdir()
+        if isinstance(error, OSError) and error.filename in (None, str(neighbour)):
+            if error.errno is None:  # numpy's own "1000 requested and 0 written", of a large array on a full disk
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+            error.filename = str(path)  # the system names no file when a write fails
+        raise
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Name ``path`` in an error of writing it: the system names no file when a disk is full."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+
+
+def check_place(path: Path) -> None:
+    """ValueError if nothing can be written at ``path``, found out before the work whose result belongs there."""
+    if "\0" in str(path):
+        raise ValueError(f"{path}: a name cannot hold a NUL character, choose another")
+    parent = next(p for p in path.absolute().parents if os.path.lexists(p))
+    try:
+        path.exists()  # says so itself where the name is too long
+        if not parent.is_dir():
+            raise ValueError(f"{path} cannot be written: {parent} is not a folder, choose another place")
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {error.strerror}, choose another place") from None
+
+
+def brief(error: BaseException) -> str:
+    """The first line of a library's error, at most 160 characters, to quote in one of ours."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+
+
+def write_json(path: Path, value: Any) -> None:
+    """``value`` as indented JSON, atomically."""
+    text = json.dumps(value, indent=1, allow_nan=False) + "\n"
+    write_atomic(path, lambda file: file.write(text.encode()))
+
+
+def read_json(path: Path, what: str) -> Any:
+    """The JSON in ``path``; ValueError says which file is missing or damaged. ``what`` names it for the reader."""
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ValueError(f"{path} does not exist: {what} is missing there") from None
+    except (IsADirectoryError, NotADirectoryError):
+        raise ValueError(f"{path} is no file but a folder, or lies below a file: give the file of {what}") from None
+    except (ValueError, RecursionError) as error:  # also: no UTF-8, numbers of 5000 digits, a million brackets
+        raise ValueError(f"{path} is not valid JSON ({brief(error)}): {what} is damaged") from None
+
+
+def digest(value: Any) -> str:
+    """sha256 (hex) of a JSON-ready value, independent of key order."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """sha256 (hex) of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def cache_dir() -> Path:
+    """Where packs and features are kept: $MVITAC_CACHE, else $XDG_CACHE_HOME/mvitac, else ~/.cache/mvitac."""
+    if "MVITAC_CACHE" in os.environ:
+        return Path(os.environ["MVITAC_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mvitac"

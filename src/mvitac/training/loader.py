@@ -1,0 +1,108 @@
+"""Where a step's pixels come from: the pack, mapped or decoded, or wholly resident on the GPU as uint8; and a thread ahead.
+
+Shapes: images uint8 [N, H, W, C] in the pack, [B, C, H, W] (channels-last) as they leave.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvitac.data.pack import Images, Pack
+from mvitac.methods.base import Views
+
+T = TypeVar("T")
+SHARE = 0.4
+"""Of a GPU's free memory that a resident pack may take."""
+
+
+class Feed:
+    """The images of ``pack`` for ``device``; on a GPU they are resident if they fit (JPEGs: decoded), else copied through
+    pinned memory."""
+
+    def __init__(self, pack: Pack, device: torch.device) -> None:
+        self.pack, self.device, self.resident = pack, device, {}
+        if device.type == "cuda":
+            size = sum(pack.images[m].nbytes for m in pack.spec.modalities)
+            if size < SHARE * torch.cuda.mem_get_info(device)[0]:
+                self.resident = {m: self._upload(pack.images[m]) for m in pack.spec.modalities}
+
+    def _upload(self, images: Images) -> Tensor:
+        whole = torch.empty(images.shape, dtype=torch.uint8, device=self.device)
+        for start in range(0, len(images), 4096):  # the file is read once, in order, in pieces
+            piece = np.ascontiguousarray(images[start : start + 4096])
+            whole[start : start + 4096] = torch.from_numpy(piece)
+        return whole
+
+    def __call__(self, modality: str, rows: np.ndarray) -> Tensor:
+        """uint8 [len(rows), C, H, W] on the device."""
+        if modality in self.resident:
+            index = torch.from_numpy(rows).pin_memory().to(self.device, non_blocking=True)
+            return self.resident[modality].index_select(0, index).permute(0, 3, 1, 2)
+        images = torch.from_numpy(self.pack.images[modality][rows])
+        if self.device.type == "cuda":
+            images = images.pin_memory().to(self.device, non_blocking=True)
+        return images.to(self.device).permute(0, 3, 1, 2)
+
+
+def ahead(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
+    """``batches`` made by a thread on a stream of their own, so that a GPU's network never waits for its input."""
+    side = torch.cuda.Stream(device)
+
+    def on_side() -> Iterator[tuple[Views, Any]]:
+        while True:
+            with torch.cuda.device(device), torch.cuda.stream(side):
+                batch = next(batches, None)
+                if batch is None:
+                    return
+                yield batch, side.record_event()
+
+    for batch, made in prefetch(on_side()):
+        stream = torch.cuda.current_stream(device)
+        stream.wait_event(made)
+        for tensor in [batch.rows, *batch.labels.values(), *(v for views in batch.images.values() for v in views)]:
+            tensor.record_stream(stream)  # else its memory could be taken while the network still reads it
+        yield batch
+
+
+def prefetch(items: Iterator[T], depth: int = 2) -> Iterator[T]:
+    """``items``, made up to ``depth`` ahead by a thread; an error of theirs is raised where the item would have come."""
+    made: queue.Queue[tuple[bool, T | BaseException | None]] = queue.Queue(depth)
+    stop = threading.Event()
+
+    def put(entry: tuple[bool, T | BaseException | None]) -> None:
+        while not stop.is_set():
+            try:
+                return made.put(entry, timeout=0.1)
+            except queue.Full:
+                continue
+
+    def work() -> None:
+        try:
+            for item in items:
+                put((True, item))
+                if stop.is_set():
+                    return
+            put((False, None))
+        except BaseException as error:
+            put((False, error))
+
+    thread = threading.Thread(target=work, name="prefetch", daemon=True)
+    thread.start()
+    try:
+        while True:
+            more, item = made.get()
+            if not more:
+                if item is not None:
+                    raise item  # type: ignore[misc]
+                return
+            yield item  # type: ignore[misc]
+    finally:
+        stop.set()
+        thread.join()

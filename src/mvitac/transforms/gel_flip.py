@@ -1,0 +1,139 @@
+"""What colours a mirrored touch has: flips of touch that a camera behind the gel could have seen.
+
+An optical gel shows slope as colour, I(x, y) = I0 + rx gx + ry gy, with I0 [3] its picture at rest, gx and gy the slopes
+of the imprint and rx, ry [3] what one unit of slope along x and along y does to the colour. Mirroring pixels leaves gx as
+it is, where a mirrored touch has -gx, and mirrors the lamps with it. The mirrored touch is
+
+    I'(x) = I0(x) + M (I(-x) - I0(-x)),  M [3, 3]: rx to -rx, ry to ry, and what is no slope (ink, shadow) to itself
+
+Nobody has to measure rx and ry: slopes are derivatives of one height, so d gx / dy = d gy / dx, and of all pairs of
+colour mixtures of a sensor's pictures only those of gx and gy obey it (integrability, as in uncalibrated photometric
+stereo: Yuille and Snow, CVPR 1997). I0 is the sensor's mean picture, in the mean colour of the image at hand: slopes of a
+bump add up to nothing, so that colour is lamps and tint, which differ between copies of a sensor and drift. That the mean
+picture holds the average contact does no harm as long as the average contact is its own mirror image.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
+from scipy.linalg import eigh
+from torch import Tensor
+
+from mvitac.data.pack import Pack
+from mvitac.transforms.random_views import ViewAugment
+
+MIN_ROWS, NUM_ROWS = 32, 256
+"""Training rows of a sensor that are needed, and as many as are looked at, evenly spread."""
+SIDE = 64
+"""Side in pixels, or a little more, at which colours are learned; what is finer is noise and JPEG."""
+REST = 16
+"""Side in pixels of the picture at rest: lamps and tint, but no dots, which contact drags along."""
+MAX_CURL, MAX_STRETCH = 0.2, 30.0
+"""Beyond these what was found are not two slopes. Curl is .03 to .11 for gels, simulated and real, .25 to .5 for gray."""
+
+
+def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Learn how pictures of one sensor, their mean taken off, colour slope.
+
+    Returns ``colours`` [3, 2] (rx and ry as columns, up to one common factor), ``mixtures`` [3, 2] (``d @ mixtures`` are
+    gx and gy of a colour ``d``, up to the inverse factor) and ``curl``, 0 for perfect slopes and .5 for noise. ValueError
+    if no two mixtures of colours are slopes of one height.
+    """
+    down = ((images[:, 2:, 1:-1] - images[:, :-2, 1:-1]) / 2).reshape(-1, 3)
+    right = ((images[:, 1:-1, 2:] - images[:, 1:-1, :-2]) / 2).reshape(-1, 3)
+    rounding = np.eye(3) * len(down) / 24  # of pictures to whole levels: channels that are equal are never exactly so
+    yy, xx, yx = down.T @ down + rounding, right.T @ right + rounding, down.T @ right
+    # The mixtures p, q [3] with the least |d(p . I)/dy - d(q . I)/dx|^2 as a share of their whole change.
+    change = yy + xx
+    shares, pairs = eigh(np.block([[yy, -yx], [-yx.T, xx]]), np.kron(np.eye(2), change))
+    mixtures, curl = pairs[:, 0].reshape(2, 3).T, float(shares[0])
+    slopes = mixtures.T @ change @ mixtures
+    if curl > MAX_CURL or np.linalg.cond(slopes) > MAX_STRETCH:
+        raise ValueError(f"colours do not follow slopes along x and y (curl {curl:.2f})")
+    return change @ mixtures @ np.linalg.inv(slopes), mixtures, curl
+
+
+def mirror_colours(colours: np.ndarray, mixtures: np.ndarray) -> np.ndarray:
+    """M [3, 3] of a horizontal flip: rx to -rx, ry and what is neither to themselves."""
+    return np.eye(3) - 2 * np.outer(colours[:, 0], mixtures[:, 0])
+
+
+class GelMirror:
+    """Flips the touch images of ``pack`` as touches, by colours learned once from each sensor's training rows.
+
+    A stacked image is mirrored gel by gel. ValueError where a sensor has too few rows or its colours follow no slope.
+    """
+
+    def __init__(self, pack: Pack, device: torch.device) -> None:
+        if not pack.spec.touch_channels:
+            raise ValueError(f"dataset {pack.spec.name!r} has no touch to flip: give --augment.gel-flip plain")
+        named = "sensor" in pack.table.column_names
+        sensors = pack.column("sensor").astype(str) if named else np.full(pack.num, "touch")
+        rows = pack.rows("train", "unlabelled", having=("touch",))
+        names = np.unique(sensors[rows]).tolist()
+        self.sensors = np.searchsorted(names, sensors)
+        """[pack.num]: number of each row's sensor; what it says of rows that nothing learns from means nothing."""
+        self.gels: list[list[tuple[Tensor, Tensor]]] = []
+        """For every sensor and gel M' [3, 3] and I0(x) - M I0(-x) [size, size, 3], where I0 is without its mean colour."""
+        for name in names:
+            own = rows[sensors[rows] == name]
+            if len(own) < MIN_ROWS:
+                raise ValueError(
+                    f"sensor {name!r} has {len(own)} training rows with touch, its colours take {MIN_ROWS}:"
+                    " give --augment.gel-flip plain"
+                )
+            own = pack.near(own, NUM_ROWS)
+            own = own[np.linspace(0, len(own) - 1, min(len(own), NUM_ROWS)).astype(int)]
+            try:
+                gels = _shrunk(pack, own).split(3, dim=1)
+                self.gels.append([tuple(t.to(device) for t in _learn(gel, pack.size)) for gel in gels])  # type: ignore
+            except ValueError as error:
+                raise ValueError(f"sensor {name!r}: {error}: give --augment.gel-flip plain") from None
+
+    def random(
+        self, images: UInt8[Tensor, "B C H W"], rows: np.ndarray, config: ViewAugment, generator: torch.Generator
+    ) -> UInt8[Tensor, "B C H W"]:
+        """``images`` of the pack's ``rows``, each mirrored with the probability ``config`` gives to a flip."""
+        num, gels = len(images), images.shape[1] // 3
+        which = torch.rand(num, gels if config.independent_sensors else 1, generator=generator) < config.flip
+        return self(images, rows, which.expand(num, gels))
+
+    @torch.no_grad()
+    def __call__(
+        self, images: UInt8[Tensor, "B C H W"], rows: np.ndarray, which: Bool[Tensor, "B G"]
+    ) -> UInt8[Tensor, "B C H W"]:
+        """``images`` of the pack's ``rows`` with the gels ``which`` (on the CPU) mirrored, rounded, channels-last."""
+        out = images.permute(0, 2, 3, 1).clone(memory_format=torch.contiguous_format)
+        for sensor in np.unique(self.sensors[rows]):
+            here = torch.from_numpy(self.sensors[rows] == sensor)
+            for gel, (matrix, rest) in enumerate(self.gels[sensor]):
+                index = (here & which[:, gel]).nonzero().flatten().to(images.device, non_blocking=True)
+                pixels = out[..., 3 * gel : 3 * gel + 3]
+                with torch.autocast(images.device.type, enabled=False):
+                    flipped = pixels[index].flip(2).float()
+                    tint = flipped.mean((1, 2), keepdim=True)
+                    mirrored = tint + (flipped - tint) @ matrix + rest
+                pixels[index] = mirrored.round_().clamp_(0, 255).to(torch.uint8)
+        return out.permute(0, 3, 1, 2)
+
+
+def _shrunk(pack: Pack, rows: np.ndarray) -> Float[Tensor, "N C h w"]:
+    """Touch images of ``rows``, pixels averaged down to about ``SIDE``."""
+    parts = []
+    for some in np.array_split(rows, -(-len(rows) // 32)):  # never all of them in full size
+        whole = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][some])).permute(0, 3, 1, 2)
+        parts.append(F.avg_pool2d(whole.float(), max(1, pack.size // SIDE)))
+    return torch.cat(parts)
+
+
+def _learn(gel: Float[Tensor, "N 3 h w"], size: int) -> tuple[Tensor, Tensor]:
+    """M' and I0(x) - M I0(-x), I0 without its mean colour, of one gel from pictures of it."""
+    mean = gel.mean(0, keepdim=True)
+    colours, mixtures, _ = slope_colours((gel - mean).permute(0, 2, 3, 1).double().numpy())
+    matrix = torch.from_numpy(mirror_colours(colours, mixtures).T).float()
+    rest = F.interpolate(F.adaptive_avg_pool2d(mean, REST), (size, size), mode="bilinear")[0].permute(1, 2, 0)
+    rest = rest - rest.mean((0, 1))
+    return matrix, (rest - rest.flip(1) @ matrix).contiguous()

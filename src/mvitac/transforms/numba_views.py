@@ -1,0 +1,291 @@
+"""The CPU's views in one pass per image: crop, resize, flip, grayscale, normalisation; compiled by numba (extra ``fast``).
+
+The fixed-point arithmetic of torch's antialiased uint8 resize, so its levels bit for bit. Each direction is weighted sums
+of whole lines (of the rows as they lie along the height, of gathered pixels along the width), which LLVM makes vectors of.
+Pixels are resized as four bytes, the last of which means nothing: so one reading fetches a pixel.
+"""
+
+# pyright: reportCallIssue=false
+# (the first parameter of an intrinsic is numba's own, not its caller's)
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+MAX_SHRINK = 1.5
+"""Side of the image over that of the view, up to which ``TERMS`` neighbours make a level; beyond it little is gained."""
+TERMS = 3
+
+# Numba computes in 64 bits what is not kept from it; multipliers of 16 bits are four times as many in a vector.
+I32, U8 = ir.IntType(32), ir.IntType(8)
+
+
+@intrinsic
+def _plus_product(_: Any, total: Any, level: Any, weight: Any) -> Any:
+    """int32 ``total`` + uint8 ``level`` * int16 ``weight``."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        product = builder.mul(builder.zext(given[1], I32), builder.sext(given[2], I32), flags=["nsw"])
+        return builder.add(given[0], product, flags=["nsw"])
+
+    return types.int32(types.int32, types.uint8, types.int16), generate
+
+
+@intrinsic
+def _level(_: Any, total: Any, precision: Any) -> Any:
+    """uint8: the whole part of a weighted sum, int32 with ``precision`` bits behind the point."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        return builder.trunc(builder.lshr(given[0], given[1]), U8)
+
+    return types.uint8(types.int32, types.int32), generate
+
+
+@intrinsic
+def _fma(_: Any, a: Any, b: Any, c: Any) -> Any:
+    """float32 ``a`` * ``b`` + ``c``, rounded once, as torch.addcmul has it."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        return builder.fma(*given)
+
+    return types.float32(types.float32, types.float32, types.float32), generate
+
+
+@intrinsic
+def _byte(_: Any, pixel: Any, shift: Any) -> Any:
+    """uint8: the eight bits of uint32 ``pixel`` from ``shift`` on."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        return builder.trunc(builder.lshr(given[0], builder.trunc(given[1], I32)), U8)
+
+    return types.uint8(types.uint32, types.int64), generate
+
+
+@njit(nogil=True)
+def _filter(length: int, size: int, starts: Any, weights: Any) -> Any:
+    """Fill in which of ``length`` levels make each of ``size``: the first of them, and int16 ``weights`` [TERMS, size].
+
+    A triangle, as wide as a step where it shrinks. Returns how many levels make one (2 or 3) and the weights' precision.
+    """
+    step = length / size
+    reach = max(step, 1.0)
+    terms, largest = 2, 0.0
+    exact = np.zeros(weights.shape)
+    for i in range(size):
+        centre = step * (i + 0.5)
+        first = max(int(centre - reach + 0.5), 0)
+        num = min(int(centre + reach + 0.5), length) - first
+        total = 0.0
+        for k in range(num):
+            exact[k, i] = max(1.0 - abs((first + k - centre + 0.5) * (1.0 / reach)), 0.0)
+            total += exact[k, i]
+        for k in range(num):
+            exact[k, i] /= total
+            largest = max(largest, exact[k, i])
+        starts[i], terms = first, max(terms, num)
+    precision = 0
+    while int(0.5 + largest * (1 << (precision + 1))) < 1 << 15:
+        precision += 1
+    for k in range(TERMS):
+        for i in range(size):
+            weights[k, i] = int(0.5 + exact[k, i] * (1 << precision))
+    return terms, np.int32(precision)
+
+
+@njit(nogil=True)
+def _copy(line: Any, out: Any) -> None:
+    for j in range(len(line)):
+        out[j] = line[j]
+
+
+@njit(nogil=True)
+def _gather(line: Any, places: Any, out: Any) -> None:
+    for j in range(len(out)):
+        out[j] = line[places[j]]
+
+
+@njit(nogil=True)
+def _pixel(red: Any, green: Any, blue: Any, precision: Any) -> Any:
+    red, green, blue = _level(red, precision), _level(green, precision), _level(blue, precision)
+    return np.uint32(red) | np.uint32(green) << np.uint32(8) | np.uint32(blue) << np.uint32(16)
+
+
+# A function for every number of terms: numba counts the uses of an array's parts wherever they outlive a branch,
+# and a count costs as much as dozens of pixels.
+
+
+@njit(nogil=True)
+def _across_2(pixels: Any, weights: Any, precision: Any, out: Any) -> None:
+    """A row of pixels, uint32 ``out`` [S]: the sum of ``pixels`` [2, S] times int16 ``weights`` [2, S]."""
+    half, p, q, u, v = np.int32(1 << (precision - 1)), pixels[0], pixels[1], weights[0], weights[1]
+    for x in range(len(out)):
+        a, b = p[x], q[x]
+        red = _plus_product(_plus_product(half, _byte(a, 0), u[x]), _byte(b, 0), v[x])
+        green = _plus_product(_plus_product(half, _byte(a, 8), u[x]), _byte(b, 8), v[x])
+        blue = _plus_product(_plus_product(half, _byte(a, 16), u[x]), _byte(b, 16), v[x])
+        out[x] = _pixel(red, green, blue, precision)
+
+
+@njit(nogil=True)
+def _across_3(pixels: Any, weights: Any, precision: Any, out: Any) -> None:
+    half, p, q, r = np.int32(1 << (precision - 1)), pixels[0], pixels[1], pixels[2]
+    u, v, w = weights[0], weights[1], weights[2]
+    for x in range(len(out)):
+        a, b, c = p[x], q[x], r[x]
+        red = _plus_product(_plus_product(half, _byte(a, 0), u[x]), _byte(b, 0), v[x])
+        green = _plus_product(_plus_product(half, _byte(a, 8), u[x]), _byte(b, 8), v[x])
+        blue = _plus_product(_plus_product(half, _byte(a, 16), u[x]), _byte(b, 16), v[x])
+        red = _plus_product(red, _byte(c, 0), w[x])
+        green = _plus_product(green, _byte(c, 8), w[x])
+        blue = _plus_product(blue, _byte(c, 16), w[x])
+        out[x] = _pixel(red, green, blue, precision)
+
+
+@njit(nogil=True)
+def _down_2(lines: Any, first: int, u: Any, v: Any, precision: Any, out: Any) -> None:
+    """A row of levels, uint8 ``out`` [L]: two ``lines`` [h, L] from ``first`` on, times int16 ``u`` and ``v``."""
+    half, a, b = np.int32(1 << (precision - 1)), lines[first], lines[first + 1]
+    for j in range(len(out)):
+        out[j] = _level(_plus_product(_plus_product(half, a[j], u), b[j], v), precision)
+
+
+@njit(nogil=True)
+def _down_3(lines: Any, first: int, u: Any, v: Any, w: Any, precision: Any, out: Any) -> None:
+    half, a, b, c = np.int32(1 << (precision - 1)), lines[first], lines[first + 1], lines[first + 2]
+    for j in range(len(out)):
+        out[j] = _level(_plus_product(_plus_product(_plus_product(half, a[j], u), b[j], v), c[j], w), precision)
+
+
+@njit(nogil=True)
+def _bfloat16(value: Any) -> Any:
+    """The bits of a float32 as bfloat16, to the nearest, ties to even."""
+    bits = np.float32(value).view(np.uint32)
+    return np.uint16(np.uint32(bits + np.uint32(0x7FFF) + (bits >> np.uint32(16) & np.uint32(1))) >> np.uint32(16))
+
+
+@njit(nogil=True)
+def _normalise(levels: Any, grayscale: bool, luma: Any, factors: Any, offsets: Any, line: Any) -> None:
+    """A line of uint8 ``levels`` [S * 4], whose fourth channel means nothing, to ``line`` [S * 3]."""
+    for x in range(len(line) // 3):
+        red, green, blue = np.float32(levels[4 * x]), np.float32(levels[4 * x + 1]), np.float32(levels[4 * x + 2])
+        if grayscale:
+            red = green = blue = _fma(blue, luma[2], _fma(green, luma[1], red * luma[0]))
+        red = _fma(red, factors[0], offsets[0])
+        green = _fma(green, factors[1], offsets[1])
+        blue = _fma(blue, factors[2], offsets[2])
+        if line.itemsize == 4:
+            line[3 * x], line[3 * x + 1], line[3 * x + 2] = red, green, blue
+        else:
+            line[3 * x], line[3 * x + 1], line[3 * x + 2] = _bfloat16(red), _bfloat16(green), _bfloat16(blue)
+
+
+@njit(nogil=True)
+def _resize_rows(
+    crop: Any, places: Any, weights: Any, terms: int, precision: Any, channels: int, held: Any, fours: Any, rows: Any
+) -> None:
+    """Fill ``rows`` [..., S] with sums of pixels of each row of ``crop``, uint8 [h, bytes], the first at ``places``."""
+    pixels = np.empty(weights.shape, np.uint32)
+    for y in range(len(crop)):
+        _copy(crop[y], held)
+        for k in range(terms):
+            _gather(fours[k * channels :], places, pixels[k])
+        if terms == 2:
+            _across_2(pixels, weights, precision, rows[y])
+        else:
+            _across_3(pixels, weights, precision, rows[y])
+
+
+@njit(nogil=True)
+def _finish(
+    rows: Any,
+    starts: Any,
+    weights: Any,
+    terms: int,
+    precision: Any,
+    grayscale: bool,
+    luma: Any,
+    factors: Any,
+    offsets: Any,
+    out: Any,
+) -> None:
+    """Sums of ``rows`` of pixels, as uint8 [..., S * 4], normalised: ``out`` [S, S * 3]."""
+    levels = np.empty(rows.shape[1], np.uint8)
+    for y in range(len(out)):
+        if terms == 2:
+            _down_2(rows, starts[y], weights[0, y], weights[1, y], precision, levels)
+        else:
+            _down_3(rows, starts[y], weights[0, y], weights[1, y], weights[2, y], precision, levels)
+        _normalise(levels, grayscale, luma, factors, offsets, out[y])
+
+
+@njit(nogil=True)
+def _views(
+    images: Any,
+    boxes: Any,
+    flip: Any,
+    grayscale: Any,
+    out: Any,
+    luma: Any,
+    factors: Any,
+    offsets: Any,
+    held: Any,
+    fours: Any,
+) -> None:
+    """``views`` of ``images`` [B, H, W * C]; ``held`` and ``fours`` are scratch: bytes, and the four from each on."""
+    size, channels = out.shape[2:]
+    starts, places = np.empty(size, np.int64), np.empty(size, np.uint64)  # unsigned: none counts from the end
+    weights, turned = np.empty((TERMS, size), np.int16), np.empty((TERMS, size), np.int16)
+    rows = np.zeros((images.shape[1] + TERMS, size), np.uint32)
+    alone = np.empty((size if channels > 3 else 0, 3 * size), out.dtype)
+    for i in range(len(images)):
+        top, left, height, width = boxes[i]
+        for channel in range(0, channels, 3):
+            terms, precision = _filter(width, size, starts, weights)
+            for x in range(size):
+                source = size - 1 - x if flip[i] else x
+                places[x] = starts[source] * channels
+                for k in range(TERMS):
+                    turned[k, x] = weights[k, source]
+            crop = images[i, top : top + height, left * channels + channel : (left + width) * channels]
+            _resize_rows(crop, places, turned, terms, precision, channels, held, fours, rows)
+            terms, precision = _filter(height, size, starts, weights)
+            lines, gray = rows.view(np.uint8), grayscale[i]
+            if channels == 3:
+                whole = out[i].reshape(size, 3 * size)
+                _finish(lines, starts, weights, terms, precision, gray, luma, factors, offsets, whole)
+            else:
+                _finish(lines, starts, weights, terms, precision, gray, luma, factors, offsets, alone)
+                out[i, :, :, channel : channel + 3] = alone.reshape(size, size, 3)
+
+
+with suppress(RuntimeError):  # nowhere to keep it: every process compiles anew
+    _views.enable_caching()
+
+
+def views(
+    images: np.ndarray,
+    boxes: np.ndarray,
+    flip: np.ndarray,
+    grayscale: np.ndarray,
+    out: np.ndarray,
+    luma: np.ndarray,
+    factors: np.ndarray,
+    offsets: np.ndarray,
+) -> None:
+    """Fill ``out`` [B, S, S, C], float32 or as uint16 the bits of bfloat16, with the views of uint8 ``images`` [B, H, W, C].
+
+    ``boxes``, ``flip`` and ``grayscale`` are those of ``random_views.Drawn``; ``luma``, ``factors`` and ``offsets`` float32 [3].
+    All contiguous. Holds no lock: several threads may fill parts of one ``out``.
+    """
+    assert max(images.shape[1:3]) <= MAX_SHRINK * out.shape[1]
+    num, height, width, channels = images.shape
+    held = np.zeros((width + TERMS) * channels, np.uint8)  # neighbours past the end of a row have weight 0
+    fours = np.ndarray(len(held) - 3, np.uint32, held, strides=(1,))
+    _views(
+        images.reshape(num, height, width * channels), boxes, flip, grayscale, out, luma, factors, offsets, held, fours
+    )

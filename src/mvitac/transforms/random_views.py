@@ -1,0 +1,309 @@
+"""Random views, per image and batched: crop, flips, grayscale, colour jitter, normalisation (paper, appendix B).
+
+Parameters are drawn first (``draw``), from an explicit generator, then applied (``apply``): so a view is a function of
+(seed, step), the two gels of a stacked pair get the same crop, and CPU and GPU can replay the same parameters.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from types import ModuleType
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as PIL and torchvision use it
+NUM_TRIES = 10  # of a crop that fits, then the largest centred one; as torchvision's RandomResizedCrop
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewAugment:
+    """What one modality's random views are made of."""
+
+    scale: tuple[float, float] = (0.2, 1.0)
+    """Crop area as a share of the image (paper: .2 to 1)."""
+    flip: float = 0.5
+    """Probability of a horizontal flip (paper: .5)."""
+    grayscale: float = 0.2
+    """Probability of grayscale (paper: .2 for materials, none for grasping)."""
+    jitter: float = 0.0
+    """Strength of brightness, contrast and per-channel gain jitter, each factor 1 +- jitter (paper: none)."""
+    noise: float = 0.0
+    """Gaussian noise on every pixel of a view, its standard deviation drawn between 0 and this many of 255 levels (paper:
+    none)."""
+    independent_sensors: bool = False
+    """Draw the two sensors of a stacked touch image apart (as the authors' code does) instead of alike."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale[0] <= self.scale[1] <= 1:
+            raise ValueError(f"augment scale {self.scale}: give two shares of the area, 0 < low <= high <= 1")
+        for name in ("flip", "grayscale"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"augment {name} {getattr(self, name)} is not a probability: give 0 to 1")
+        if not 0 <= self.jitter < 1:
+            raise ValueError(f"augment jitter {self.jitter}: give a strength in [0, 1)")
+        if not 0 <= self.noise <= 255:
+            raise ValueError(f"augment noise {self.noise}: give a standard deviation of 0 to 255 levels")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Augment:
+    """Both modalities' views and the side in pixels of what the encoders see."""
+
+    size: int = 224
+    """Side of the crop that enters the encoders (paper: 224)."""
+    whole: int | None = None
+    """Side at which the frozen encoders see whole images; none = size. A random crop shows things larger than the whole
+    image squeezed into the same side does, so features of whole images gain from a larger side (arXiv:1906.06423).
+    Heads that were trained along (shared space, own classifiers) do not, and keep to ``size`` (docs/simulator.md)."""
+    gel_flip: Literal["plain", "colour"] = "plain"
+    """What a flip of touch mirrors. plain: pixels (paper), and with them the lamps, which no real press does. colour: the
+    touch, as the same sensor would show it, by the colours of slope learned from the training rows."""
+    vision: ViewAugment = ViewAugment()
+    touch: ViewAugment = ViewAugment()
+
+    def __post_init__(self) -> None:
+        for name, side in (("size", self.size), ("whole", self.eval_size)):
+            if not 8 <= side <= 1024:
+                raise ValueError(f"augment {name} {side}: give a side of 8 to 1024 pixels")
+        if self.gel_flip == "colour" and not self.touch.flip:
+            raise ValueError(
+                "augment gel_flip 'colour' flips nothing at touch.flip 0: give --augment.touch.flip 0.5 as well"
+            )
+
+    @property
+    def eval_size(self) -> int:
+        """Side of the whole image that probes and predictions see."""
+        return self.size if self.whole is None else self.whole
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The drawn parameters of one view of B images."""
+
+    boxes: Tensor
+    """[B, 4] int64: top, left, height, width of the crop."""
+    flip: Tensor
+    """[B] bool."""
+    grayscale: Tensor
+    """[B] bool."""
+    gains: Tensor
+    """[B, 5] float: brightness, contrast, and a gain for each of R, G, B."""
+
+
+def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -> Drawn:
+    """Parameters of one random view of ``num`` images of side ``size``."""
+
+    def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
+    area = size * size * uniform(num, NUM_TRIES, low=config.scale[0], high=config.scale[1])
+    ratio = torch.exp(uniform(num, NUM_TRIES, low=-0.28768207, high=0.28768207))  # log(3/4) to log(4/3)
+    width, height = (area * ratio).sqrt().round().long(), (area / ratio).sqrt().round().long()
+    fits = (width <= size) & (height <= size) & (width > 0) & (height > 0)
+    first = fits.float().argmax(dim=1, keepdim=True)
+    none = ~fits.any(dim=1)
+    height, width = height.gather(1, first).squeeze(1), width.gather(1, first).squeeze(1)
+    height[none] = width[none] = size
+    top = (uniform(num) * (size - height + 1)).long()
+    left = (uniform(num) * (size - width + 1)).long()
+    return Drawn(
+        boxes=torch.stack([top, left, height, width], dim=1),
+        flip=uniform(num) < config.flip,
+        grayscale=uniform(num) < config.grayscale,
+        gains=uniform(num, 5, low=1 - config.jitter, high=1 + config.jitter),
+    )
+
+
+def apply(
+    images: UInt8[Tensor, "B C H W"], drawn: Drawn, size: int, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "B C S S"]:
+    """The view ``drawn`` of uint8 ``images``: cropped to [size, size], normalised, channels-last, on their device.
+
+    Computed in fp32 and rounded to ``dtype`` once, as autocast would round it before the first convolution.
+    """
+    if images.device.type != "cpu":
+        return _batched(images, drawn, size, dtype)
+    plain = dtype in (torch.float32, torch.bfloat16) and not bool((drawn.gains != 1).any())
+    compiled = fused() if plain else None
+    if compiled is None or max(images.shape[2:]) > compiled.MAX_SHRINK * size:
+        return _one_by_one(images, drawn, size, dtype)
+    return _in_one_pass(images, drawn, size, dtype, compiled)
+
+
+@cache
+def fused() -> ModuleType | None:
+    """``mvitac.transforms.numba_views``, where a numba that works with this numpy is installed (extra ``fast``)."""
+    try:
+        from mvitac.transforms import numba_views
+    except ImportError:
+        return None
+    return numba_views
+
+
+def _in_one_pass(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, compiled: ModuleType) -> Tensor:
+    """The CPU's fast route, without jitter: a share of the images for each of torch's threads.
+
+    The levels of ``_one_by_one``, and so its views bit for bit, but for the last bits of a gray one.
+    """
+    num, channels = images.shape[:2]
+    out = torch.empty(num, size, size, channels, dtype=dtype)
+    bits = out.view(torch.uint16) if dtype == torch.bfloat16 else out  # numpy has no bfloat16
+    given = (images.permute(0, 2, 3, 1), drawn.boxes, drawn.flip, drawn.grayscale)
+    each = [*(t.contiguous() for t in given), bits]
+    shared = [t.numpy() for t in (_luma(images.device).flatten(), *_normalisation(images.device))]
+
+    def fill(*share: Tensor) -> None:
+        compiled.views(*(t.numpy() for t in share), *shared)
+
+    num_threads = min(num, torch.get_num_threads())
+    if num_threads < 2:
+        fill(*each)
+    else:
+        list(_threads(num_threads).map(fill, *(t.tensor_split(num_threads) for t in each)))
+    return out.permute(0, 3, 1, 2)
+
+
+@cache
+def _threads(num: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num, "views")
+
+
+def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
+    """The CPU's route in torch: an image stays in the cache from crop to normalised view, uint8 until the last step."""
+    num, channels = images.shape[:2]
+    out = torch.empty(num, size, size * channels, dtype=dtype)  # a line of pixels with its channels: long inner loops
+    factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device))
+    luma = _luma(images.device).flatten()
+    jittered = (drawn.gains != 1).any(1)
+    for i, line in enumerate(out):
+        pixels = _crop(images[i], drawn.boxes[i].tolist(), bool(drawn.flip[i]), size)
+        levels = pixels.reshape(size, -1).float()
+        if jittered[i]:
+            sensors = pixels.permute(2, 0, 1).unflatten(0, (-1, 3))[None].float().div_(255)
+            one = Drawn(*(getattr(drawn, name)[i : i + 1] for name in ("boxes", "flip", "grayscale", "gains")))
+            levels = _colour(sensors, one)[0].mul_(255).permute(2, 3, 0, 1).reshape(size, -1)
+        elif drawn.grayscale[i]:
+            levels = (levels.view(-1, 3) @ luma)[:, None].expand(-1, 3).reshape(size, -1)
+        torch.addcmul(offsets, levels, factors, out=line)
+    return out.view(num, size, size, channels).permute(0, 3, 1, 2)
+
+
+def _crop(image: UInt8[Tensor, "C H W"], box: list[int], flip: bool, size: int) -> UInt8[Tensor, "S S C"]:
+    """Cut, resize (bilinear, antialiased where it shrinks) and flip one image, three channels at a time."""
+    top, left, height, width = box
+    crop = image[:, top : top + height, left : left + width].unflatten(0, (-1, 3))  # [sensors, 3, h, w]
+    if (height, width) != (size, size):  # torch's kernel for uint8 is vectorised where the channels lie together
+        crop = F.interpolate(
+            crop.contiguous(memory_format=torch.channels_last), (size, size), mode="bilinear", antialias=True
+        )
+    if flip:
+        crop = crop.flip(-1)
+    return crop.permute(2, 3, 0, 1).reshape(size, size, -1)
+
+
+def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
+    """The GPU's route: crop, resize and flip of the whole batch as two matrix products, Y @ image @ X'.
+
+    The same antialiased filter as the CPU's. In fp16 on a GPU: pixels are exact, weights err by less than 0.1 level.
+    """
+    device, side = images.device, images.shape[-1]
+    top, left, height, width = drawn.boxes.to(device, torch.float32, non_blocking=True).unbind(1)
+    exact = torch.float16 if device.type == "cuda" else torch.float32
+    rows = _resampling(top, height, side, size).to(exact)[:, None]
+    columns = _resampling(left, width, side, size)
+    flip = drawn.flip.to(device, non_blocking=True)[:, None, None]
+    columns = torch.where(flip, columns.flip(1), columns).to(exact)[:, None]
+    with torch.autocast(device.type, enabled=False):
+        cropped = rows @ images.to(exact) @ columns.mT
+    sensors = cropped.float().round_().div_(255).unflatten(1, (-1, 3))
+    scale, shift = (t.view(3, 1, 1) for t in _normalisation(device))
+    view = torch.addcmul(shift, _colour(sensors, drawn), scale * 255)
+    return view.flatten(1, 2).to(dtype, memory_format=torch.channels_last)
+
+
+def _resampling(start: Tensor, length: Tensor, side: int, size: int) -> Float[Tensor, "B S H"]:
+    """Weights of every source pixel in each pixel of the cuts [start, start + length), both [B]: a triangle filter."""
+    step = length[:, None, None] / size
+    target = torch.arange(size, device=start.device, dtype=torch.float32)[None, :, None] + 0.5
+    source = torch.arange(side, device=start.device, dtype=torch.float32)[None, None, :] + 0.5
+    begin = start[:, None, None]
+    weights = (1 - (source - begin - target * step).abs() / step.clamp(min=1)).clamp_(min=0)
+    weights = weights * ((source > begin) & (source < begin + length[:, None, None]))
+    return weights / weights.sum(2, keepdim=True)
+
+
+@lru_cache
+def _normalisation(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Factor and offset [3] that take levels 0-255 to ImageNet's mean and spread."""
+    mean, std = (torch.tensor(v, dtype=torch.float64) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    return (1 / (255 * std)).float().to(device), (-mean / std).float().to(device)
+
+
+@lru_cache
+def _luma(device: torch.device) -> Tensor:
+    return torch.tensor(LUMA, device=device).view(3, 1, 1)
+
+
+def _colour(sensors: Float[Tensor, "B N 3 S S"], drawn: Drawn) -> Float[Tensor, "B N 3 S S"]:
+    """Jitter, then grayscale, of levels in [0, 1], for all N sensors of an image alike."""
+    luma = _luma(sensors.device)
+    if bool((drawn.gains != 1).any()):  # parameters are drawn on the CPU: asking them waits for no GPU
+        gains = drawn.gains.to(sensors.device, non_blocking=True)
+        brightness, contrast = gains[:, 0].view(-1, 1, 1, 1, 1), gains[:, 1].view(-1, 1, 1, 1, 1)
+        sensors = sensors * (brightness * gains[:, 2:].view(-1, 1, 3, 1, 1))
+        level = (sensors * luma).sum(2, keepdim=True).mean((3, 4), keepdim=True)
+        sensors = (level + contrast * (sensors - level)).clamp_(0, 1)
+    if bool(drawn.grayscale.any()):
+        gray = drawn.grayscale.to(sensors.device, non_blocking=True).view(-1, 1, 1, 1, 1)
+        sensors = torch.where(gray, (sensors * luma).sum(2, keepdim=True), sensors)
+    return sensors
+
+
+def random_view(
+    images: UInt8[Tensor, "B C H W"],
+    config: ViewAugment,
+    size: int,
+    generator: torch.Generator,
+    dtype: torch.dtype = torch.float32,
+) -> Float[Tensor, "B C S S"]:
+    """One random view of every image; ``generator`` lives on the CPU and decides all of it."""
+    num, channels, side, _ = images.shape
+    if config.independent_sensors and channels > 3:
+        apart = [apply(sensor, draw(config, num, side, generator), size, dtype) for sensor in images.split(3, dim=1)]
+        view = torch.cat(apart, dim=1).contiguous(memory_format=torch.channels_last)
+    else:
+        view = apply(images, draw(config, num, side, generator), size, dtype)
+    return _noisy(view, config.noise, generator) if config.noise else view
+
+
+def _noisy(view: Float[Tensor, "B C S S"], noise: float, generator: torch.Generator) -> Float[Tensor, "B C S S"]:
+    """``view`` with noise as in ``ViewAugment.noise``, no darker than black and no lighter than white.
+
+    The strengths come from ``generator``, the pixels from one of the view's device: they differ between kinds of devices.
+    """
+    num, channels, device = len(view), view.shape[1], view.device
+    strength = (noise * torch.rand(num, 1, 1, 1, generator=generator)).to(device, non_blocking=True)
+    here = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
+    scale, shift = (t.repeat(channels // 3).view(-1, 1, 1) for t in _normalisation(device))
+    pixels = torch.randn(view.shape, generator=here, device=device).to(memory_format=torch.channels_last)
+    return torch.addcmul(view.float(), pixels, strength * scale).clamp_(shift, shift + 255 * scale).to(view.dtype)
+
+
+def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B C S S"]:
+    """The whole image at ``size``, normalised: what probes and predictions see (no randomness)."""
+    num, _, side, _ = images.shape
+    whole = torch.tensor([[0, 0, side, side]]).expand(num, 4)
+    never = torch.zeros(num, dtype=torch.bool)
+    route = (
+        _one_by_one if images.device.type == "cpu" else _batched
+    )  # few images or a network behind: numba need not start
+    return route(images, Drawn(whole, never, never, torch.ones(num, 5)), size, torch.float32)
