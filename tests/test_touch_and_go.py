@@ -468,9 +468,9 @@ def test_label_txt_alone_serves_and_knows_no_official_split(tree: Path, tmp_path
 
 
 def test_nothing_there_is_told(tmp_path: Path, tree: Path) -> None:
-    with pytest.raises(ValueError, match="is no folder: give the one with the lists"):
+    with pytest.raises(ValueError, match="is not a folder: give the one with the lists"):
         TouchAndGoConfig(root=tmp_path / "nowhere").source()
-    with pytest.raises(ValueError, match=r"is no folder: give the download .* https://touch-and-go\.github\.io"):
+    with pytest.raises(ValueError, match=r"is not a folder: give the download .* https://touch-and-go\.github\.io"):
         TouchAndGoConfig(root=tmp_path / "nowhere", lists=tree).source()
     with pytest.raises(ValueError, match="8 of 8 listed recordings cannot be packed"):
         TouchAndGoConfig(root=tmp_path, lists=tree, partial=True).source()

@@ -205,7 +205,7 @@ def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 
 
 def motion_correlations(pack: Pack, looks: dict[str, ImageStats], when: np.ndarray) -> np.ndarray:
-    """Return [sequences, 2 * MAX_LAG + 1], correlations of motion in vision and in touch ``lag`` rows later, from -MAX_LAG."""
+    """Return [sequences, 2 * MAX_LAG + 1]: correlation of motion in vision with motion in touch, by lag of touch."""
     light = {m: next(one for one in looks.values() if one.modality == m).light for m in ("vision", "touch")}
     groups, curves, both = pack.touch_groups, [], pack.has("vision") & pack.has("touch")
     order = np.lexsort((when, groups))

@@ -165,6 +165,13 @@ def folds(groups: Sequence[str], strata: Sequence[str], num: int, val_every: int
     return columns
 
 
+def add_folds(rows: Sequence[dict[str, str]], strata: Sequence[str], num: int, val_every: int = 2) -> None:
+    """Add the columns of ``folds`` to ``rows``, with their column object as the group."""
+    for column, splits in folds([row["object"] for row in rows], strata, num, val_every).items():
+        for row, split in zip(rows, splits, strict=True):
+            row[column] = split
+
+
 SCALE = 1_000_000
 """Fractions are integers in millionths, so that the result is the same on every machine."""
 
