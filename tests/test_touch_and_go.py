@@ -427,8 +427,8 @@ def test_jpegs_that_are_missing_or_cut_are_listed(tmp_path: Path) -> None:
     ("name", "text", "expected"),
     [
         ("train.txt", "nonsense", "train.txt line 1 is 'nonsense': expected <recording>/<10 digits>.jpg,<label>"),
-        ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is none of -1 to 19"),
-        ("test_rough.txt", "a/0000000001.jpg,2", "label 2 is none of -1 to 1"),
+        ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is not in -1 to 19"),
+        ("test_rough.txt", "a/0000000001.jpg,2", "label 2 is not in -1 to 1"),
         ("test.txt", "", "test.txt is empty"),
         ("test.txt", f"{NAMES[0]}/0000000020.jpg,1", "0000000020.jpg is listed twice"),
         ("test.txt", None, "has no train.txt and test.txt: they are in https://github.com"),

@@ -33,7 +33,7 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         across = np.flatnonzero(np.isin(numbers, numbers[different]) & one.seen)
         if len(across):
             across = across[np.argsort(numbers[across], kind="stable")]
-            notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy on another side")
+            notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy in another split")
             rows += across.tolist()
     if notes:
         return Finding(
@@ -43,7 +43,7 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             advice="remove the copies, or put them in one group so that they stay on one side",
             rows=tuple(rows),
         )
-    evidence = "none" + (f" (inside one side: {'; '.join(inside)})" if inside else "")
+    evidence = "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")
     return Finding(item="identical images across splits", verdict="ok", evidence=evidence)
 
 
@@ -62,7 +62,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     for name, one in looks.items():
         held_out = one.has & (sides != "train")
         if not held_out.any() or not (one.has & ~held_out).any():
-            notes.append(f"{name}: all on one side")
+            notes.append(f"{name}: all in one split")
             continue
         unit, clear = residuals(one, sensors)
         asked = _some(np.flatnonzero(clear & (sides != "train")), MAX_ASKED)

@@ -151,7 +151,7 @@ def leaks(pack: Pack) -> list[Finding]:
                 kind = f" ({pack.spec.group_by})" if name == "group" else ""
                 test = on.get("test", set())
                 of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""
-                notes.append(f"{name}{kind}: {len(both)} of {len(set(values))} on two sides, e.g. {both[0]!r}{of}")
+                notes.append(f"{name}{kind}: {len(both)} of {len(set(values))} in more than one split, e.g. {both[0]!r}{of}")
                 for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
@@ -162,13 +162,13 @@ def leaks(pack: Pack) -> list[Finding]:
             Finding(
                 item="groups across splits" if split == "split" else f"groups across column {split}",
                 verdict=verdict,
-                evidence="; ".join(notes) or f"none of {', '.join(names)} lies on two sides",
+                evidence="; ".join(notes) or f"none of {', '.join(names)} is in more than one split",
                 advice=bool(notes) * "split by the largest of these keys, or report what test shares with train",
                 rows=tuple(rows),
             )
         )
     if sound:
-        evidence = f"{some(sound, 8)}: none of {', '.join(names)} lies on two sides"
+        evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
         findings.append(Finding(item="groups across split columns", verdict="ok", evidence=evidence))
     return findings
 
