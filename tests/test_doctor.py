@@ -455,7 +455,7 @@ def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
 
     findings = {f.item: f for f in examine(build(Untested(), tmp_path / "p", size=SIDE, quiet=True))}
     near, colour = findings["near-copies across splits"], findings["red and blue swapped"]
-    assert (near.verdict, near.evidence) == ("not checkable", "vision: all on one side; touch: all on one side")
+    assert (near.verdict, near.evidence) == ("not checkable", "vision: all in one split; touch: all in one split")
     assert colour.verdict == "not checkable" and "colours vary too much to tell" in colour.evidence
 
 

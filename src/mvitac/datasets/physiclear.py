@@ -94,5 +94,5 @@ def _constants(root: Path) -> dict[str, Any]:
     except (SyntaxError, ValueError) as error:
         raise ValueError(f"{file} cannot be read as labels ({brief(error)})") from None
     for name in sorted(wanted - found.keys()):
-        raise ValueError(f"{file} says nothing of {name}: check out the version the paper was published with")
+        raise ValueError(f"{file} does not define {name}: check out the version the paper was published with")
     return found

@@ -40,7 +40,7 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             item="identical images across splits",
             verdict="broken",
             evidence="; ".join(notes),
-            advice="remove the copies, or put them in one group so that they stay on one side",
+            advice="remove the copies, or put them in one group so that they stay in one split",
             rows=tuple(rows),
         )
     evidence = "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")

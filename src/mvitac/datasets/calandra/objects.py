@@ -81,7 +81,7 @@ def _one_edit(a: str, b: str) -> bool:
 
 def doubtful_text(counts: Counter[str]) -> str:
     pairs = [f"{name} ({counts[name]}) for {likely} ({counts[likely]})?" for name, likely in doubtful(counts)]
-    return f"{'; '.join(pairs)} repair with --data.repairs written=right" if pairs else ""
+    return f"{'; '.join(pairs)} repair with --data.repairs wrong=right" if pairs else ""
 
 
 def owners_shuffle(names: Sequence[str], seed: int) -> list[str]:
