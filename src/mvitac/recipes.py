@@ -69,6 +69,8 @@ def modern(data: DatasetConfig) -> Run:
       tells these apart is the contact itself.
     - all four losses, also where positives are of the same image: on simulated grasps leaving out the intra-modal ones is
       worth 6.7 points (docs/results/grasps_1150.md), seen on test; not taken before another world has shown it.
+    - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16 a step takes ten times as
+      long and more. Scores of the two are level but for one of nine (docs/speed.md).
     """
     base = paper(data)
     phased = isinstance(data, (GraspsConfig, CalandraConfig))
@@ -80,7 +82,7 @@ def modern(data: DatasetConfig) -> Run:
         sampler="one-per-touch",
         positives="same-image" if phased else "same-touch",
         augment=replace(base.augment, touch=replace(base.augment.touch, flip=0.0)),
-        precision="bf16",
+        precision="auto",
     )
 
 

@@ -29,6 +29,7 @@ from mvitac.deploy.engine import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST,
 from mvitac.deploy.export_module import ExportModule
 from mvitac.evaluation.features import sample
 from mvitac.model import Model
+from mvitac.system.device import has_bf16
 from mvitac.system.files import check_place, digest, digest_file, write_atomic, write_json
 from mvitac.system.provenance import provenance
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
@@ -83,6 +84,11 @@ def export(
         raise ValueError(f"--rows {num_rows}: give at least 1")
     if precision == "bf16" and (kind != "openvino" or int8):
         raise ValueError("--precision bf16 is a mode of openvino without --int8: give --format openvino")
+    if precision == "bf16" and not has_bf16(torch.device("cpu")):
+        raise ValueError(
+            "--precision bf16: this CPU does not compute bf16 itself, so OpenVINO would use fp32 or emulate it, and the"
+            " export could not be checked: export it on a CPU with AVX512-BF16 or AMX, or leave --precision out"
+        )
     check_place(out)
     graph = ExportModule(model, modalities)
     for given, (modality, (_, _, channels)) in product((pack, calibrate or pack), graph.inputs.items()):

@@ -13,7 +13,7 @@ from mvitac.system.malloc import keep_freed_memory
 
 
 def pack_features(
-    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, precision: str = "fp32"
+    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, bf16: bool = False
 ) -> Tensor:
     """Features [len(rows), D] of pack rows, as ``Model.features``, in chunks on the model's device; back on the CPU."""
     device = next(model.parameters()).device
@@ -22,7 +22,7 @@ def pack_features(
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        chunks.append(model.features(modality, images, for_heads=for_heads, precision=precision).cpu())
+        chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
     return torch.cat(chunks)
 
 

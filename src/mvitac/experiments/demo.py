@@ -15,7 +15,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_summary
 from mvitac.run import Run
-from mvitac.system.device import pick_device
+from mvitac.system.device import describe_precision, pick_device, pick_precision
 from mvitac.system.files import write_json
 from mvitac.system.processes import side_by_side
 from mvitac.training.log import bars, last_line
@@ -42,6 +42,8 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     if len(unfinished) > 1 and pick_device(run.device).type == "cpu" and (os.cpu_count() or 1) > 1:
         # Several runs of few threads get more out of the cores than one run of many (docs/speed.md).
         say(f"2/4 pre-training {len(unfinished)} seeds side by side: {steps} steps each")
+        device = pick_device(run.device)
+        say(describe_precision(run.precision, pick_precision(run.precision, device), device))
         train_together(unfinished, steps, console)
     for seeded, path in runs:  # what is finished is only held against what is asked for
         if not (path / "model.safetensors").exists():

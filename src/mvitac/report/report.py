@@ -17,7 +17,7 @@ from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs
 from mvitac.evaluation.probe import cross_modal, parts
-from mvitac.model import load
+from mvitac.model import load, precision_of
 from mvitac.registry import to_json
 from mvitac.report import galleries, tables
 from mvitac.report import html as page
@@ -261,6 +261,7 @@ def _cost(study: Study) -> str:
             "wall time": _duration(seconds) if seconds else "",
             "parameters kept": f"{trunks / 1e6:.2f} M in trunks" + (f", {heads / 1e6:.2f} M in heads" if heads else ""),
             "machine": f"{r.record.get('machine', '')}; device {r.run.device}",
+            "precision": precision_of(r.run, r.record) + " (auto)" * (r.run.precision == "auto"),
             "versions": ", ".join(f"{k} {v}" for k, v in r.record.get("versions", {}).items()),
             "python": str(r.record.get("python", "")),
             "commit": str(r.record.get("commit") or "not from a checkout"),

@@ -92,7 +92,7 @@ class World:
         """Whether ``flag`` is set on any process; all must ask together."""
         if self.size == 1:
             return flag
-        value = torch.tensor(float(flag), device="cuda" if dist.get_backend() == "nccl" else "cpu")
+        value = torch.tensor(float(flag), device=local_device("cuda") if dist.get_backend() == "nccl" else "cpu")
         dist.all_reduce(value)
         return bool(value > 0)
 

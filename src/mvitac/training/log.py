@@ -68,8 +68,12 @@ class Log:
     def evaluation(self, step: int, values: dict[str, float]) -> None:
         self._write({"step": step, "eval": values})
         best = [f"{name} {value:.3f}" for name, value in values.items() if "knn" in name or name.endswith("R@5")]
+        self.say(f"step {step}: " + ", ".join(best))
+
+    def say(self, text: str) -> None:
+        """``text`` on a line of its own above the progress."""
         if not self.progress.disable:
-            self.progress.console.print(f"step {step}: " + ", ".join(best), soft_wrap=True, highlight=False)
+            self.progress.console.print(text, soft_wrap=True, highlight=False, markup=False)
 
     def _write(self, entry: dict[str, Any]) -> None:
         with naming(self.path):

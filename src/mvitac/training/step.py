@@ -26,7 +26,7 @@ class Step:
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world = method, device, world or World()
-        self.bf16 = run.precision == "bf16"
+        self.bf16 = run.bf16
         self.optimiser = build_optimiser(run.optim, method)
         if (run.chunk or self.world.size > 1) and not isinstance(method, Contrastive):
             raise ValueError(
