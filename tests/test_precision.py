@@ -14,12 +14,15 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from rich.console import Console
 from test_train import assert_equal_weights, power_cut
 
 import mvitac
+from mvitac.cli import live
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
+from mvitac.deploy.engine import open_engine
 from mvitac.deploy.export import export
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.experiments.collect import forecast, gather, lay_out
@@ -247,11 +250,39 @@ def test_a_bf16_export_needs_a_cpu_that_can_check_it(
     assert not (tmp_path / "e").exists()
 
 
+def test_a_bf16_export_runs_in_fp32_where_openvino_lists_no_bf16(
+    onnx: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import openvino
+
+    hints: list[str] = []
+    listed = ["FP32"]
+
+    class Core:
+        def get_property(self, *names: str) -> list[str]:
+            return listed
+
+        def compile_model(self, path: Path, device: str, config: dict[str, str]) -> SimpleNamespace:
+            hints.append(config["INFERENCE_PRECISION_HINT"])
+            return SimpleNamespace(create_infer_request=lambda: None)
+
+    monkeypatch.setattr(openvino, "Core", Core)
+    monkeypatch.setattr("mvitac.deploy.engine.Engine", lambda *_, **__: SimpleNamespace(meta={"precision": "bf16"}))
+    said = []
+    for capabilities in (["FP32"], ["BF16", "FP32"]):
+        listed = capabilities
+        open_engine(onnx, "openvino", "bf16")
+        live._engine(str(onnx), 1, Console())
+        said.append("runs in fp32" in capsys.readouterr().out.replace("\n", " "))
+    assert (hints, said) == (["f32", "bf16"], [True, False])
+
+
 # -- a CPU without bf16 -----------------------------------------------------------------------------------------------
 
 SCRIPT = """
 import sys
 from mvitac.cli import main
+from mvitac.commands import live
 
 pack, out = sys.argv[1:]
 common = ["--data", "pack", "--data.path", pack, "--encoder.trunk", "mvitac_tiny", "--steps", "2", "--batch-size", "16"]

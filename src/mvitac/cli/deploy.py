@@ -70,7 +70,7 @@ def export(argv: list[str]) -> None:
         format: Annotated[Literal["torch", "onnx", "openvino"], tyro.conf.arg(name="format")] = "onnx"
         """torch (torch.export), onnx (ONNX Runtime) or openvino."""
         precision: Literal["fp32", "bf16"] = "fp32"
-        """Arithmetic of openvino: bf16 where the CPU has it."""
+        """Arithmetic of openvino; bf16 only on a CPU that computes it, where it can be checked."""
         int8: bool = False
         """8-bit weights and activations, ranges from train rows of the pack (onnx, openvino)."""
         on: Path | None = None
