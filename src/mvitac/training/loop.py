@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
+from typing import Any
 
 import torch
 
@@ -28,7 +30,7 @@ from mvitac.system.locks import hold_lock
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.log import Log, Logger
+from mvitac.training.log import EARLY, Log, Logger
 from mvitac.training.sampler import mix, training_rows
 from mvitac.training.step import Step
 from mvitac.training.validation import evaluate
@@ -106,7 +108,8 @@ def _train(
     every = run.checkpoint_every or max(1, num_steps // 10)
     method.train()
 
-    log_here = Log(out, start, num_steps, quiet, loggers) if world.writes else nullcontext()
+    telling = {"quiet": quiet, "sinks": loggers}
+    log_here = Log(out, start, num_steps, run.batch_size, **telling) if world.writes else nullcontext()
     with log_here as log, _stop_signals() as stopped:
         for at, parts in enumerate(
             feed_parts(run, pack, rows, method.views, device, world, start, num_steps, mirror), start=start
@@ -115,12 +118,13 @@ def _train(
             losses = step(parts, lr=rate, seed=mix(run.seed, at) + 1, progress=(at + 1) / num_steps)
 
             done = at + 1
-            report = done % run.log_every == 0 or done == num_steps
+            early = done - start == EARLY < run.log_every
+            report = done % run.log_every == 0 or done == num_steps or early
             if report:
                 values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
                 _check_finite(values, done, run)
                 if log:
-                    log.step(done, values, rate, run.batch_size)
+                    log.step(done, values, rate)
             stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
             saving = done == num_steps or done % every == 0 or stopping
             if saving:
@@ -219,3 +223,13 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in old.items():
             signal.signal(number, handler)
+
+
+class _Callable(ModuleType):
+    """Once this module is imported, ``mvitac.train`` is the module and not the function: calling it calls the function."""
+
+    def __call__(self, *args: Any, **options: Any) -> Path:
+        return train(*args, **options)
+
+
+sys.modules[__name__].__class__ = _Callable
