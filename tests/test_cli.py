@@ -88,6 +88,20 @@ def test_pretrain_help_is_golden(capsys: pytest.CaptureFixture[str], monkeypatch
     assert text == path.read_text()
 
 
+@pytest.mark.parametrize("options", [[], ["--recipe", "paper", "--method", "ssvtp"]])
+def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["pretrain", *options]) == 2
+    said = capsys.readouterr().err
+    for word in (
+        "--data",
+        "folder",
+        "--from RUN.JSON",
+        "mvitac demo",
+        "mvitac pretrain --data materials --recipe demo",
+    ):
+        assert word in said
+
+
 def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """simulate -> info -> pretrain -> probe -> report, as a user types it, on the real simulator."""
     pack, run, scores = tmp_path / "pack", tmp_path / "run", tmp_path / "scores.json"

@@ -71,7 +71,7 @@ def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Co
     """
     with shown(console) as bars, side_by_side(len(runs)) as pool:
         assert bars is not None
-        overall = bars.add_task("pre-training", total=num_steps * len(runs), unit="steps", rate="pairs/s")
+        overall = bars.add_task("pre-training", total=num_steps * len(runs), unit="steps", rate="pairs")
         tasks = {path: bars.add_task(f"seed {run.seed}", total=num_steps, silent=True) for run, path in runs}
         waiting = {pool.submit(train, run, path, resume=True, quiet=True) for run, path in runs}
         try:

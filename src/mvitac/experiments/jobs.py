@@ -225,7 +225,7 @@ class _Pace:
             steps_done[job.out] = seen["completed"]
             if len(self.todo) > 1 and self.num_jobs > 1:  # a run in this process has its own bar
                 if job.out not in self.tasks:
-                    many = {"total": self.steps[job.out], "unit": "steps", "rate": "pairs/s", "silent": True}
+                    many = {"total": self.steps[job.out], "unit": "steps", "rate": "pairs", "silent": True}
                     self.tasks[job.out] = self.bars.add_task(job.name, **many)
                 self.bars.update(self.tasks[job.out], **seen)
         todo = [job for job in self.todo if not job.done]

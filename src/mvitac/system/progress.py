@@ -60,12 +60,13 @@ class Bars(Progress):
 
     def _tell(self, task: Task) -> None:
         name, now, left = task.description, self.get_time(), time_left(task)
+        spent = task.elapsed or 0.0
         told = name in self._due
         if task.finished and told:
             del self._due[name]
             self.say(_summary(task))
-        elif left is not None and not task.finished and now >= self._due.get(name, (task.start_time or now) + FIRST):
-            self._due[name] = now + min(SELDOM, max(OFTEN, ((task.elapsed or 0) + left) / 10))
+        elif left is not None and not task.finished and now >= self._due.get(name, now - spent + FIRST):
+            self._due[name] = now + min(SELDOM, max(OFTEN, (spent + left) / 10))
             text = f", {_text(task)}" if _text(task) else ""
             self.say(f"{name}: {_count(task)}, about {duration(left)} left{_bracketed(_speed(task))}{text}")
 

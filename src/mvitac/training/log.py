@@ -44,7 +44,7 @@ class Log:
     def __enter__(self) -> Log:
         self.bars = self.stack.enter_context(shown(quiet=self.quiet))
         if self.bars:
-            rate = {"unit": "steps", "rate": "pairs/s", "scale": self.batch_size}
+            rate = {"unit": "steps", "rate": "pairs", "scale": self.batch_size}
             self.bar = self.bars.add_task("pre-training", total=self.num_steps, completed=self.start, **rate)
         return self
 
