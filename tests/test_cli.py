@@ -164,7 +164,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
         assert cell["low"] <= cell["mean"] <= cell["high"]
     shown = capsys.readouterr().out
     assert "report.html" in shown and "majority" in shown
-    assert "2/2 steps" in shown  # no terminal: lines instead of bars
+    assert "pre-training: 4/4 steps in" in shown  # of both seeds; no terminal: a line instead of bars
     weights = tmp_path / "demo" / "seed1" / "model.safetensors"
     before = weights.stat().st_mtime_ns
     assert main(command) == 0

@@ -37,6 +37,7 @@ def test_a_pipe_is_told_the_time_left_after_the_first_measured_steps() -> None:
         for done in range(1, 102):
             clock.now += 20 if done == 1 else 2
             bars.update(bar, completed=done, text="loss 3.21")
+        bars.end(bar)
     said = lines(console)
     assert said[0] == "pre-training: 2/101 steps, about 3 min left (32 pairs/s), loss 3.21"  # at 22 seconds
     assert said[-1] == "pre-training: 101/101 steps in 4 min (32 pairs/s)"

@@ -85,5 +85,6 @@ def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Co
                     bars.update(overall, completed=sum(one["completed"] for one in said), **whole)
                 for future in done:
                     future.result()
+            bars.end(overall)
         except KeyboardInterrupt:  # the terminal sent it to the runs as well, which stop after their step
             raise Interrupted("stopped; the same command goes on from here") from None

@@ -51,21 +51,18 @@ class Bars(Progress):
         """A plain line, above the bars where there are some."""
         self.console.print(text, soft_wrap=True, highlight=False, markup=False)
 
-    def end(self, task_id: TaskID) -> None:
-        """Take the task's bar away, leaving a line of what was done."""
+    def end(self, task_id: TaskID, *, always: bool = True) -> None:
+        """Take a task's bar away, and say what was done; of short work only if ``always``."""
         task = self._tasks[task_id]
         self.remove_task(task_id)
-        if self.live_bars and task.finished:
+        told = self._due.pop(task.description, None) is not None
+        if task.finished and (always or told):
             self.say(_summary(task))
 
     def _tell(self, task: Task) -> None:
         name, now, left = task.description, self.get_time(), time_left(task)
         spent = task.elapsed or 0.0
-        told = name in self._due
-        if task.finished and told:
-            del self._due[name]
-            self.say(_summary(task))
-        elif left is not None and not task.finished and now >= self._due.get(name, now - spent + FIRST):
+        if left is not None and not task.finished and now >= self._due.get(name, now - spent + FIRST):
             self._due[name] = now + min(SELDOM, max(OFTEN, (spent + left) / 10))
             text = f", {_text(task)}" if _text(task) else ""
             self.say(f"{name}: {_count(task)}, about {duration(left)} left{_bracketed(_speed(task))}{text}")
@@ -163,7 +160,7 @@ def work(
     try:
         yield lambda num=1: bars.update(task, advance=num)
     finally:
-        bars.remove_task(task)
+        bars.end(task, always=False)
 
 
 def tick(unit: str) -> None:
