@@ -88,6 +88,20 @@ def test_pretrain_help_is_golden(capsys: pytest.CaptureFixture[str], monkeypatch
     assert text == path.read_text()
 
 
+@pytest.mark.parametrize("options", [[], ["--recipe", "paper", "--method", "ssvtp"]])
+def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["pretrain", *options]) == 2
+    said = capsys.readouterr().err
+    for word in (
+        "--data",
+        "folder",
+        "--from RUN.JSON",
+        "mvitac demo",
+        "mvitac pretrain --data materials --recipe demo",
+    ):
+        assert word in said
+
+
 def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """simulate -> info -> pretrain -> probe -> report, as a user types it, on the real simulator."""
     pack, run, scores = tmp_path / "pack", tmp_path / "run", tmp_path / "scores.json"
@@ -150,7 +164,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
         assert cell["low"] <= cell["mean"] <= cell["high"]
     shown = capsys.readouterr().out
     assert "report.html" in shown and "majority" in shown
-    assert "2/2 steps" in shown  # no terminal: lines instead of bars
+    assert "pre-training: 4/4 steps in" in shown  # of both seeds; no terminal: a line instead of bars
     weights = tmp_path / "demo" / "seed1" / "model.safetensors"
     before = weights.stat().st_mtime_ns
     assert main(command) == 0

@@ -165,6 +165,22 @@ def test_no_checkpoint_is_kept_of_weights_that_are_no_numbers(pack: Pack, tmp_pa
     assert 1 <= kept["step"] < 8 and all(torch.isfinite(value).all() for value in kept["method"].values())
 
 
+def test_the_package_has_the_function_every_time(pack: Pack, tmp_path: Path) -> None:
+    """``mvitac.train`` is also a module of that name, which Python puts in the function's place once it is imported."""
+    import mvitac
+
+    for name in ("a", "b"):
+        assert mvitac.train(smoke(pack, steps=1), tmp_path / name, quiet=True) == tmp_path / name
+    assert_equal_weights(tmp_path / "a", tmp_path / "b")
+
+
+def test_a_run_tells_its_speed_soon(pack: Pack, tmp_path: Path) -> None:
+    """Steps after the first, which starts everything, so that whoever reads its log can tell the time left."""
+    log = train(smoke(pack, steps=12, log_every=10), tmp_path / "r", quiet=True) / "log.jsonl"
+    said = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["step"] for line in said if "loss" in line] == [3, 10, 12]
+
+
 def test_seed_decides(pack: Pack, straight: Path, tmp_path: Path) -> None:
     train(smoke(pack), tmp_path / "same", quiet=True)
     assert_equal_weights(straight, tmp_path / "same")
@@ -300,8 +316,8 @@ def test_learning_rate_schedules() -> None:
 
 
 def test_last_line_is_the_last_one_about_losses(tmp_path: Path) -> None:
-    assert last_line(tmp_path) == (0, "")
+    assert last_line(tmp_path) == {}
     told = {"step": 20, "loss": 3.456, "pairs_per_s": 81.6}
     lines = [{**told, "step": 10}, told, {"step": 20, "eval": {}}, {"step": 21, "eval": {}}, {"step": 22, "eval": {}}]
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"step": 30, "lo')
-    assert last_line(tmp_path) == (20, "loss 3.46  82/s")
+    assert last_line(tmp_path) == told

@@ -15,6 +15,7 @@ def publish(argv: list[str]) -> None:
     from mvitac.data.pack import Pack
     from mvitac.deploy.artifact import read
     from mvitac.deploy.publish import publish, push
+    from mvitac.system.progress import shown
 
     @dataclass(frozen=True)
     class Options:
@@ -32,7 +33,8 @@ def publish(argv: list[str]) -> None:
         """Make the uploaded repository private."""
 
     options = parse(Options, argv, "publish")
-    out = publish(options.run, options.out, Pack(options.on) if options.on else None)
+    with shown(Console(stderr=True)):
+        out = publish(options.run, options.out, Pack(options.on) if options.on else None)
     console = Console(markup=False)
     table = Table(title=f"{out}: what its probes know", title_justify="left")
     for column in ("task", "from", "accuracy %", "majority %"):
@@ -57,6 +59,7 @@ def export(argv: list[str]) -> None:
     from mvitac.deploy import export as exports
     from mvitac.deploy.artifact import load
     from mvitac.deploy.publish import own_data, with_readouts
+    from mvitac.system.progress import shown
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -93,22 +96,23 @@ def export(argv: list[str]) -> None:
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
     usual = exports.TOLERANCES["int8" if options.int8 else options.precision]
-    report = exports.export(
-        with_readouts(model, pack),
-        pack,
-        options.out,
-        kind=options.format,
-        precision=options.precision,
-        int8=options.int8,
-        calibrate=Pack(options.calibrate) if options.calibrate else None,
-        modalities=None if options.modality == "both" else (options.modality,),
-        tolerance=exports.Tolerance(
-            min_cosine=usual.min_cosine if options.min_cosine is None else options.min_cosine,
-            accuracy_loss=options.accuracy_loss,
-        ),
-        num_rows=options.rows,
-        threads=options.threads,
-    )
+    with shown(Console(stderr=True)):
+        report = exports.export(
+            with_readouts(model, pack),
+            pack,
+            options.out,
+            kind=options.format,
+            precision=options.precision,
+            int8=options.int8,
+            calibrate=Pack(options.calibrate) if options.calibrate else None,
+            modalities=None if options.modality == "both" else (options.modality,),
+            tolerance=exports.Tolerance(
+                min_cosine=usual.min_cosine if options.min_cosine is None else options.min_cosine,
+                accuracy_loss=options.accuracy_loss,
+            ),
+            num_rows=options.rows,
+            threads=options.threads,
+        )
     table = Table(title=f"{options.out}: checked on {report['num_rows']} test rows", title_justify="left")
     for column in ("", "original", "export"):
         table.add_column(column)

@@ -13,7 +13,7 @@ import os
 import shutil
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -31,6 +31,7 @@ from mvitac.evaluation.features import sample
 from mvitac.model import Model
 from mvitac.system.device import has_bf16
 from mvitac.system.files import check_place, digest, digest_file, write_atomic, write_json
+from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
@@ -112,13 +113,16 @@ def export(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        with silent():
+        with work(f"writing {kind}"), silent():
             _write(graph, partial, kind, _examples(graph, calibrate or pack) if int8 else None)
         call = open_engine(partial, kind, precision, threads)
-        wanted = reference(model, graph, pack, rows)
-        report = parity(graph, call, model, pack, rows, wanted, tolerance)
+        with work("computing what the model itself answers", len(rows), "rows") as advance:
+            wanted = reference(model, graph, pack, rows, advance)
+        with work("checking what the export answers", len(rows), "rows") as advance:
+            report = parity(graph, call, model, pack, rows, wanted, tolerance, advance)
         report["size_mb"] = round(sum((partial / name).stat().st_size for name in FILES[kind]) / 1e6, 2)
-        report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
+        with work("measuring latency"):
+            report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
         check = {f"input_{m}": pack.images[m][rows[:NUM_CHECK]] for m in graph.modalities}
         check |= {n: v[:NUM_CHECK] for n, v in wanted.items()}
         data = safetensors.numpy.save({n: np.ascontiguousarray(v) for n, v in check.items()})
@@ -236,7 +240,9 @@ def silent() -> Iterator[None]:
 # -- checking ---------------------------------------------------------------------------------------------------------
 
 
-def reference(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+def reference(
+    model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray, advance: Callable[[int], object] = lambda num: None
+) -> dict[str, np.ndarray]:
     """What the trained model itself makes of pack rows: the outputs of ``graph``, by ``Model``'s own code."""
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 64)):
@@ -249,6 +255,7 @@ def reference(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray) -
         }
         found |= {f"probability_{r.question.task}": r(joined) for r in graph.readouts}  # type: ignore[union-attr]
         chunks.append(found)
+        advance(len(chunk))
     return {name: torch.cat([c[name] for c in chunks]).numpy() for name in graph.outputs}
 
 
@@ -260,13 +267,14 @@ def parity(
     rows: np.ndarray,
     wanted: dict[str, np.ndarray],
     tolerance: Tolerance,
+    advance: Callable[[int], object] = lambda num: None,
 ) -> dict[str, Any]:
     """Cosines and accuracies of ``call`` on pack rows beside ``wanted``; ValueError if beyond ``tolerance``, with the
     likeliest reason."""
-    chunks = [
-        call([np.ascontiguousarray(pack.images[m][chunk]) for m in graph.modalities])
-        for chunk in np.array_split(rows, max(1, len(rows) // 16))  # batches of another size than the traced one
-    ]
+    chunks = []
+    for chunk in np.array_split(rows, max(1, len(rows) // 16)):  # batches of another size than the traced one
+        chunks.append(call([np.ascontiguousarray(pack.images[m][chunk]) for m in graph.modalities]))
+        advance(len(chunk))
     found = {name: np.concatenate([c[i] for c in chunks]) for i, name in enumerate(graph.outputs)}
     report: dict[str, Any] = {"num_rows": len(rows), "cosine": {}, "accuracy": {}}
     for name in (n for n in graph.outputs if n.startswith(("embedding_", "shared_"))):
