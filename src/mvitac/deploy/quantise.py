@@ -1,7 +1,7 @@
 """ONNX files, their int8 versions, and which CPU an int8 version is for.
 
-A CPU without VNNI adds pairs of 8-bit products in 16 bits, and what does not fit is cut off (it saturates). Weights of 7
-bits always fit; this is onnxruntime's ``reduce_range`` and OpenVINO's overflow fix.
+A CPU without VNNI adds pairs of 8-bit products in 16 bits, and what does not fit is cut off (it saturates). With weights
+of 7 bits the sums fit; this is onnxruntime's ``reduce_range`` and OpenVINO's overflow fix.
 """
 
 from __future__ import annotations
