@@ -21,8 +21,8 @@ KEEP := import torch, torchvision, sys; sys.exit(tuple(map(int, torch.__version_
 demo: .venv/ready  ## the main job end to end, on simulated data (minutes on two cores)
 	$(BIN)/mvitac demo --out runs/demo
 
-test: .venv/ready  ## the test suite
-	$(BIN)/python -m pytest
+test: .venv/ready  ## the test suite, on all cores
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 
 check: .venv/ready  ## lint, format, types, import contract
 	$(BIN)/ruff check .

@@ -112,7 +112,7 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
                 "simulate",
                 "materials",
                 "--num",
-                "800",
+                "400",
                 "--touches",
                 "2",
                 "--size",

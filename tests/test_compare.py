@@ -9,7 +9,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -24,6 +23,7 @@ import pyarrow as pa
 import pytest
 import torch
 from PIL import Image
+from processes import begin, finish
 from rich.console import Console
 from toy import Toy, toy_pack
 
@@ -624,7 +624,7 @@ def test_paired_difference_doubts_seeds_too() -> None:
 
 def command(pack: Pack, plan: Path, out: Path, *more: str) -> list[str]:
     choice = ["--plan", str(plan), "--data", "pack", "--data.path", str(pack.path), "--out", str(out)]
-    return [sys.executable, "-m", "mvitac", "compare", *choice, *more]
+    return ["compare", *choice, *more]
 
 
 def write_plan(path: Path, num_rows: int, seeds: int, steps: int) -> Path:
@@ -644,19 +644,20 @@ def table(out: Path) -> tuple[str, str]:
 def kill_and_resume(pack: Pack, base: Path, num_rows: int, seeds: int, steps: int, goals: tuple[int, ...]) -> None:
     """SIGKILL the command whenever ``goals`` log lines are written in all, then let it end, and compare the tables."""
     plan = write_plan(base / "plan.json", num_rows, seeds, steps)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run(command(pack, plan, base / "straight"), check=True, env=environment, stdout=subprocess.DEVNULL)
+    finish(begin(main, command(pack, plan, base / "straight")))
     out = base / "killed"
     for goal in goals:
-        process = subprocess.Popen(command(pack, plan, out), env=environment, stdout=subprocess.DEVNULL)
-        while process.poll() is None:
+        process = begin(main, command(pack, plan, out))
+        while process.is_alive():
             if sum(len(log.read_text().splitlines()) for log in out.glob("runs/*/*/log.jsonl")) >= goal:
-                process.send_signal(signal.SIGKILL)
-                assert process.wait() == -signal.SIGKILL
+                process.kill()
+                process.join()
+                assert process.exitcode == -signal.SIGKILL
             time.sleep(0.005)
         assert not (out / "table.md").exists()
-    shown = subprocess.run(command(pack, plan, out), check=True, env=environment, capture_output=True, text=True).stdout
-    assert f"[{num_rows * seeds}/{num_rows * seeds}]" in shown
+    shown = base / "shown.txt"
+    finish(begin(main, command(pack, plan, out), output=shown), shown)
+    assert f"[{num_rows * seeds}/{num_rows * seeds}]" in shown.read_text()
     assert table(out) == table(base / "straight")
 
 
@@ -667,7 +668,7 @@ def test_killed_twice_and_resumed_gives_the_same_table(pack: Pack, tmp_path: Pat
 
 def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = write_plan(tmp_path / "plan.json", 2, 1, 2)
-    words = command(pack, plan, tmp_path / "out")[3:]
+    words = command(pack, plan, tmp_path / "out")
     assert main([*words, "--dry-run"]) == 0
     assert "2 rows x 1 seeds = 2 runs" in capsys.readouterr().out and not (tmp_path / "out").exists()
     assert main([*words, "--tables-only"]) == 2
@@ -709,7 +710,7 @@ def test_slurm_without_submitit_is_one_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "submitit", None)  # as if it were not installed
     plan = write_plan(tmp_path / "plan.json", 1, 1, 2)
-    assert main([*command(pack, plan, tmp_path / "out")[3:], "--slurm", "slurm_partition=gpu"]) == 2
+    assert main([*command(pack, plan, tmp_path / "out"), "--slurm", "slurm_partition=gpu"]) == 2
     assert "pip install 'mvitac[slurm]'" in capsys.readouterr().err
 
 

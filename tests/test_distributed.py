@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,6 +15,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from processes import begin
 from test_step import assert_close, gradients, views
 from test_step import build as build_from
 from test_train import power_cut
@@ -41,8 +39,6 @@ from mvitac.training.step import Chunk, Step
 RUN = replace(
     recipe("smoke"), optim=Optim(name="sgd"), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
 )
-HERE = Path(__file__).parent
-WORKER = str(HERE / "worker_distributed.py")
 METHODS = {
     "mvitac": RUN.method,
     "cmc": CMCConfig(out=12, num_negatives=1500),
@@ -66,24 +62,20 @@ def loop_run(data: DatasetConfig, method: str) -> Run:
     return replace(with_method(recipe("smoke", data), method), steps=4, checkpoint_every=2, log_every=1)
 
 
-def together(command: list[str], num: int = 2, fails: bool = False) -> None:
-    """Run ``command`` in ``num`` processes that find each other as torchrun's would."""
+def together(folder: Path, *words: str, num: int = 2, fails: bool = False) -> None:
+    """Run the worker in ``num`` processes that find each other as torchrun's would."""
+    from worker_distributed import main
+
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": str(num), "OMP_NUM_THREADS": "1"}
-    shared["PYTHONPATH"] = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
-    processes = []
-    for rank in map(str, range(num)):
-        environment = {**os.environ, **shared, "RANK": rank, "LOCAL_RANK": rank}
-        processes.append(
-            subprocess.Popen(
-                [sys.executable, *command], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-            )
-        )
-    for process in processes:
-        errors = process.communicate(timeout=120)[1].decode()
-        assert (process.returncode != 0) == fails, errors
+    processes, said = [], [folder / f"rank{rank}.txt" for rank in range(num)]
+    for rank, output in enumerate(said):
+        place = {"WORLD_SIZE": str(num), "RANK": str(rank), "LOCAL_RANK": str(rank)}
+        processes.append(begin(main, *words, output=output, MASTER_ADDR="127.0.0.1", MASTER_PORT=port, **place))
+    for process, output in zip(processes, said, strict=True):
+        process.join(120)
+        assert process.exitcode is not None and (process.exitcode != 0) == fails, output.read_text()
 
 
 def three_steps(
@@ -121,7 +113,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).mkdir()
         made = three_steps(partial(alone, name), [views], run_of(name), folder / name / "one.pt")
         torch.save(made, folder / name / "alone.pt")
-    together([WORKER, "step", str(folder)])
+    together(folder, "step", str(folder))
     return folder
 
 
@@ -163,10 +155,10 @@ def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tm
         write_shards(pack, str(tmp_path / "shards"), shard_mb=0.05, quiet=True)
     data = str(pack.path if kind == "pack" else tmp_path / "shards")
     straight, cut = tmp_path / "straight", tmp_path / "cut"
-    together([WORKER, "train", data, str(straight), "99", "mvitac"])
-    together([WORKER, "train", data, str(cut), "3", "mvitac"], fails=True)
+    together(tmp_path, "train", data, str(straight), "99", "mvitac")
+    together(tmp_path, "train", data, str(cut), "3", "mvitac", fails=True)
     assert not (cut / "model.safetensors").exists()
-    together([WORKER, "train", data, str(cut), "99", "mvitac"])
+    together(tmp_path, "train", data, str(cut), "99", "mvitac")
     a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     for path in (straight, cut):
@@ -188,9 +180,9 @@ def test_the_loop_keeps_whole_banks_when_the_number_of_processes_changes(
     if first == 1:
         with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
             train(run, out, quiet=True)
-        together([WORKER, "train", str(pack.path), str(out), "99", "cmc"])
+        together(tmp_path, "train", str(pack.path), str(out), "99", "cmc")
     else:
-        together([WORKER, "train", str(pack.path), str(out), "3", "cmc"], fails=True)
+        together(tmp_path, "train", str(pack.path), str(out), "3", "cmc", fails=True)
         assert torch.load(out / "checkpoint.pt")["step"] == 2
         train(run, out, resume=True, quiet=True)
     rows = training_rows(run, pack)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -114,11 +115,48 @@ def test_int8_reports_what_it_keeps_and_runs(openvino: Path, pack: Pack, model: 
     meta = json.loads((openvino / "export.json").read_text())
     report = meta["report"]
     assert meta["int8"] and report["num_rows"] == len(pack.rows("test"))
+    assert report["target"] in ("avx2", "vnni")
     assert 0.9 < report["cosine"]["embedding_touch"]["min"] < 0.99999  # int8 leaves its mark
     assert report["size_mb"] > 0 and 0 < report["latency_ms"]["p50"] <= report["latency_ms"]["p99"]
     images = {m: pack.images[m][:5] for m in ("vision", "touch")}
     found = Engine(openvino, threads=1)(**images)
     assert cosines(found["embedding_touch"], model.embed(**images)["touch"].numpy()).min() > 0.9
+
+
+OPENED_WITHOUT_VNNI = """
+import sys
+from mvitac.quantise import this_machine
+from mvitac.runtime import Engine
+
+print(this_machine("openvino"))
+for folder in sys.argv[1:]:
+    try:
+        print(Engine(folder, threads=1).meta["report"]["target"])
+    except ValueError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(
+    not torch.cpu._is_vnni_supported() or "ONEDNN_MAX_CPU_ISA" in os.environ,
+    reason="8-bit weights are refused here, as they should be: the test above has 7-bit ones",
+)
+def test_int8_on_a_cpu_without_vnni(
+    openvino: Path, model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There 8-bit weights saturate: auto takes 7-bit ones, and an 8-bit export from elsewhere says what to do."""
+    monkeypatch.setattr(exports, "this_machine", lambda kind: "avx2")
+    tolerance = Tolerance(min_cosine=0.95, accuracy_loss=10)
+    export(model, pack, tmp_path / "auto", kind="openvino", int8=True, tolerance=tolerance)
+    found = subprocess.run(
+        [sys.executable, "-c", OPENED_WITHOUT_VNNI, tmp_path / "auto", openvino],
+        env={**os.environ, "ONEDNN_MAX_CPU_ISA": "AVX2"},  # OpenVINO obeys it
+        capture_output=True,
+        text=True,
+    )
+    machine, opened, refused = found.stdout.splitlines()
+    assert machine == opened == "avx2"
+    assert "on this machine embedding_vision has cosine" in refused and "with --target avx2" in refused
 
 
 def test_torch_export_of_touch_alone(
@@ -317,6 +355,7 @@ def test_impossible_requests_are_refused_first(
     for options, message in (
         ({"kind": "torch", "int8": True}, "--int8 is for onnx and openvino"),
         ({"kind": "onnx", "precision": "bf16"}, "--format openvino"),
+        ({"kind": "onnx", "target": "avx2"}, "add --int8"),
         ({"modalities": ("smell",)}, "no smell encoder"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -6,8 +6,6 @@ import json
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,8 +17,10 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from processes import begin, finish
 from toy import toy_pack
 
+from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.supervised import SupervisedConfig
@@ -106,28 +106,25 @@ def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:
 def command(pack: Pack, out: Path) -> list[str]:
     fields = ["--steps", "30", "--checkpoint-every", "1", "--eval-every", "0", "--log-every", "1", "--quiet"]
     choice = ["--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path)]
-    return [sys.executable, "-m", "mvitac", "pretrain", *choice, *fields, "--out", str(out), "--resume"]
-
-
-def environment() -> dict[str, str]:
-    return {**os.environ, "OMP_NUM_THREADS": "1"}
+    return ["pretrain", *choice, *fields, "--out", str(out), "--resume"]
 
 
 @pytest.mark.slow
 def test_sigkill_at_random_moments(pack: Pack, tmp_path: Path) -> None:
     """Killed with SIGKILL three times at random steps, then resumed: the weights of the run that was not."""
-    subprocess.run(command(pack, tmp_path / "straight"), check=True, env=environment(), stdout=subprocess.DEVNULL)
+    finish(begin(main, command(pack, tmp_path / "straight")))
     out, rng = tmp_path / "killed", random.Random()
     killed = 0
     for goal in sorted(rng.sample(range(2, 26), 3)):
-        process = subprocess.Popen(command(pack, out), env=environment(), stdout=subprocess.DEVNULL)
-        while process.poll() is None:
+        process = begin(main, command(pack, out))
+        while process.is_alive():
             log = out / "log.jsonl"
             if log.exists() and len(log.read_text().splitlines()) >= goal:
                 time.sleep(rng.random() * 0.02)  # anywhere within a step or its checkpoint
-                process.send_signal(signal.SIGKILL)
-                killed += process.wait() == -signal.SIGKILL
-    subprocess.run(command(pack, out), check=True, env=environment(), stdout=subprocess.DEVNULL)
+                process.kill()
+                process.join()
+                killed += process.exitcode == -signal.SIGKILL
+    finish(begin(main, command(pack, out)))
     assert killed == 3
     assert_equal_weights(tmp_path / "straight", out)
 

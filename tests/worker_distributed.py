@@ -1,8 +1,7 @@
-"""One process of tests/test_distributed.py under torchrun's variables: ``step DIR``, ``train PACK OUT DIE_AFTER METHOD``."""
+"""What one process of test_distributed.py does: main("step", DIR), main("train", PACK, OUT, DIE_AFTER, METHOD)."""
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -55,8 +54,6 @@ def train(pack: Path, out: Path, die_after: int, name: str) -> None:
     torch.save(seen, out.with_name(f"{out.name}-rows{join().rank}.pt"))
 
 
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    kind, *given = sys.argv[1:]
+def main(kind: str, *given: str) -> None:
     step(Path(given[0])) if kind == "step" else train(Path(given[0]), Path(given[1]), int(given[2]), given[3])
     dist.destroy_process_group()

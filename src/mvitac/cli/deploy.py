@@ -76,6 +76,9 @@ def export(argv: list[str]) -> None:
         """Arithmetic of openvino; bf16 only on a CPU that computes it, where it can be checked."""
         int8: bool = False
         """8-bit weights and activations, ranges from train rows of the pack (onnx, openvino)."""
+        target: Literal["auto", "avx2", "vnni"] = "auto"
+        """CPU that --int8 is for. avx2: any CPU (7-bit weights). vnni: x86 with VNNI or AMX, or ARM (8-bit weights). auto:
+        this machine's, as measured."""
         on: Path | None = None
         """Pack whose test rows check the export, and to which the probes of a run are fitted; an artifact keeps its own
         (default: the data the model was trained on)."""
@@ -104,6 +107,7 @@ def export(argv: list[str]) -> None:
             kind=options.format,
             precision=options.precision,
             int8=options.int8,
+            target=options.target,
             calibrate=Pack(options.calibrate) if options.calibrate else None,
             modalities=None if options.modality == "both" else (options.modality,),
             tolerance=exports.Tolerance(
@@ -120,6 +124,9 @@ def export(argv: list[str]) -> None:
         table.add_row(f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}")
     for name, values in report["cosine"].items():
         table.add_row(f"{name}, least cosine", "", f"{values['min']:.5f}")
+    if options.int8:
+        bits = {"avx2": "any CPU, 7-bit weights", "vnni": "with VNNI, 8-bit weights"}[report["target"]]
+        table.add_row("CPUs it is for", "", f"{report['target']}: {bits}")
     table.add_row("size, MB", "", f"{report['size_mb']}")
     table.add_row("latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"]))
     Console(markup=False).print(table)
