@@ -29,7 +29,6 @@ import safetensors
 import safetensors.torch
 import torch
 from PIL import Image
-from toy import Toy
 
 import mvitac
 from mvitac.cli.main import main
@@ -44,11 +43,11 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, safetensors_digest
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
-from mvitac.system.files import digest, digest_file, write_atomic
+from mvitac.system.files import digest, write_atomic
 from mvitac.training import views as batches_module
 from mvitac.training.loop import train
-
-Spoil = Callable[[Path], object]
+from support.forged_packs import Spoil, described, edited, seal
+from support.toy import Toy
 
 
 class WorkBegan(AssertionError):
@@ -319,16 +318,6 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
         yield path
 
 
-def edited(path: Path, keys: tuple[str, ...], value: Any) -> None:
-    """Write ``value`` at ``keys`` of the JSON in ``path``."""
-    content = json.loads(path.read_text())
-    inner = content
-    for key in keys[:-1]:
-        inner = inner[key]
-    inner[keys[-1]] = value
-    path.write_text(json.dumps(content))
-
-
 LEAVES = [".".join(path) for path in leaves(to_json(recipe("smoke", PackConfig())))]
 
 
@@ -555,26 +544,6 @@ def test_out_of_memory_is_one_line(refused: Callable[..., str], monkeypatch: pyt
 
 
 # -- packs ------------------------------------------------------------------------------------------------------------
-
-
-def seal(path: Path) -> None:
-    """Make pack.json promise what the files hold now, so that the checks behind the digests are reached."""
-    meta = json.loads((path / "pack.json").read_text())
-    meta["digests"] = {name: digest_file(path / name) for name in meta["digests"] if (path / name).exists()}
-    meta.pop("digest", None)
-    (path / "pack.json").write_text(json.dumps({**meta, "digest": digest(meta)}))
-
-
-def described(*keys: str, value: Any) -> Spoil:
-    """pack.json with another value, consistently sealed."""
-
-    def spoil(path: Path) -> None:
-        edited(path / "pack.json", keys, value)
-        meta = json.loads((path / "pack.json").read_text())
-        meta.pop("digest", None)
-        (path / "pack.json").write_text(json.dumps({**meta, "digest": digest(meta)}))
-
-    return spoil
 
 
 def within(name: str, spoil: Spoil, *, sealed: bool = False) -> Spoil:
@@ -817,7 +786,7 @@ def test_bad_samples_make_no_pack(tmp_path: Path, change: Any, says: str) -> Non
     ],
 )
 def test_unfinished_pack_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str) -> None:
-    """A damaged leftover is named (a part's file that is only damaged is made again: tests/test_pack.py)."""
+    """A damaged leftover is named (a part's file that is only damaged is made again: tests/data/test_pack.py)."""
     with monkeypatch.context() as patch:
         patch.setattr(packing, "_finish", trap("finish"))
         with pytest.raises(WorkBegan):

@@ -12,7 +12,7 @@ import pytest
 
 from mvitac.cli.main import COMMANDS, HELP, main
 
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 def test_help_imports_nothing_heavy() -> None:

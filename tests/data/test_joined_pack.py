@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy import Toy, toy_pack
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -19,6 +18,7 @@ from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.pack import PackConfig
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
+from support.toy import Toy, toy_pack
 
 
 class Negative(Toy):

@@ -15,9 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from PIL import Image, JpegImagePlugin
-from test_bad_inputs import described, seal
-from test_train import assert_equal_weights, power_cut, smoke
-from toy import Counting, Toy
 
 from mvitac.cli.main import main
 from mvitac.data import build as packing
@@ -37,6 +34,9 @@ from mvitac.run import Run
 from mvitac.system.files import digest
 from mvitac.training import views
 from mvitac.training.loop import train
+from support.forged_packs import described, seal
+from support.toy import Counting, Toy
+from support.training_runs import assert_equal_weights, power_cut, smoke
 
 FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
 

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 from filelock import FileLock
-from toy import Counting, Toy, toy_pack
 
 from mvitac.data import build as packing
 from mvitac.data.build import build
@@ -25,6 +24,7 @@ from mvitac.data.partial_pack import RowFile
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import PackConfig
 from mvitac.system import locks
+from support.toy import Counting, Toy, toy_pack
 
 FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
 

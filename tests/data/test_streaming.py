@@ -16,9 +16,6 @@ import fsspec
 import numpy as np
 import pytest
 import torch
-from test_bad_inputs import seal
-from test_train import assert_equal_weights, power_cut, smoke
-from toy import Toy
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -34,6 +31,9 @@ from mvitac.system.distributed import World
 from mvitac.training import validation
 from mvitac.training.loop import train
 from mvitac.training.sampler import batches, epoch_order, mix, partners, shard_order, training_rows
+from support.forged_packs import seal
+from support.toy import Toy
+from support.training_runs import assert_equal_weights, power_cut, smoke
 
 SHARD_MB = 0.05
 """Eight of the toy's pairs: 120 are 15 shards, 9 of them of its 72 training rows."""

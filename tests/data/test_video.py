@@ -12,13 +12,13 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
-from videos import edited, numbered, read_number, write_video
 
 from mvitac.data import video
 from mvitac.data.video import frames, num_frames
 from mvitac.datasets.table import video_times
+from support.videos import edited, numbered, read_number, write_video
 
-REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "touch_and_go_sample"
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "touch_and_go_sample"
 NUM = 150
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "mpeg4": ("v.mp4", {}),

@@ -13,9 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from films import film, shade
 from PIL import Image
-from toy import Toy
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -28,6 +26,8 @@ from mvitac.datasets.lerobot.writer import write_lerobot
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.table.video_times import nearest
 from mvitac.datasets.webdataset import WebDatasetConfig
+from support.films import film, shade
+from support.toy import Toy
 
 
 def packed(config: RowsConfig, out: Path) -> Pack:

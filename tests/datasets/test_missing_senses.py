@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy import Toy
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -28,6 +27,7 @@ from mvitac.report.explorer_data import ExplorerData
 from mvitac.training import views as batches_module
 from mvitac.training.loop import train
 from mvitac.training.sampler import partners
+from support.toy import Toy
 
 
 @dataclass

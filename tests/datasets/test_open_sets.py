@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from films import film, shade
 from PIL import Image
 
 from mvitac.cli.main import main
@@ -24,6 +23,7 @@ from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.datasets.table.video_times import num_frames, spread
 from mvitac.datasets.vt60 import VT60Config
+from support.films import film, shade
 
 
 def plain(path: Path, value: int) -> None:
@@ -332,7 +332,7 @@ def test_vt60_pairs_are_weak_but_right(packs: dict[str, Pack]) -> None:
 
 # -- genuine images, put back where their owners keep them ------------------------------------------------------------
 
-REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def genuine(name: str) -> list[dict[str, str]]:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from films import film, shade
 from PIL import Image
 
 from mvitac.data import video
@@ -22,6 +21,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.table import table as rows_module
+from support.films import film, shade
 
 Table = list[dict[str, Any]]
 

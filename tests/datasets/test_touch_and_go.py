@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from videos import numbered, read_number, write_video
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -34,8 +33,9 @@ from mvitac.datasets.touch_and_go.lists import (
 from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig
 from mvitac.datasets.touch_and_go.recordings import Recording
 from mvitac.evaluation.probe import parts
+from support.videos import numbered, read_number, write_video
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 LISTS, SAMPLE = SHARED / "touch_and_go_lists", SHARED / "touch_and_go_sample"
 published = pytest.mark.skipif(not LISTS.is_dir(), reason="the published lists are not here")
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from toy import reordered, toy_pack
 
 import mvitac
 import mvitac.deploy.export as exports
@@ -31,6 +30,7 @@ from mvitac.model import Model
 from mvitac.recipes import recipe
 from mvitac.system.files import digest, digest_file, write_json
 from mvitac.training.loop import train
+from support.toy import reordered, toy_pack
 
 EXACT = Tolerance(min_cosine=0.9999, accuracy_loss=0.0)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from dataclasses import replace
@@ -13,13 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from faults import Clock, Rig
 
 import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.engine import Engine
 from mvitac.deploy.policy import ObservationEncoder
 from mvitac.model import Model
+from support.examples import load_example
+from support.faults import Clock, Rig
 
 KEYS = {"observation.images.wrist": "vision", "observation.images.gel": "touch"}
 
@@ -99,15 +99,6 @@ def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
             ObservationEncoder(model, KEYS)({k: wrong(v) for k, v in observe(pack, [0]).items()})
     with pytest.raises(ValueError, match=r"observation.state: expected \(1, 2\)"):
         encoder({**seen, "observation.state": torch.zeros(1, 3)})
-
-
-def load_example(name: str, folder: str = "examples") -> Any:
-    path = Path(__file__).parents[1] / folder / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def message(image: np.ndarray, encoding: str, pad: int = 5) -> SimpleNamespace:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_policy import load_example
 
 import mvitac
 from mvitac.data.build import build
@@ -18,6 +17,7 @@ from mvitac.datasets.simulated import Grasps, GraspsConfig
 from mvitac.deploy.policy import ObservationEncoder
 from mvitac.model import fresh
 from mvitac.recipes import recipe
+from support.examples import load_example
 
 regrasp = load_example("regrasp")
 THINGS, EACH = 40, 5

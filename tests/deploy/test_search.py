@@ -10,7 +10,6 @@ import pyarrow.parquet as pq
 import pytest
 from filelock import FileLock
 from PIL import Image
-from test_policy import load_example
 
 import mvitac
 from mvitac.cli.main import main
@@ -18,6 +17,7 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.search import Index, build, nearest
 from mvitac.model import Model
 from mvitac.system.locks import Busy
+from support.examples import load_example
 
 
 def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:

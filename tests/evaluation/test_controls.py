@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toy import Toy, toy_pack
 
 from mvitac.data.spec import DataSpec
 from mvitac.evaluation.classifiers import fit_knn, spread_out
@@ -19,6 +18,7 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.recipes import recipe, with_method
 from mvitac.run import Run
+from support.toy import Toy, toy_pack
 
 
 def pictures(*images: np.ndarray) -> Any:

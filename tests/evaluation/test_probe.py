@@ -12,7 +12,6 @@ import pyarrow as pa
 import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
-from toy import Toy, toy_pack
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
@@ -31,6 +30,7 @@ from mvitac.report.report import _as_scored, open_runs
 from mvitac.report.tables import markdown
 from mvitac.run import Optim
 from mvitac.training.loop import train
+from support.toy import Toy, toy_pack
 
 
 @pytest.fixture(scope="module")

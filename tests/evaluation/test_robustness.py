@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_compare import small
 
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
@@ -26,6 +25,7 @@ from mvitac.model import Model, load
 from mvitac.recipes import recipe
 from mvitac.run import Optim
 from mvitac.training.loop import train
+from support.small_plans import small
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,6 @@ import pytest
 import torch
 from PIL import Image
 from rich.console import Console
-from toy import Toy, toy_pack
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -49,17 +48,8 @@ from mvitac.system.files import write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.training.loop import Interrupted, train
 from mvitac.training.step import Step
-
-ROWS = (
-    Row(label="MViTac", printed={"touch": {"pattern": 57.6}}),
-    Row(label="colder", set={"method.temperature": 0.5}),
-    Row(label="supervised, touch", method="supervised", set={"method.modalities": ["touch"]}),
-)
-
-
-def small(pack: Pack, **changes: object) -> Plan:
-    plan = Plan(name="small", rows=ROWS, recipe="smoke", seeds=2, set={"steps": 4, "eval_every": 0})
-    return replace(plan, data=PackConfig(path=pack.path), **changes)  # type: ignore[arg-type]
+from support.small_plans import ROWS, small
+from support.toy import Toy, toy_pack
 
 
 @pytest.fixture(scope="module")

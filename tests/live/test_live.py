@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from faults import Clock, Rig, World, faulty
 from PIL import Image
 from rich.console import Console
 
@@ -32,6 +31,7 @@ from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.model import Model
+from support.faults import Clock, Rig, World, faulty
 
 
 @pytest.fixture(scope="module")

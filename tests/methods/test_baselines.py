@@ -10,10 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from test_losses import slow_info_nce
-from test_methods import ROWS, TINY, build, outcome, small, views
-from test_train import smoke
-from toy import Toy
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.diagnostics import spread
@@ -36,6 +32,10 @@ from mvitac.recipes import with_method
 from mvitac.run import Optim
 from mvitac.system.distributed import World
 from mvitac.training.loop import train
+from support.slow_losses import slow_info_nce
+from support.small_methods import ROWS, TINY, build, outcome, small, views
+from support.toy import Toy
+from support.training_runs import smoke
 
 
 def unit(x: torch.Tensor) -> list[list[float]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from toy import Toy
 
 from mvitac.methods.byol import regression
 from mvitac.methods.dino import DINO, DINOConfig
@@ -12,6 +11,7 @@ from mvitac.methods.simclr import nt_xent
 from mvitac.methods.vicreg import VICReg, VICRegConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.nn.losses import queue_nce
+from support.toy import Toy
 
 loss = pytest.importorskip("lightly.loss")
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)

@@ -8,8 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 import torch.nn.functional as F
-from test_losses import slow_info_nce
-from toy import Toy
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Views
@@ -17,6 +15,8 @@ from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.run import Optim
 from mvitac.training.step import build_optimiser
+from support.slow_losses import slow_info_nce
+from support.toy import Toy
 
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
 CONFIG = MViTacConfig(hidden=24, out=12)

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from toy import Toy
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
+from support.toy import Toy
 
 
 def test_strips_hold_their_class_and_spread_over_groups(pack: Pack) -> None:

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
 from PIL import Image
-from toy import reordered
 
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.report.explorer_data import COLOURS, ExplorerData
+from support.browser import CHROMIUM, Browser
+from support.toy import reordered
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ def test_a_grasp_repeats_whatever_was_simulated_before_it_and_in_another_process
     code = f"""
 import sys; sys.path.insert(0, {str(next(iter(__import__("mvitac").__path__)))!r} + "/..")
 sys.path.insert(0, {str(__file__).rsplit("/", 1)[0]!r})
-import test_sim_grasps as t
+import test_grasps as t
 print(t.digest(t.grasps.grasp(3, 5, 7, size=t.SIZE)))
 """
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

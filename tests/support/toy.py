@@ -41,7 +41,7 @@ class Toy(Source):
             group_by="instance",
             controls={"noise only": ("noise",)},
             licence="none",
-            source="tests/toy.py",
+            source="tests/support/toy.py",
         )
 
     def items(self) -> list[str]:

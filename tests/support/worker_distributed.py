@@ -1,4 +1,4 @@
-"""One process of tests/test_distributed.py under torchrun's variables: ``step DIR``, ``train PACK OUT DIE_AFTER METHOD``."""
+"""One process of test_distributed.py, as torchrun starts it: ``step DIR`` or ``train PACK OUT DIE_AFTER METHOD``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from test_distributed import METHODS, build, loop_run, run_of, third_step, three_steps, views
-from test_step import split
 
 from mvitac.datasets.pack import PackConfig, StreamConfig
 from mvitac.methods.base import Method
@@ -18,6 +16,8 @@ from mvitac.system.distributed import join, synchronise_norms
 from mvitac.training import views as batches
 from mvitac.training.loop import train as pretrain
 from mvitac.training.step import Step
+from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps, views
+from support.small_steps import split
 
 
 def step(folder: Path) -> None:

@@ -7,63 +7,32 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from test_step import assert_close, gradients, views
-from test_step import build as build_from
-from test_train import power_cut
-from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.data.sharding import write_shards
-from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
-from mvitac.methods.cmc import CMCConfig
-from mvitac.methods.mvitac import MViTacConfig
-from mvitac.recipes import recipe, with_method
-from mvitac.run import Optim, Run
+from mvitac.recipes import recipe
 from mvitac.system.distributed import World
-from mvitac.training import checkpoint
 from mvitac.training.loop import train
 from mvitac.training.sampler import batches, training_rows
-from mvitac.training.step import Chunk, Step
+from mvitac.training.step import Step
+from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
+from support.small_steps import assert_close, views
+from support.training_runs import power_cut
 
-RUN = replace(
-    recipe("smoke"), optim=Optim(name="sgd"), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
-)
-HERE = Path(__file__).parent
-WORKER = str(HERE / "worker_distributed.py")
-METHODS = {
-    "mvitac": RUN.method,
-    "cmc": CMCConfig(out=12, num_negatives=1500),
-    "cmc softmax": CMCConfig(out=12, num_negatives=1500, softmax=True),
-    "cmc softmax, 2 negatives": CMCConfig(out=12, num_negatives=2, softmax=True),  # often a process holds neither
-}
-NUM_ROWS = 601  # of which two processes hold 301 and 300
+TESTS = Path(__file__).parents[1]
+WORKER = str(TESTS / "support" / "worker_distributed.py")
 CHAOS = 0.02
 """Of the largest entry: weights 1e-7 apart are up to 4e-3 apart three steps later, where a ReLU turns over."""
-
-
-def run_of(method: str) -> Run:
-    return replace(RUN, method=METHODS[method])
-
-
-def build(method: str = "mvitac") -> Method:
-    return build_from(run_of(method), num_rows=NUM_ROWS)
-
-
-def loop_run(data: DatasetConfig, method: str) -> Run:
-    return replace(with_method(recipe("smoke", data), method), steps=4, checkpoint_every=2, log_every=1)
 
 
 def together(command: list[str], num: int = 2, fails: bool = False) -> None:
@@ -72,7 +41,7 @@ def together(command: list[str], num: int = 2, fails: bool = False) -> None:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": str(num), "OMP_NUM_THREADS": "1"}
-    shared["PYTHONPATH"] = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+    shared["PYTHONPATH"] = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     processes = []
     for rank in map(str, range(num)):
         environment = {**os.environ, **shared, "RANK": rank, "LOCAL_RANK": rank}
@@ -84,28 +53,6 @@ def together(command: list[str], num: int = 2, fails: bool = False) -> None:
     for process in processes:
         errors = process.communicate(timeout=120)[1].decode()
         assert (process.returncode != 0) == fails, errors
-
-
-def three_steps(
-    start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, to: Path, world: World | None = None
-) -> dict[str, Any]:
-    """What three steps on ``parts`` make, with a checkpoint ``to`` after the second."""
-    method, step = start()
-    result = {"losses": step(parts, lr=5e-3, seed=0, progress=0.5), "gradients": gradients(method)}
-    result["memory"] = {k: v.clone() for k, v in method.state_dict().items() if k.startswith(("banks.", "z_norm"))}
-    step(parts, lr=5e-3, seed=1, progress=0.5)
-    checkpoint.save(to, run, method, step.optimiser, 2, world)
-    result["last"] = step(parts, lr=5e-3, seed=2, progress=0.5)
-    result["own"] = {m: bank.values[: bank.num_own] for m, bank in getattr(method, "banks", {}).items()}
-    return {**result, "weights": method.state_dict()}
-
-
-def third_step(start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, of: Path) -> dict[str, Tensor]:
-    """The weights after the last of these, begun from the checkpoint ``of``."""
-    method, step = start()
-    assert checkpoint.restore(of, run, method, step.optimiser, 3) == 2
-    step(parts, lr=5e-3, seed=2, progress=0.5)
-    return method.state_dict()
 
 
 def alone(name: str) -> tuple[Method, Step]:

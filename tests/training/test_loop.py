@@ -9,61 +9,26 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
-from toy import toy_pack
 
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
-from mvitac.recipes import recipe
-from mvitac.run import Optim, Run
-from mvitac.training import views as batches
+from mvitac.run import Optim
 from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
 from mvitac.training.sampler import epoch_order, partners
 from mvitac.training.validation import evaluate
 from mvitac.training.views import make_views
-
-
-def smoke(pack: Pack, **changes: object) -> Run:
-    return replace(recipe("smoke", PackConfig(path=pack.path)), **changes)  # type: ignore[arg-type]
-
-
-@contextmanager
-def power_cut(after: int) -> Iterator[None]:
-    """Training dies (RuntimeError "power cut") when it asks for its views after ``after`` batches."""
-    left = iter(range(after))
-
-    def dying(*args: object) -> object:
-        if next(left, None) is None:
-            raise RuntimeError("power cut")
-        return make_views(*args)  # type: ignore[arg-type]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batches, "make_views", dying)
-        yield
-
-
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return safetensors.torch.load_file(path / "model.safetensors")
-
-
-def assert_equal_weights(a: Path, b: Path) -> None:
-    first, second = weights(a), weights(b)
-    assert first.keys() == second.keys()
-    for name, value in first.items():
-        assert torch.equal(value, second[name]), name
+from support.toy import toy_pack
+from support.training_runs import assert_equal_weights, power_cut, smoke, weights
 
 
 @pytest.fixture(scope="module")

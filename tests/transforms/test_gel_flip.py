@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter
-from toy import toy_pack
 
 from mvitac.data.build import build
 from mvitac.data.pack import Pack, Store
@@ -27,6 +26,7 @@ from mvitac.training.loop import train
 from mvitac.training.views import make_views
 from mvitac.transforms.gel_flip import MIN_ROWS, GelMirror, slope_colours
 from mvitac.transforms.random_views import Augment, ViewAugment, plain_view
+from support.toy import toy_pack
 
 SIDE = 48
 PIXEL_MM = 12.8 / SIDE

@@ -45,7 +45,7 @@ class Presses(Source):
             tasks=(Task(name="material", classes=("wood", "metal", "cloth")),),
             group_by="object",
             licence="none",
-            source="tests/test_doctor.py",
+            source="tests/data/checks/test_checks.py",
         )
 
     def items(self) -> list[str]:
