@@ -110,7 +110,7 @@ def _train(
     every = run.checkpoint_every or max(1, num_steps // 10)
     method.train()
 
-    telling = {"quiet": quiet, "sinks": loggers}
+    telling = {"quiet": quiet, "loggers": loggers}
     log_here = Log(out, start, num_steps, run.batch_size, **telling) if world.writes else nullcontext()
     with log_here as log, _stop_signals() as stopped:
         if log and not quiet:  # not measured for nobody
