@@ -1,4 +1,4 @@
-"""What a run says of itself while it trains: log.jsonl, the progress, and the sinks one may add; and others of it."""
+"""What a run says of itself while it trains: log.jsonl, the progress, and the loggers one may add."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EARLY = 3
 
 
 class Log:
-    """log.jsonl, the progress, and the sinks; on resume, lines after the checkpoint are dropped."""
+    """log.jsonl, the progress, and the loggers; on resume, lines after the checkpoint are dropped."""
 
     def __init__(
         self, out: Path, start: int, num_steps: int, batch_size: int, *, quiet: bool, loggers: tuple[Logger, ...]
