@@ -22,7 +22,6 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mvitac.data.build_parts import Work, make_parts
 from mvitac.data.jpeg import QUALITY
@@ -33,6 +32,8 @@ from mvitac.data.spec import DataSpec
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
+from mvitac.system.progress import shown
+from mvitac.system.progress import work as progress
 from mvitac.system.provenance import provenance
 
 NUM_PART_ITEMS = 32
@@ -169,13 +170,14 @@ def _write_parts(work: Work, parts: Sequence[Part], workers: int, quiet: bool) -
     """Write all parts and return the digest of each image file by its name."""
     # Parts are done in order, so digests are computed while other processes work, from rows still in memory.
     sums = {modality: hashlib.sha256(rows.header(rows.num)) for modality, rows in work.files.items()}
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, disable=quiet) as progress:
-        bar = progress.add_task(f"packing {work.spec.name}", total=len(work.counts))
+    with (
+        shown(quiet=quiet),
+        progress(f"packing {work.spec.name}", len(work.counts), "items", announce=False) as advance,
+    ):
         for part, num in zip(parts, make_parts(work, parts, workers), strict=True):
             for modality, rows in work.files.items():
                 sums[modality].update(rows.join(part, num))
-            progress.update(bar, advance=part.items[1] - part.items[0])
+            advance(part.items[1] - part.items[0])
     return {rows.path.name: sums[modality].hexdigest() for modality, rows in work.files.items()}
 
 

@@ -3,7 +3,7 @@
 Without torchrun there is one process and all functions do nothing. Each process embeds its own rows. Embeddings of all
 processes are gathered, and each process computes the whole loss, so it has the full gradient of its own embeddings.
 Parameter gradients are then summed. The result is the gradient of a single process on the joint batch
-(tests/test_distributed.py).
+(tests/training/test_distributed.py).
 
 If a memory bank is sharded, process r has rows r, r + size, ... (`shard`). Inputs that are equal on all processes go through
 `spread`, and partial results of the shards through `sum`, so that values and gradients are complete on every process (the
@@ -93,7 +93,7 @@ class World:
         """Return whether ``flag`` is true on any process; all processes must call this."""
         if self.size == 1:
             return flag
-        value = torch.tensor(float(flag), device="cuda" if dist.get_backend() == "nccl" else "cpu")
+        value = torch.tensor(float(flag), device=local_device("cuda") if dist.get_backend() == "nccl" else "cpu")
         dist.all_reduce(value)
         return bool(value > 0)
 
