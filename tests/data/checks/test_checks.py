@@ -170,8 +170,8 @@ FAULTS = {
     "labels": ("missing labels", "look", "first 00-01"),
     "numbers": ("numbers", "look", "force is not a number in 1 of 320 (0.3 %), first row 41"),
     "range": ("numbers", "look", "force is 1e+06 in row 41"),
-    "sensor": ("sensors and resolutions", "look", "sensor alone tells material to 100 %"),
-    "give-away": ("columns that give a label away", "look", "force tells material to 91 %"),
+    "sensor": ("sensors and resolutions", "look", "sensor alone predicts material with 100 % accuracy"),
+    "give-away": ("columns that give a label away", "look", "force predicts material with 91 % accuracy"),
     "published": ("published: objects", "look", "20 found, 21 published; missing 20"),
 }
 

@@ -25,7 +25,7 @@ def unreadable(pack: Pack) -> Finding:
     return Finding(
         item="unreadable items",
         verdict="broken" if len(damaged) > 0.01 * pack.num else "look",
-        evidence=f"{len(damaged)} beside {pack.num} rows that were read, first {name}: {why}",
+        evidence=f"{len(damaged)}; {pack.num} rows were read; first {name}: {why}",
         advice="repair them or download them again; the pack does not contain them",
     )
 
@@ -219,7 +219,9 @@ def _predicted_tasks(pack: Pack, column: str, values: np.ndarray) -> list[str]:
             continue
         majority, told = np.bincount(labels).max() / len(labels), _accuracy(mine, labels)
         if told > majority + 0.1:
-            notes.append(f"{column} alone tells {task.name} to {100 * told:.0f} % (majority {100 * majority:.0f} %)")
+            notes.append(
+                f"{column} alone predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
+            )
     return notes
 
 
@@ -283,7 +285,9 @@ def give_aways(pack: Pack) -> Finding:
             part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
             told = _accuracy(part, labels)
             if told > majority + 0.1:
-                notes.append(f"{name} tells {task.name} to {100 * told:.0f} % (majority {100 * majority:.0f} %)")
+                notes.append(
+                    f"{name} predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
+                )
     advice = "report them with every score as a control (--data.controls name=column)" if notes else ""
     return Finding(
         item="columns that give a label away",
