@@ -36,7 +36,7 @@ docs: .venv/ready  ## the documentation site, into site/ (open site/index.html);
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 notebooks: .venv/ready  ## write the tutorials' notebooks anew from their pages
-	$(BIN)/jupytext --quiet --to ipynb docs/tutorials/[!i]*.md
+	$(BIN)/jupytext --quiet --update --to ipynb docs/tutorials/[!i]*.md
 
 pictures: .venv/ready  ## draw the docs' picture of the simulator again
 	$(BIN)/mvitac data sheet materials --out docs/materials.png
