@@ -22,7 +22,7 @@ def run(page: Path) -> None:
     """Run the code cells of ``page``. Its commands run in this process, which spares each the import of torch."""
     from mvitac.cli.main import main
 
-    names = {"__name__": "tutorial"}
+    names = vars(sys.modules["__main__"])  # where a notebook's cells define their names, too
     for kind, source in cells(page):
         if kind != "code":
             continue
