@@ -70,16 +70,26 @@ LATER = {"later": True}
 without it keeps its bytes and digests."""
 
 
-def to_json(config: Any) -> Any:
-    """A (nested) config dataclass as JSON-ready values; a registered one carries its ``name``."""
+LATER_IN_DIGEST = {"later in digest": True}
+"""The same for a field that is always written, but is left out of digests at its default."""
+
+
+def to_json(config: Any, *, for_digest: bool = False) -> Any:
+    """A (nested) config dataclass as JSON-ready values; a registered one carries its ``name``.
+
+    With ``for_digest``, without the fields of ``LATER_IN_DIGEST`` that are at their default.
+    """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        said = [f for f in dataclasses.fields(config) if f.metadata != LATER or getattr(config, f.name) != f.default]
-        fields = {f.name: to_json(getattr(config, f.name)) for f in said}
+        left_out = (LATER, LATER_IN_DIGEST) if for_digest else (LATER,)
+        said = [
+            f for f in dataclasses.fields(config) if f.metadata not in left_out or getattr(config, f.name) != f.default
+        ]
+        fields = {f.name: to_json(getattr(config, f.name), for_digest=for_digest) for f in said}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
-        return {str(key): to_json(value) for key, value in config.items()}
+        return {str(key): to_json(value, for_digest=for_digest) for key, value in config.items()}
     if isinstance(config, (list, tuple)):
-        return [to_json(value) for value in config]
+        return [to_json(value, for_digest=for_digest) for value in config]
     return str(config) if isinstance(config, Path) else config
 
 

@@ -124,6 +124,7 @@ class GraspsConfig(SimulatedConfig):
     """Simulated two-finger grasps of 106 objects, before, during and after the lift; label success; split by object."""
 
     name: ClassVar[str] = "grasps"
+    phased: ClassVar[bool] = True
 
     num: int = 5300
     """How many grasps; each gives three rows (before, during, after)."""

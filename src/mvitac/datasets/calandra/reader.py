@@ -70,6 +70,7 @@ class CalandraConfig(DatasetConfig):
     """Grasps of about 106 objects with two GelSights (stacked, 6 channels) and a Kinect; label success."""
 
     name: ClassVar[str] = "calandra"
+    phased: ClassVar[bool] = True
 
     path: Path = Path("data/calandra")
     """Folder with the owners' shards calandra_corl2017_000.h5 to _037.h5, or with some of them."""
