@@ -51,9 +51,12 @@ class Engine:
         for name in (n for n in self.meta["outputs"] if n.startswith("embedding_")):
             least = float(cosines(found[name], check[name]).min())
             if not least >= self.meta["tolerance"]["min_cosine"]:
+                again = " with this engine"
+                if self.meta["int8"] and self.meta["report"].get("target") != "avx2":
+                    again = ", with --target avx2 if this CPU has no VNNI"
                 raise ValueError(
                     f"{folder}: on this machine {name} has cosine {least:.4f} to what the trained model gave,"
-                    f" at least {self.meta['tolerance']['min_cosine']} is allowed: export it again with this engine"
+                    f" at least {self.meta['tolerance']['min_cosine']} is allowed: export it again{again}"
                 )
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:

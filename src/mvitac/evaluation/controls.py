@@ -5,7 +5,7 @@ A score says something only by how far it is above these, on the same rows and b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from mvitac.model import fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.run import Run
 from mvitac.system.processes import in_threads
+from mvitac.system.progress import work
 
 CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority")
 """Their names, from the strongest idea to the weakest; the data's own come before the last."""
@@ -61,41 +62,51 @@ def controls_of(
         records.extend({"source": source, "seed": seed, **record} for record in found)
 
     for task in tasks:
-        rows = parts(pack, task)
-        everything = np.concatenate([rows.train, rows.val, rows.test])
-        labels = pack.column(f"label_{task.name}").astype(int)
-        common = np.bincount(labels[np.concatenate([rows.train, rows.val])], minlength=len(task.classes)).argmax()
-        constant = np.eye(len(task.classes))[np.full(len(rows.test), common)]
-        result = score_rows(pack, task, rows.test, constant)
-        add("majority", None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
-        for name, columns in pack.spec.controls.items():
-            x = np.stack([pack.column(column)[everything].astype(float) for column in columns], axis=1)
-            result = probe_features(x, pack, task, rows, "linear", 0)
-            add(name, None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
+        for name, record in _without_images(pack, task):
+            add(name, None, [record])
 
     def pixels(modality: str, rows: np.ndarray) -> np.ndarray:
         names = pack.spec.modalities if modality == "both" else (modality,)
         return np.concatenate([thumbnails(pack, m, rows) for m in names], axis=1)
 
-    add("pixels", None, probe_all(pixels, pack, tasks, modalities, ["linear"], 0))
-    if "touch" in modalities:
-        ring = probe_all(lambda m, rows: borders(pack, m, rows), pack, tasks, ["touch"], ["linear"], 0)
-        add("border", None, ring)
+    starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)
+    num_trunks = len(probes) * (len(starts) + len(weights))
+    num = len(tasks) * (len(modalities) * (1 + num_trunks) + ("touch" in modalities))
+    with work("fitting probes of the controls", num, "probes"):
+        add("pixels", None, probe_all(pixels, pack, tasks, modalities, ["linear"], 0))
+        if "touch" in modalities:
+            ring = probe_all(lambda m, rows: borders(pack, m, rows), pack, tasks, ["touch"], ["linear"], 0)
+            add("border", None, ring)
 
-    # The trunk before training, once for each seed and architecture among the runs; then the trunk they started from.
-    starts = starts_of(runs, specs or [pack.spec] * len(runs))
-    untrained = [fresh(_scratch(run), spec, pack.size) for run, spec in starts]  # one by one: threads share a generator
-    scored = in_threads(
-        lambda model: (probe_model(model, pack, tasks, modalities, probes), cross_modal(model, pack)), untrained
-    )
-    for (run, _), (found, ranked) in zip(starts, scored, strict=True):
-        add("untrained", run.seed, found)
-        retrieval += [{"source": "untrained", "seed": run.seed, **r} for r in ranked]
-    for name in start_weights(runs, imagenet):
-        run, spec = starts[0]
-        start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
-        add("imagenet", None, probe_model(start, pack, tasks, modalities, probes))
+        # The trunk before training, once for each seed and architecture among the runs; then the trunk they started from.
+        untrained = [
+            fresh(_scratch(run), spec, pack.size) for run, spec in starts
+        ]  # one by one: threads share a generator
+        scored = in_threads(
+            lambda model: (probe_model(model, pack, tasks, modalities, probes), cross_modal(model, pack)), untrained
+        )
+        for (run, _), (found, ranked) in zip(starts, scored, strict=True):
+            add("untrained", run.seed, found)
+            retrieval += [{"source": "untrained", "seed": run.seed, **r} for r in ranked]
+        for name in weights:
+            run, spec = starts[0]
+            start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
+            add("imagenet", None, probe_model(start, pack, tasks, modalities, probes))
     return records, retrieval
+
+
+def _without_images(pack: Pack, task: Task) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The commonest class, and the dataset's own columns, by name."""
+    rows = parts(pack, task)
+    everything = np.concatenate([rows.train, rows.val, rows.test])
+    labels = pack.column(f"label_{task.name}").astype(int)
+    common = np.bincount(labels[np.concatenate([rows.train, rows.val])], minlength=len(task.classes)).argmax()
+    constant = np.eye(len(task.classes))[np.full(len(rows.test), common)]
+    own = {"task": task.name, "modality": "none", "probe": "linear"}
+    yield "majority", {**own, **score_rows(pack, task, rows.test, constant)}
+    for name, columns in pack.spec.controls.items():
+        x = np.stack([pack.column(column)[everything].astype(float) for column in columns], axis=1)
+        yield name, {**own, **probe_features(x, pack, task, rows, "linear", 0)}
 
 
 def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run, DataSpec]]:

@@ -20,6 +20,7 @@ from mvitac.registry import to_json, unknown
 from mvitac.run import load_run
 from mvitac.system.files import check_place, digest, write_json
 from mvitac.system.processes import in_threads
+from mvitac.system.progress import work
 
 END_TO_END = ", end to end"
 """Added to a source's name where its own classifiers are scored, which it trained along with its encoders."""
@@ -99,7 +100,10 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         )
         return mine, found
 
-    for mine, found in in_threads(lambda each: one(*each), list(zip(paths, models, names, strict=True))):
+    num = len(models) * len(tasks) * len(modalities) * len(session.probes)
+    with work("fitting probes", num, "probes"):
+        scored = in_threads(lambda each: one(*each), list(zip(paths, models, names, strict=True)))
+    for mine, found in scored:
         records += mine
         retrieval += found
     if session.controls:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -10,12 +12,23 @@ from mvitac.data.pack import Pack
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
+from mvitac.system.progress import work
 
 
 def pack_features(
-    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, bf16: bool = False
+    model: Model,
+    pack: Pack,
+    modality: str,
+    rows: np.ndarray,
+    *,
+    for_heads: bool = False,
+    bf16: bool = False,
+    advance: Callable[[int], object] = lambda num: None,
 ) -> Tensor:
-    """Features [len(rows), D] of pack rows, as ``Model.features``, in chunks on the model's device; back on the CPU."""
+    """Features [len(rows), D] of pack rows, as ``Model.features``, in chunks on the model's device; back on the CPU.
+
+    ``advance`` is told how many rows each chunk has, once it is done.
+    """
     device = next(model.parameters()).device
     if device.type == "cpu":
         keep_freed_memory()  # else every activation is mapped anew: twice the time and more on a virtual machine
@@ -23,6 +36,7 @@ def pack_features(
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
         chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
+        advance(len(chunk))
     return torch.cat(chunks)
 
 
@@ -48,6 +62,7 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
             return np.load(path, allow_pickle=False)
         except (ValueError, EOFError, OSError):
             path.unlink()  # damaged: compute it again
-    values = pack_features(model, pack, modality, rows, for_heads=for_heads).numpy()
+    with work(f"reading {modality} features", len(rows), "images") as advance:
+        values = pack_features(model, pack, modality, rows, for_heads=for_heads, advance=advance).numpy()
     write_atomic(path, lambda file: np.save(file, values))
     return values

@@ -21,6 +21,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.scores import score
 from mvitac.model import Model
 from mvitac.registry import unknown
+from mvitac.system.progress import tick
 
 PROBES = ("linear", "paper", "knn")
 """linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
@@ -136,7 +137,7 @@ def score_rows(pack: Pack, task: Task, rows: np.ndarray, probabilities: np.ndarr
 def probe_all(
     matrix: Any, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str], probes: Sequence[str], seed: int
 ) -> list[dict[str, Any]]:
-    """Every (task, modality, probe) on the features ``matrix(modality, rows)``."""
+    """Every (task, modality, probe) on the features ``matrix(modality, rows)``; each is a tick of "probes"."""
     papers = _papers(matrix, pack, tasks, modalities, seed) if "paper" in probes else {}
     records = []
     for task in tasks:
@@ -145,6 +146,7 @@ def probe_all(
             x = matrix(modality, np.concatenate([rows.train, rows.val, rows.test]))
             for kind in probes:
                 result = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
+                tick("probes")
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
 

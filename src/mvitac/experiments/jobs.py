@@ -14,6 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -31,7 +32,8 @@ from mvitac.system.device import pick_device
 from mvitac.system.files import brief, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.system.processes import my_device, side_by_side
-from mvitac.training.log import bars, last_line
+from mvitac.system.progress import Bars, shown
+from mvitac.training.log import Logger, in_a_bar, last_line
 from mvitac.training.loop import Diverged, Interrupted, train
 from mvitac.training.sampler import training_rows
 
@@ -92,26 +94,26 @@ class Work:
     left_out: dict[str, str]
 
 
-def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
+def do(job: Job, pack: Pack | None = None, *, quiet: bool = True, loggers: tuple[Logger, ...] = ()) -> str:
     """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant, and from several
     processes at once: what one is at, the others leave to it."""
     try:
         with hold_lock(
             job.out, "another process is at it; this command makes the whole table once it is done", wait=False
         ):
-            return "finished before" if job.done else _do(job, pack, quiet)
+            return "finished before" if job.done else _do(job, pack, quiet, loggers)
     except Busy as busy:
         return str(busy)
 
 
-def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
+def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -> str:
     pack = pack or job.run.data.open(quiet=True)
     gpu = pick_device(job.run.device)
     measured = gpu.type == "cuda" and not (job.out / "model.safetensors").exists()
     if measured:
         torch.cuda.reset_peak_memory_stats(gpu)
     try:
-        train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
+        train(job.run, job.out, resume=True, quiet=quiet, loggers=loggers, pack=pack)
     except Diverged as error:
         write_json(job.out / "failed.json", {"error": str(error)})
         return f"diverged: {error}"
@@ -132,15 +134,14 @@ def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
 def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
     """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several.
 
-    ``console``, if it is a terminal, shows how far they are. A job that fails is told; the first one's error is raised after
-    all others are done. ValueError if a process dies. Interrupted after Ctrl-C, when the runs under way have saved
-    their checkpoints.
+    ``console``, if given, shows how far they are and the time left. A job that fails is told; the first one's error is
+    raised after all others are done. ValueError if a process dies. Interrupted after Ctrl-C, when the runs under way
+    have saved their checkpoints.
     """
     todo = [job for job in work.jobs if not job.done]
     for job in work.jobs:
         if job.done and not (job.out / "failed.json").exists():
             job.drop_checkpoint()  # of a run that was killed when it had been scored
-    shown = console if console and console.is_terminal else None
     errors: list[Exception] = []
 
     def told(job: Job, result: Callable[[], str]) -> None:
@@ -154,13 +155,17 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
         say(f"[{sum(j.done for j in work.jobs)}/{len(work.jobs)}] {job.name}: {line}")
 
     try:
-        if num_jobs == 1 or len(todo) < 2:
-            for job in todo:
-                say(f"{job.name} ...")
-                pack = work.pack if job.run.data == work.plan.data else None
-                told(job, lambda job=job, pack=pack: do(job, pack, quiet=not shown))
-        else:
-            _side_by_side(work, todo, num_jobs, told, shown)
+        with shown(console, quiet=console is None) as bars:
+            pace = _Pace(work, todo, bars, num_jobs)
+            if num_jobs == 1 or len(todo) < 2:
+                for job in todo:
+                    say(f"{job.name} ...")
+                    pack = work.pack if job.run.data == work.plan.data else None
+                    look = (lambda *_, job=job: pace.look([job]),)
+                    told(job, lambda job=job, pack=pack, look=look: do(job, pack, quiet=console is None, loggers=look))
+                    pace.look([])
+            else:
+                _side_by_side(work, todo, num_jobs, told, pace)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("stopped; the same command goes on from here") from None
     except BrokenProcessPool:
@@ -173,37 +178,71 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
 
 
 def _side_by_side(
-    work: Work,
-    todo: Sequence[Job],
-    num_jobs: int,
-    told: Callable[[Job, Callable[[], str]], None],
-    console: Console | None,
+    work: Work, todo: Sequence[Job], num_jobs: int, told: Callable[[Job, Callable[[], str]], None], pace: _Pace
 ) -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
-    shown = bars(console or Console(), disable=console is None, transient=True, speed_estimate_period=600)
-    with shown as progress, side_by_side(num_jobs, devices) as pool:
-        overall = progress.add_task("all runs", total=len(todo), text="")
-        tasks: dict[Path, tuple[TaskID, int]] = {}  # of the runs under way, with their steps
+    with side_by_side(num_jobs, devices) as pool:
         jobs = {pool.submit(_do_here, job): job for job in todo}
         waiting = set(jobs)
         while waiting:
             done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
-                told(job := jobs[future], future.result)
-                if job.out in tasks:
-                    progress.remove_task(tasks.pop(job.out)[0])
-            part = 0.0
-            for job in (jobs[future] for future in waiting if future.running()) if console else ():
-                step, text = last_line(job.out)
-                if step and job.out not in tasks:
-                    steps = job.run.num_steps(len(training_rows(job.run, work.pack)))
-                    tasks[job.out] = progress.add_task(job.name, total=steps, text=""), steps
-                if job.out in tasks:
-                    task, steps = tasks[job.out]
-                    progress.update(task, completed=step, text=text)
-                    part += min(1, step / steps)  # a fold's own steps may be more
-            progress.update(overall, completed=len(todo) - len(waiting) + part)
+                told(jobs[future], future.result)
+            pace.look([jobs[future] for future in waiting if future.running()])
+
+
+class _Pace:
+    """How far the jobs of a comparison are, and when they will be done, by the speeds that their rows' logs tell."""
+
+    def __init__(self, work: Work, todo: Sequence[Job], bars: Bars | None, num_jobs: int) -> None:
+        self.todo, self.bars, self.num_jobs = todo, bars, num_jobs
+        self.speeds: dict[str, float] = {}  # pairs per second of each row, as last seen
+        self.tasks: dict[Path, TaskID] = {}  # bars of the runs under way
+        if bars:
+            # A fold's own steps may be a few more or less.
+            self.steps = {job.out: job.run.num_steps(len(training_rows(job.run, work.pack))) for job in work.jobs}
+            for job in work.jobs:
+                self._see(job)
+            self.overall = bars.add_task("all runs", total=len(todo), unit="runs", rate="")
+
+    def _see(self, job: Job) -> dict[str, Any]:
+        """What a bar shows of ``job``; its speed is kept for its row."""
+        seen = in_a_bar(last_line(job.out), self.steps[job.out], job.run.batch_size)
+        if seen["speed"]:
+            self.speeds[job.label] = seen["speed"]
+        return seen
+
+    def look(self, running: Sequence[Job]) -> None:
+        """Show where the jobs under way are now, and when all will be done."""
+        if not self.bars:
+            return
+        for path in self.tasks.keys() - {job.out for job in running}:
+            self.bars.remove_task(self.tasks.pop(path))
+        steps_done = {}
+        for job in running:
+            seen = self._see(job)
+            steps_done[job.out] = seen["completed"]
+            if len(self.todo) > 1 and self.num_jobs > 1:  # a run in this process has its own bar
+                if job.out not in self.tasks:
+                    many = {"total": self.steps[job.out], "unit": "steps", "rate": "pairs", "silent": True}
+                    self.tasks[job.out] = self.bars.add_task(job.name, **many)
+                self.bars.update(self.tasks[job.out], **seen)
+        todo = [job for job in self.todo if not job.done]
+        part = sum(min(1, steps_done.get(job.out, 0) / self.steps[job.out]) for job in todo)
+        left = self.seconds_left(todo, steps_done)
+        self.bars.update(self.overall, completed=len(self.todo) - len(todo) + part, left=left)
+
+    def seconds_left(self, todo: Sequence[Job], steps_done: dict[Path, int]) -> float | None:
+        """Seconds of training for ``todo``, ``num_jobs`` at a time; a row without a speed gets the mean of the others'."""
+        if not self.speeds:
+            return None
+        usual = fmean(1 / max(speed, 1e-9) for speed in self.speeds.values())
+        seconds = 0.0
+        for job in todo:
+            pairs = max(0, self.steps[job.out] - steps_done.get(job.out, 0)) * job.run.batch_size
+            seconds += pairs / self.speeds[job.label] if job.label in self.speeds else pairs * usual
+        return seconds / min(self.num_jobs, max(1, len(todo)))
 
 
 def _do_here(job: Job) -> str:

@@ -2,7 +2,7 @@
 
 The last stages of a ResNet at 48 px have maps of 3x3 and 2x2 pixels. oneDNN spends ten times as long on them as their
 arithmetic takes, most of it on the weights' gradient (docs/speed.md); as a product over the unrolled neighbourhoods
-(im2col) they are plain matrix products. The same sums in another order, so equal to rounding (tests/test_small_maps.py).
+(im2col) they are plain matrix products. The same sums in another order, so equal to rounding (tests/nn/test_small_conv.py).
 """
 
 from __future__ import annotations

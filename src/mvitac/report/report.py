@@ -25,6 +25,7 @@ from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
 from mvitac.run import load_run
 from mvitac.system.files import write_atomic
+from mvitac.system.progress import duration, shown, work
 
 
 def write_report(
@@ -44,10 +45,9 @@ def write_report(
     runs = open_runs([Path(path) for path in paths])
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
         raise ValueError("these runs were trained on different data: report them apart")
-    console = Console(stderr=True, quiet=quiet)
     pack = pack or runs[0].run.data.open(quiet=quiet)
     if result is None:
-        with console.status("probing"):
+        with shown(Console(stderr=True), quiet=quiet):
             result = _probe(runs, pack)
     elif not isinstance(result, dict) or {"pack", "records", "retrieval", "summary", "classes"} - set(result):
         raise ValueError("this is not a probe result: make one with `mvitac probe RUN... --json FILE`")
@@ -57,7 +57,7 @@ def write_report(
         )
     _check_scored(runs, result)
     runs = _as_scored(runs, result)
-    with console.status("drawing"):
+    with shown(Console(stderr=True), quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
     write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
     return Path(out) / "report.html"
@@ -128,18 +128,23 @@ def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finishe
 
 def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
-    sections = [
-        ("scores", "What the frozen features are worth", evidence.probe(study)),
-        ("retrieval", "Finding the other modality", evidence.retrieval(study)),
-        ("loss", "Loss", evidence.loss(study)),
-        ("collapse", "Learning or collapsing?", evidence.collapse(study)),
-        ("confusion", "What is taken for what", evidence.confusions(study)),
-        ("map", "A map of the features", galleries.feature_maps(study)),
-        ("gallery", "Retrieval gallery", galleries.gallery(study)),
-        ("settings", "Settings", _settings(study)),
-        ("cost", "What it cost", _cost(study)),
-        ("again", "Do it again", _again(study)),
-    ]
+    drawn = {
+        "scores": ("What the frozen features are worth", evidence.probe),
+        "retrieval": ("Finding the other modality", evidence.retrieval),
+        "loss": ("Loss", evidence.loss),
+        "collapse": ("Learning or collapsing?", evidence.collapse),
+        "confusion": ("What is taken for what", evidence.confusions),
+        "map": ("A map of the features", galleries.feature_maps),
+        "gallery": ("Retrieval gallery", galleries.gallery),
+        "settings": ("Settings", _settings),
+        "cost": ("What it cost", _cost),
+        "again": ("Do it again", _again),
+    }
+    sections = []
+    with work("drawing the report", len(drawn), "sections") as advance:
+        for name, (heading, draw) in drawn.items():
+            sections.append((name, heading, draw(study)))
+            advance()
     spec = study.pack.spec
     notes = "".join(f" Note: {note}." for note in spec.notes)
     foot = page.paragraph(
@@ -258,7 +263,7 @@ def _cost(study: Study) -> str:
             "steps": f"{steps:,}",
             "pairs seen": f"{steps * r.run.batch_size:,} (the data has {r.record.get('num_pairs', 0):,})",
             "speed": f"{median(e['pairs_per_s'] for e in lines):,.0f} pairs/s (median)" if lines else "",
-            "wall time": _duration(seconds) if seconds else "",
+            "wall time": duration(seconds) if seconds else "",
             "parameters kept": f"{trunks / 1e6:.2f} M in trunks" + (f", {heads / 1e6:.2f} M in heads" if heads else ""),
             "machine": f"{r.record.get('machine', '')}; device {r.run.device}",
             "precision": precision_of(r.run, r.record) + " (auto)" * (r.run.precision == "auto"),
@@ -273,11 +278,6 @@ def _cost(study: Study) -> str:
     names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
     shown = page.table(["", *names], [[name, *values] for name, values in rows.items()], words=True, label="cost")
     return page.paragraph("Wall time is estimated from the logged speeds; the last scoring is not in it.") + shown
-
-
-def _duration(seconds: float) -> str:
-    minutes, hours = seconds / 60, seconds / 3600
-    return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if hours < 2 else f"{hours:.1f} h"
 
 
 def _again(study: Study) -> str:

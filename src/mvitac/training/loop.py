@@ -29,7 +29,7 @@ from mvitac.system.locks import hold_lock
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.log import Log, Logger
+from mvitac.training.log import EARLY, Log, Logger
 from mvitac.training.sampler import mix, training_rows
 from mvitac.training.step import Step
 from mvitac.training.validation import evaluate
@@ -110,7 +110,8 @@ def _train(
     every = run.checkpoint_every or max(1, num_steps // 10)
     method.train()
 
-    log_here = Log(out, start, num_steps, quiet, loggers) if world.writes else nullcontext()
+    telling = {"quiet": quiet, "sinks": loggers}
+    log_here = Log(out, start, num_steps, run.batch_size, **telling) if world.writes else nullcontext()
     with log_here as log, _stop_signals() as stopped:
         if log and not quiet:  # not measured for nobody
             log.say(describe_precision(asked.precision, run.precision, device))
@@ -121,12 +122,13 @@ def _train(
             losses = step(parts, lr=rate, seed=mix(run.seed, at) + 1, progress=(at + 1) / num_steps)
 
             done = at + 1
-            report = done % run.log_every == 0 or done == num_steps
+            early = done - start == EARLY < run.log_every
+            report = done % run.log_every == 0 or done == num_steps or early
             if report:
                 values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
                 _check_finite(values, done, run)
                 if log:
-                    log.step(done, values, rate, run.batch_size)
+                    log.step(done, values, rate)
             stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
             saving = done == num_steps or done % every == 0 or stopping
             if saving:

@@ -1,4 +1,4 @@
-"""One optimiser step: forward, losses, backward, update; fast or small, and equal to the plain one (tests/test_step.py).
+"""One optimiser step: forward, losses, backward, update; fast or small, and equal to the plain one (tests/training).
 
 A batch comes as parts, functions that make its views anew, the same each time. One part is the plain step. Several are
 gradient caching (Gao et al., arXiv:2101.06983): every part is embedded without a graph, the losses are taken over all
