@@ -36,21 +36,7 @@ def load_chunks(
     """The chunks of each step's batch that this process embeds.
 
     Views depend on (seed, step, number of the chunk) only. Two processes thus see the same views as one process with chunks
-    of half the batch.
-
-    Args:
-        run: The run.
-        pack: The pack.
-        rows: Pack rows to train on.
-        num_views: Views of each image.
-        device: Where the views are made.
-        world: The processes that train together.
-        start: First step.
-        num_steps: Number of steps of the run.
-        mirror: Result of ``gel_mirror``.
-
-    Returns:
-        For each step, functions that make the views of a chunk.
+    of half the batch. ``mirror`` is the result of ``gel_mirror``.
     """
     feed = Feed(pack, device)
     share = run.batch_size // world.size
@@ -94,17 +80,9 @@ def make_views(
     feed: Feed,
     mirror: GelMirror | None = None,
 ) -> Views:
-    """Make random views of pack rows, in the precision that the networks read them in.
+    """Make random views of pack rows [B] on ``device``, in the precision that the networks read them in.
 
-    Args:
-        run: Gives augmentation, positives and precision.
-        pack: The pack.
-        rows: Pack rows [B].
-        num_views: Views of each image.
-        generator: Source of all randomness.
-        device: Where the views are made.
-        feed: Loads the images.
-        mirror: Result of ``gel_mirror``.
+    All randomness comes from ``generator``. ``mirror`` is the result of ``gel_mirror`` for the run.
     """
     assert (mirror is None) == (run.augment.gel_flip == "plain")
     views = [rows] * num_views
