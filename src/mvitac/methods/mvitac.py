@@ -19,6 +19,7 @@ Shapes: images [B, C, H, W], features [B, D], embeddings z [B, 128].
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Literal, Self
 
 import torch
@@ -26,10 +27,11 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, num_features, trunks
+from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers, num_features, trunks
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum, momentum_at
 from mvitac.registry import LATER_IN_DIGEST
+from mvitac.system.processes import in_branches
 
 PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
 """loss -> (modality of its queries, modality of its keys)."""
@@ -193,9 +195,19 @@ class MViTac(Contrastive):
 
 
 def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...]) -> Embeddings:
-    """Embeddings of ``views`` of each modality by both heads, keyed ``(name, modality, view, head)``."""
-    z: Embeddings = {}
-    for modality, tower in towers.items():
+    """Embeddings of ``views`` of each modality by both heads, keyed ``(name, modality, view, head)``.
+
+    On a CPU the two towers run side by side, except with dropout, which needs one order of random numbers.
+    """
+
+    def of(modality: str) -> Embeddings:
+        z: Embeddings = {}
         for view in views:
-            z[name, modality, view, "intra"], z[name, modality, view, "inter"] = tower(batch.images[modality][view])
-    return z
+            images = batch.images[modality][view]
+            z[name, modality, view, "intra"], z[name, modality, view, "inter"] = towers[modality](images)
+        return z
+
+    branches = [partial(of, modality) for modality in towers]
+    if batch.rows.device.type != "cpu" or draws_random_numbers(towers):
+        return {key: tensor for branch in branches for key, tensor in branch().items()}
+    return in_branches(branches)

@@ -117,6 +117,12 @@ def num_features(trunk: nn.Module) -> int:
     return int(trunk.num_features)  # type: ignore[arg-type]
 
 
+def draws_random_numbers(network: nn.Module) -> bool:
+    """Whether ``network`` has any kind of dropout. Layers of torch and timm call its rate p, drop_prob or drop_rate."""
+    rates = ("p", "drop_prob", "drop_rate")
+    return any(isinstance(rate := getattr(m, name, 0), float) and rate > 0 for m in network.modules() for name in rates)
+
+
 def build_towers(config: EncoderConfig, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
     """A ``Projected`` trunk and head per modality of ``spec``. ``head`` creates a head for D features."""
     towers = nn.ModuleDict()
