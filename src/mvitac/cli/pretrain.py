@@ -8,7 +8,7 @@ from mvitac.cli.options import parse, selectors
 
 def pretrain(argv: list[str]) -> None:
     """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [fields] --out DIR [--resume]"""
-    chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--sink"))
+    chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger", "--sink"))
     from typing import Annotated
 
     import tyro
@@ -54,10 +54,11 @@ def pretrain(argv: list[str]) -> None:
       --data {"|".join(DatasetConfig.choices)}  (needed)
       --method {"|".join(MethodConfig.choices)}  (default mvitac)
       --from RUN.JSON   repeat a recorded run instead
-      --sink tensorboard|wandb|trackio   also log there (extras; none by default)
+      --logger tensorboard|wandb|trackio   also log there (extras; none by default)
     """
     options = parse(Options, rest, "pretrain")
     console = Console(markup=False)
-    with open_loggers(chosen.get("--sink"), options.out, options.run) as loggers:
+    logger = chosen.get("--logger", chosen.get("--sink"))  # --sink: the name until 0.1.0
+    with open_loggers(logger, options.out, options.run) as loggers:
         out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers)
     console.print(f"trained: {out}\nnext: mvitac probe {out}", soft_wrap=True, highlight=False)

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 import torch
 
 from mvitac.data.pack import Pack, has_difference
-from mvitac.model import Images, Model, load
+from mvitac.model import ImageInput, Model, load
 from mvitac.registry import unknown
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.locks import hold_lock
@@ -214,12 +214,12 @@ class Index:
     def find(
         self,
         model: Model,
-        images: Images,
+        images: ImageInput,
         source: str,
         target: str,
         k: int = 5,
         *,
-        background: Images | None = None,
+        background: ImageInput | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rows and cosines [Q, k] of the ``target`` images nearest to ``images`` of modality ``source``.
 
