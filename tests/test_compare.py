@@ -323,7 +323,7 @@ def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_pat
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press, daemon=True).start()
-    with pytest.raises(Interrupted, match="stopped; the same command goes on from here"):
+    with pytest.raises(Interrupted, match="stopped; the same command continues from here"):
         do_all(work, 2, lambda line: None, terminal)
     assert not any((job.out / "model.safetensors").exists() for job in work.jobs)
     steps = [torch.load(path, weights_only=True)["step"] for path in tmp_path.rglob("checkpoint.pt")]
@@ -361,7 +361,7 @@ def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) ->
             train(work.jobs[0].run, work.jobs[0].out, pack=pack)
         do_all(work, 1, said.append)
         assert (
-            "[0/2] MViTac, seed 0: another process is at it; this command makes the whole table once it is done" in said
+            "[0/2] MViTac, seed 0: another process runs it; this command makes the whole table once it is done" in said
         )
         assert [job.done for job in work.jobs] == [False, True] and not work.jobs[0].out.exists()
         go.set()

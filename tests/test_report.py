@@ -252,7 +252,7 @@ def test_touch_alone(tmp_path: Path) -> None:
 def test_without_labels(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(labelled=False))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
-    assert "What the frozen features are worth" not in page.text
+    assert "Scores of the frozen features" not in page.text
     assert "finds its thing among the first five by camera" in page.text
     assert len(page.all("img")) == 2 * 8 * 6  # eight queries with five groups, both directions
 
@@ -272,7 +272,7 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     assert cell({"both": linear}, "mvitac", "both") in page.text
     assert not page.all("script")
     alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
-    assert "Not scored: no space that both modalities share." in alone.text
+    assert "Not scored: no method here has a space that both modalities share." in alone.text
     assert "The runs left no log lines." in alone.text
     assert not alone.all("img")
 

@@ -15,7 +15,7 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import parts
+from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.scores import score
 from mvitac.model import Model, load
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
@@ -35,7 +35,7 @@ def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
         labels = pack.column(f"label_{task.name}").astype(int)
         for modality in [*modalities, *(["both"] if len(modalities) == 2 else [])]:
             try:
-                rows = parts(pack, task, modality)
+                rows = split_rows(pack, task, modality)
             except ValueError:
                 continue
             names = modalities if modality == "both" else [modality]

@@ -1,8 +1,7 @@
-"""Doing the runs of a comparison: one after another, several at a time, as a SLURM array, or by the same command on several
-machines; safe to kill at any instant.
+"""Run the jobs of a comparison: one by one, in parallel, as a SLURM array, or on several machines.
 
-A run whose loss stops being a number is done too: it is kept as failed.json. One that fails otherwise is told, and tried
-again by the next call.
+Jobs can be killed at any time and resume. A run whose loss became NaN or infinite counts as done and is kept as
+failed.json. A run that fails otherwise is reported, and the next call tries it again.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import TaskID
+from rich.progress import Progress, TaskID
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
@@ -38,7 +37,7 @@ from mvitac.training.sampler import training_rows
 
 @dataclass(frozen=True)
 class Job:
-    """One run of one row: where it goes, and how it is scored."""
+    """One run of one row: its settings, its folder, and how it is scored."""
 
     label: str
     run: Run
@@ -49,28 +48,34 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Its row and seed, and its fold where there are several."""
+        """Row, fold (if there are several) and seed."""
         return f"{self.label}, {f'{self.fold}, ' if self.fold else ''}seed {self.run.seed}"
 
     @property
     def asked(self) -> dict[str, Any]:
-        """What its scores are of, as it stands beside them."""
+        """The probes, tasks and modalities to score, as stored with the scores."""
         return to_json(
             ProbeConfig(probes=self.session.probes, tasks=self.session.tasks, modalities=self.session.modalities)
         )
 
     @property
+    def failure(self) -> str:
+        """Why the run diverged; "" if it did not."""
+        path = self.out / "failed.json"
+        return read_json(path, "a failure")["error"] if path.exists() else ""
+
+    @property
     def done(self) -> bool:
         kept = ["scores.json", *(["stress.json"] if self.stress else [])]
-        return (self.out / "failed.json").exists() or all(_scored(self.out / name) == self.asked for name in kept)
+        return bool(self.failure) or all(_scored(self.out / name) == self.asked for name in kept)
 
     def drop_checkpoint(self) -> None:
-        """Once scored, a run needs none; they are four times its weights, and hundreds of runs would fill a disk."""
+        """Delete the checkpoint. A scored run needs none, and it is four times as large as the weights."""
         (self.out / "checkpoint.pt").unlink(missing_ok=True)
 
 
 def _scored(path: Path) -> dict[str, Any] | None:
-    """What the scores in ``path`` are of; None if there are none."""
+    """``Job.asked`` of the scores in ``path``; None if there are none."""
     try:
         return _asked(path, path.stat().st_mtime_ns)
     except FileNotFoundError:
@@ -79,12 +84,12 @@ def _scored(path: Path) -> dict[str, Any] | None:
 
 @cache
 def _asked(path: Path, changed: int) -> dict[str, Any]:
-    return read_json(path, "a run's scores").get("asked", to_json(ProbeConfig()))  # older ones do not say
+    return read_json(path, "a run's scores").get("asked", to_json(ProbeConfig()))  # version 0.1.0 did not store it
 
 
 @dataclass(frozen=True)
 class Work:
-    """A plan on one dataset (one fold of it): the jobs to do, and the rows that cannot be part of it, with the reason."""
+    """A plan on one dataset (or fold): the jobs, and the rows left out with the reason."""
 
     plan: Plan
     pack: Pack
@@ -93,11 +98,13 @@ class Work:
 
 
 def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
-    """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant, and from several
-    processes at once: what one is at, the others leave to it."""
+    """Train and score one run; returns a line about it.
+
+    Safe to call again after a kill, and from several processes at once: a run that another process works on is skipped.
+    """
     try:
         with hold_lock(
-            job.out, "another process is at it; this command makes the whole table once it is done", wait=False
+            job.out, "another process runs it; this command makes the whole table once it is done", wait=False
         ):
             return "finished before" if job.done else _do(job, pack, quiet)
     except Busy as busy:
@@ -129,81 +136,95 @@ def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
     return f"{seconds_of(job.out):.0f} s of training"
 
 
-def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
-    """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several.
+class _Reporter:
+    """Prints a line about each finished job, and keeps the errors of failed ones."""
 
-    ``console``, if it is a terminal, shows how far they are. A job that fails is told; the first one's error is raised after
-    all others are done. ValueError if a process dies. Interrupted after Ctrl-C, when the runs under way have saved
-    their checkpoints.
-    """
-    todo = [job for job in work.jobs if not job.done]
-    for job in work.jobs:
-        if job.done and not (job.out / "failed.json").exists():
-            job.drop_checkpoint()  # of a run that was killed when it had been scored
-    shown = console if console and console.is_terminal else None
-    errors: list[Exception] = []
+    def __init__(self, work: Work, say: Callable[[str], None]) -> None:
+        self.work, self.say = work, say
+        self.errors: list[Exception] = []
 
-    def told(job: Job, result: Callable[[], str]) -> None:
+    def __call__(self, job: Job, result: Callable[[], str]) -> None:
         try:
             line = result()
         except (Interrupted, BrokenProcessPool):
             raise
-        except Exception as error:  # the other runs need not wait for someone to mend it
-            errors.append(error)
+        except Exception as error:  # do not stop the other runs
+            self.errors.append(error)
             line = f"failed: {brief(error)}"
-        say(f"[{sum(j.done for j in work.jobs)}/{len(work.jobs)}] {job.name}: {line}")
+        jobs = self.work.jobs
+        self.say(f"[{sum(j.done for j in jobs)}/{len(jobs)}] {job.name}: {line}")
 
+
+def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
+    """Run the unfinished jobs, ``num_jobs`` at a time, each on its own GPU if there are several.
+
+    Args:
+        work: The jobs.
+        num_jobs: Number of parallel processes.
+        say: Receives a line about each job.
+        console: Shows progress bars if it is a terminal.
+
+    Raises:
+        Exception: The first error of a failed job, after all other jobs ran.
+        ValueError: If a process was killed.
+        Interrupted: After Ctrl-C, once the active runs have saved their checkpoints.
+    """
+    todo = [job for job in work.jobs if not job.done]
+    for job in work.jobs:
+        if job.done and not job.failure:
+            job.drop_checkpoint()  # a killed process may have left it
+    shown = console if console and console.is_terminal else None
+    report = _Reporter(work, say)
     try:
         if num_jobs == 1 or len(todo) < 2:
             for job in todo:
                 say(f"{job.name} ...")
                 pack = work.pack if job.run.data == work.plan.data else None
-                told(job, lambda job=job, pack=pack: do(job, pack, quiet=not shown))
+                report(job, lambda job=job, pack=pack: do(job, pack, quiet=not shown))
         else:
-            _side_by_side(work, todo, num_jobs, told, shown)
+            _side_by_side(work, todo, num_jobs, report, shown)
     except (KeyboardInterrupt, Interrupted):
-        raise Interrupted("stopped; the same command goes on from here") from None
+        raise Interrupted("stopped; the same command continues from here") from None
     except BrokenProcessPool:
         raise ValueError(
             f"one of {num_jobs} processes was killed, most likely for lack of memory: give fewer --jobs; the same command"
-            " goes on from here"
+            " continues from here"
         ) from None
-    if errors:
-        raise errors[0]
+    if report.errors:
+        raise report.errors[0]
 
 
-def _side_by_side(
-    work: Work,
-    todo: Sequence[Job],
-    num_jobs: int,
-    told: Callable[[Job, Callable[[], str]], None],
-    console: Console | None,
-) -> None:
+def _side_by_side(work: Work, todo: Sequence[Job], num_jobs: int, report: _Reporter, console: Console | None) -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
     shown = bars(console or Console(), disable=console is None, transient=True, speed_estimate_period=600)
     with shown as progress, side_by_side(num_jobs, devices) as pool:
         overall = progress.add_task("all runs", total=len(todo), text="")
-        tasks: dict[Path, tuple[TaskID, int]] = {}  # of the runs under way, with their steps
+        active: dict[Path, tuple[TaskID, int]] = {}  # progress bar and steps of each active run
         jobs = {pool.submit(_do_here, job): job for job in todo}
         waiting = set(jobs)
         while waiting:
             done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
-                told(job := jobs[future], future.result)
-                if job.out in tasks:
-                    progress.remove_task(tasks.pop(job.out)[0])
-            part = 0.0
-            for job in (jobs[future] for future in waiting if future.running()) if console else ():
-                step, text = last_line(job.out)
-                if step and job.out not in tasks:
-                    steps = job.run.num_steps(len(training_rows(job.run, work.pack)))
-                    tasks[job.out] = progress.add_task(job.name, total=steps, text=""), steps
-                if job.out in tasks:
-                    task, steps = tasks[job.out]
-                    progress.update(task, completed=step, text=text)
-                    part += min(1, step / steps)  # a fold's own steps may be more
+                report(job := jobs[future], future.result)
+                if job.out in active:
+                    progress.remove_task(active.pop(job.out)[0])
+            running = [jobs[future] for future in waiting if future.running()] if console else []
+            part = sum(_show_progress(work, job, progress, active) for job in running)
             progress.update(overall, completed=len(todo) - len(waiting) + part)
+
+
+def _show_progress(work: Work, job: Job, progress: Progress, active: dict[Path, tuple[TaskID, int]]) -> float:
+    """Update the bar of one active run; returns the fraction that is done."""
+    step, text = last_line(job.out)
+    if step and job.out not in active:
+        steps = job.run.num_steps(len(training_rows(job.run, work.pack)))
+        active[job.out] = progress.add_task(job.name, total=steps, text=""), steps
+    if job.out not in active:
+        return 0.0
+    task, steps = active[job.out]
+    progress.update(task, completed=step, text=text)
+    return min(1, step / steps)  # a fold may take more steps than counted here
 
 
 def _do_here(job: Job) -> str:
@@ -212,7 +233,7 @@ def _do_here(job: Job) -> str:
 
 
 def submit(work: Work, options: str) -> str:
-    """Hand the unfinished jobs to SLURM as one array by submitit and return its id; nothing waits for them here.
+    """Submit the unfinished jobs to SLURM as one array with submitit; returns at once with a line that has its id.
 
     ``options``: comma-separated name=value of submitit's ``update_parameters``, e.g. "slurm_partition=gpu,timeout_min=600".
     """
@@ -238,7 +259,7 @@ def submit(work: Work, options: str) -> str:
 
 
 def seconds_of(path: Path) -> float:
-    """Seconds of training that a run's log tells, over all its resumptions; steps lost to a kill are not in it."""
+    """Seconds of training by a run's log, over all resumptions. Steps lost to a kill are not counted."""
     total, before = 0.0, 0
     batch_size = read_json(path / "run.json", "a run's record")["run"]["batch_size"]
     for line in (path / "log.jsonl").read_text().splitlines():
