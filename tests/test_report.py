@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -130,7 +131,7 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
     task = ""
     for row in filter(None, rows):
         task = row[0] if len(row) == 1 else task
-        shown[task, row[0]] = row[1:]
+        shown[task, row[0]] = [unescape(value).replace("\xa0", " ") for value in row[1:]]
     assert set(result["summary"]) == {"category", "soft", "rough"}
     for task, found in result["summary"].items():
         sources = {source for cells in found.values() for source in cells}
@@ -269,7 +270,7 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     assert len(page.all("img")) == 2 * 8 * 6  # the gallery of the second run; the first one has none
     linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
     assert f"with supervised, mvitac {100 * nearest['mvitac']['mean']:.1f}" in page.text
-    assert cell({"both": linear}, "mvitac", "both") in page.text
+    assert cell({"both": linear}, "mvitac", "both") in page.text.replace("\xa0", " ")
     assert not page.all("script")
     alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
     assert "Not scored: no method here has a space that both modalities share." in alone.text

@@ -96,7 +96,9 @@ footer { margin-top: 64px; padding-top: 16px; padding-bottom: 40px; font-size: 1
   .query { grid-template-columns: repeat(5, 1fr); gap: 6px; font-size: 11px; }
   .query .asked { grid-column: 1 / -1; display: grid; grid-template-columns: 76px 1fr; gap: 10px; align-items: center;
     border-right: 0; padding-right: 0; font-size: 13px; }
-  th, td { padding: 6px 10px; }
+  table { font-size: 12px; }
+  th, td { padding: 6px; }
+  td, thead th { white-space: normal; }
   h2 { margin-top: 44px; }
   figure, .card { padding: 10px; }
 }
@@ -168,7 +170,8 @@ def table(
             body.append(f'<tr class="part"><th colspan="{len(columns)}">{escape(name)}</th></tr>')
             continue
         look = ' class="muted"' if name in muted else ""
-        inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+        # On a phone a cell wraps, but not within an interval.
+        inner = "".join(f"<td>{escape(cell) if words else escape(cell).replace(', ', ',&nbsp;')}</td>" for cell in cells)
         body.append(f'<tr{look}><th scope="row">{escape(name)}</th>{inner}</tr>')
     box = f'<div class="scroll{" words" * words}" tabindex="0" role="region" aria-label="{escape(label)}">'
     return f"{box}<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
