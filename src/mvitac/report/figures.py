@@ -175,7 +175,7 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
         key = dot.control, dot.source
         best[key] = max(best.get(key, 0.0), dot.mean if dot in next(iter(panels.values())) else 0.0)
     rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
-    names = [textwrap.fill(name, 34, max_lines=2, placeholder=" …") for name in rows]
+    names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
     size = (3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows))
     figure = Figure(figsize=size, layout="constrained")
     for axes, (task, panel) in zip(
