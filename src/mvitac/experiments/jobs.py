@@ -13,11 +13,12 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import Progress, TaskID
+from rich.progress import TaskID
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
@@ -30,7 +31,8 @@ from mvitac.system.device import pick_device
 from mvitac.system.files import brief, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.system.processes import my_device, side_by_side
-from mvitac.training.log import bars, last_line
+from mvitac.system.progress import Bars, shown
+from mvitac.training.log import Logger, in_a_bar, last_line
 from mvitac.training.loop import Diverged, Interrupted, train
 from mvitac.training.sampler import training_rows
 
@@ -97,28 +99,29 @@ class Work:
     left_out: dict[str, str]
 
 
-def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
+def do(job: Job, pack: Pack | None = None, *, quiet: bool = True, loggers: tuple[Logger, ...] = ()) -> str:
     """Train and score one run; returns a line about it.
 
     Safe to call again after a kill, and from several processes at once: a run that another process works on is skipped.
+    ``loggers`` are called during training, as in ``training.loop.train``.
     """
     try:
         with hold_lock(
             job.out, "another process runs it; this command makes the whole table once it is done", wait=False
         ):
-            return "finished before" if job.done else _do(job, pack, quiet)
+            return "finished before" if job.done else _do(job, pack, quiet, loggers)
     except Busy as busy:
         return str(busy)
 
 
-def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
+def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -> str:
     pack = pack or job.run.data.open(quiet=True)
     gpu = pick_device(job.run.device)
     measured = gpu.type == "cuda" and not (job.out / "model.safetensors").exists()
     if measured:
         torch.cuda.reset_peak_memory_stats(gpu)
     try:
-        train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
+        train(job.run, job.out, resume=True, quiet=quiet, loggers=loggers, pack=pack)
     except Diverged as error:
         write_json(job.out / "failed.json", {"error": str(error)})
         return f"diverged: {error}"
@@ -162,7 +165,7 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
         work: The jobs.
         num_jobs: Number of parallel processes.
         say: Receives a line about each job.
-        console: Shows progress bars if it is a terminal.
+        console: Shows progress and the time left; None shows nothing.
 
     Raises:
         Exception: The first error of a failed job, after all other jobs ran.
@@ -173,16 +176,14 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
     for job in work.jobs:
         if job.done and not job.failure:
             job.drop_checkpoint()  # a killed process may have left it
-    shown = console if console and console.is_terminal else None
     report = _Reporter(work, say)
     try:
-        if num_jobs == 1 or len(todo) < 2:
-            for job in todo:
-                say(f"{job.name} ...")
-                pack = work.pack if job.run.data == work.plan.data else None
-                report(job, lambda job=job, pack=pack: do(job, pack, quiet=not shown))
-        else:
-            _side_by_side(work, todo, num_jobs, report, shown)
+        with shown(console, quiet=console is None) as bars:
+            progress = _Progress(work, todo, bars, num_jobs)
+            if num_jobs == 1 or len(todo) < 2:
+                _one_by_one(work, todo, report, progress, quiet=console is None)
+            else:
+                _side_by_side(todo, num_jobs, report, progress)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("stopped; the same command continues from here") from None
     except BrokenProcessPool:
@@ -194,37 +195,86 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
         raise report.errors[0]
 
 
-def _side_by_side(work: Work, todo: Sequence[Job], num_jobs: int, report: _Reporter, console: Console | None) -> None:
+def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: _Progress, *, quiet: bool) -> None:
+    for job in todo:
+        report.say(f"{job.name} ...")
+        pack = work.pack if job.run.data == work.plan.data else None
+        loggers = (lambda *_, job=job: progress.update([job]),)
+        report(job, lambda job=job, pack=pack, loggers=loggers: do(job, pack, quiet=quiet, loggers=loggers))
+        progress.update([])
+
+
+def _side_by_side(todo: Sequence[Job], num_jobs: int, report: _Reporter, progress: _Progress) -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
-    shown = bars(console or Console(), disable=console is None, transient=True, speed_estimate_period=600)
-    with shown as progress, side_by_side(num_jobs, devices) as pool:
-        overall = progress.add_task("all runs", total=len(todo), text="")
-        active: dict[Path, tuple[TaskID, int]] = {}  # progress bar and steps of each active run
+    with side_by_side(num_jobs, devices) as pool:
         jobs = {pool.submit(_do_here, job): job for job in todo}
         waiting = set(jobs)
         while waiting:
             done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
-                report(job := jobs[future], future.result)
-                if job.out in active:
-                    progress.remove_task(active.pop(job.out)[0])
-            running = [jobs[future] for future in waiting if future.running()] if console else []
-            part = sum(_show_progress(work, job, progress, active) for job in running)
-            progress.update(overall, completed=len(todo) - len(waiting) + part)
+                report(jobs[future], future.result)
+            progress.update([jobs[future] for future in waiting if future.running()])
 
 
-def _show_progress(work: Work, job: Job, progress: Progress, active: dict[Path, tuple[TaskID, int]]) -> float:
-    """Update the bar of one active run; returns the fraction that is done."""
-    step, text = last_line(job.out)
-    if step and job.out not in active:
-        steps = job.run.num_steps(len(training_rows(job.run, work.pack)))
-        active[job.out] = progress.add_task(job.name, total=steps, text=""), steps
-    if job.out not in active:
-        return 0.0
-    task, steps = active[job.out]
-    progress.update(task, completed=step, text=text)
-    return min(1, step / steps)  # a fold may take more steps than counted here
+class _Progress:
+    """Progress of a comparison's jobs, and the time left by the speeds in the runs' logs."""
+
+    def __init__(self, work: Work, todo: Sequence[Job], bars: Bars | None, num_jobs: int) -> None:
+        self.todo, self.bars, self.num_jobs = todo, bars, num_jobs
+        self.speeds: dict[str, float] = {}  # label of a row -> its last speed in pairs per second
+        self.tasks: dict[Path, TaskID] = {}  # bars of the active runs
+        if bars:
+            # A fold may take a few steps more or less than counted here.
+            self.steps = {job.out: job.run.num_steps(len(training_rows(job.run, work.pack))) for job in work.jobs}
+            for job in work.jobs:
+                self._read(job)
+            self.overall = bars.add_task("all runs", total=len(todo), unit="runs", rate="")
+
+    def _read(self, job: Job) -> dict[str, Any]:
+        """Fields for the bar of ``job`` from its log; also keeps the speed of its row."""
+        fields = in_a_bar(last_line(job.out), self.steps[job.out], job.run.batch_size)
+        if fields["speed"]:
+            self.speeds[job.label] = fields["speed"]
+        return fields
+
+    def update(self, active: Sequence[Job]) -> None:
+        """Show how far the active jobs are, and the time left for all."""
+        if not self.bars:
+            return
+        for path in self.tasks.keys() - {job.out for job in active}:
+            self.bars.remove_task(self.tasks.pop(path))
+        steps_done = {}
+        for job in active:
+            fields = self._read(job)
+            steps_done[job.out] = fields["completed"]
+            if len(self.todo) > 1 and self.num_jobs > 1:  # a run in this process has its own bar
+                self._show(job, fields)
+        todo = [job for job in self.todo if not job.done]
+        part = sum(min(1, steps_done.get(job.out, 0) / self.steps[job.out]) for job in todo)
+        left = self.seconds_left(todo, steps_done)
+        self.bars.update(self.overall, completed=len(self.todo) - len(todo) + part, left=left)
+
+    def _show(self, job: Job, fields: dict[str, Any]) -> None:
+        assert self.bars
+        if job.out not in self.tasks:
+            options = {"total": self.steps[job.out], "unit": "steps", "rate": "pairs", "silent": True}
+            self.tasks[job.out] = self.bars.add_task(job.name, **options)
+        self.bars.update(self.tasks[job.out], **fields)
+
+    def seconds_left(self, todo: Sequence[Job], steps_done: dict[Path, int]) -> float | None:
+        """Seconds of training for ``todo``, ``num_jobs`` at a time; None if no speed is known.
+
+        A row without a speed gets the mean of the others.
+        """
+        if not self.speeds:
+            return None
+        usual = fmean(1 / max(speed, 1e-9) for speed in self.speeds.values())
+        seconds = 0.0
+        for job in todo:
+            pairs = max(0, self.steps[job.out] - steps_done.get(job.out, 0)) * job.run.batch_size
+            seconds += pairs / self.speeds[job.label] if job.label in self.speeds else pairs * usual
+        return seconds / min(self.num_jobs, max(1, len(todo)))
 
 
 def _do_here(job: Job) -> str:
