@@ -13,7 +13,7 @@ from html import escape
 import numpy as np
 from PIL import Image
 
-from mvitac.report.figures import COLOURS
+from mvitac.report.palette import COLOURS
 
 _STYLE = """
 :root { color-scheme: light dark; --page: #f6f7f9;
@@ -171,7 +171,9 @@ def table(
             continue
         look = ' class="muted"' if name in muted else ""
         # On a phone a cell wraps, but not within an interval.
-        inner = "".join(f"<td>{escape(cell) if words else escape(cell).replace(', ', ',&nbsp;')}</td>" for cell in cells)
+        inner = "".join(
+            f"<td>{escape(cell) if words else escape(cell).replace(', ', ',&nbsp;')}</td>" for cell in cells
+        )
         body.append(f'<tr{look}><th scope="row">{escape(name)}</th>{inner}</tr>')
     box = f'<div class="scroll{" words" * words}" tabindex="0" role="region" aria-label="{escape(label)}">'
     return f"{box}<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
