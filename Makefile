@@ -4,17 +4,25 @@ BIN := .venv/bin
 
 .PHONY: demo test check bench difficulty docs pins clean
 
+# torch brings CUDA, 5 of the 7 GB. A torch that .venv can import is kept: one that was installed there first (the CPU's),
+# or the system's, with make VENV_ARGS=--system-site-packages. One that make installed itself follows constraints.txt.
+TORCH := torch|torchvision|triton|nvidia-[a-z0-9-]+|cuda-[a-z]+
+KEEP := import torch, torchvision, sys; sys.exit(tuple(map(int, torch.__version__.split(".")[:2])) < (2, 11))
+
 .venv/ready: constraints.txt pyproject.toml
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --require-hashes -r constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV_ARGS) .venv
+	if ! { test -e $@ && grep -q '^torch==' .venv/constraints.txt; } && $(BIN)/python -c '$(KEEP)' 2> /dev/null; then \
+	  awk '/^[a-z]/ { skip = /^($(TORCH))==/ } !skip' constraints.txt > .venv/constraints.txt; \
+	else cp constraints.txt .venv/; fi
+	$(BIN)/python -m pip install --quiet --no-deps --require-hashes -r .venv/constraints.txt
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
 demo: .venv/ready  ## the main job end to end, on simulated data (minutes on two cores)
 	$(BIN)/mvitac demo --out runs/demo
 
-test: .venv/ready  ## the test suite
-	$(BIN)/python -m pytest
+test: .venv/ready  ## the test suite, on all cores
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 
 check: .venv/ready  ## lint, format, types, import contract
 	$(BIN)/ruff check .

@@ -14,10 +14,10 @@ os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 import pytest
 import torch
-from toy import toy_pack
 
 from mvitac.data.pack import Pack
 
+pytest.register_assert_rewrite("support")  # before it is imported: a failed assertion there shows its values too
 torch.set_num_threads(1)
 
 
@@ -32,6 +32,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def pack(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     """120 striped pairs at 32 px: 3 classes x 20 instances x 2; split by instance."""
+    from support.toy import toy_pack
+
     return toy_pack(tmp_path_factory.mktemp("toy") / "pack")
 
 

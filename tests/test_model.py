@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from toy import toy_pack
 
 import mvitac
 from mvitac.data.images import difference
@@ -20,6 +19,7 @@ from mvitac.model import Model
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from mvitac.transforms.random_views import plain_view
+from support.toy import toy_pack
 
 
 def trained(pack: Pack, out: Path) -> Path:

@@ -50,14 +50,14 @@ class Model(nn.Module):
         self.eval()
 
     @torch.no_grad()
-    def features(self, modality: str, images: Tensor, *, for_heads: bool = False, precision: str = "fp32") -> Tensor:
+    def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
         """Pooled features [B, D] (fp32) of uint8 ``images`` [B, C, H, W] as a pack stores them.
 
         With ``for_heads`` those that ``project`` and ``classify`` want: at the side of the views the heads learned from,
         which may be smaller than the side that serves a probe best (``Augment.whole``).
         """
         view = plain_view(images, self.run.augment.size if for_heads else self.run.augment.eval_size)
-        with torch.autocast(images.device.type, torch.bfloat16, enabled=precision == "bf16"):
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
             return self.encoders[modality](view).float()
 
     @torch.no_grad()
@@ -222,6 +222,11 @@ def check_tensors(file: Path, expected: dict[str, Tensor], found: dict[str, Any]
         if tensor.shape != found[name].shape:
             shapes = f"{tuple(found[name].shape)}, expected {tuple(tensor.shape)}"
             raise ValueError(f"{file} holds other weights than its run describes: {name!r} is {shapes}")
+
+
+def precision_of(run: Run, record: dict[str, Any]) -> str:
+    """What a recorded run computed in: what auto became on its machine. Older records hold none, nor runs that ask auto."""
+    return record.get("precision", run.precision)
 
 
 def to_arrays(value: Images, channels: int, what: str) -> list[np.ndarray]:

@@ -109,9 +109,10 @@ class Run:
     which differ between the two, cannot give the answer away; a row alone in its group is its own partner. Methods of one
     view (ssvtp, cmc) have one row's vision and touch under both; same-touch-pairs gives them the vision of one row and the
     touch of another."""
-    precision: Literal["fp32", "tf32", "bf16"] = "fp32"
-    """Arithmetic of the networks; losses, weights and the optimiser stay fp32. fp32 is never TF32 in silence; tf32 lets a
-    GPU round products to 10 bits."""
+    precision: Literal["auto", "fp32", "tf32", "bf16"] = "fp32"
+    """Arithmetic of the networks; losses, weights and the optimiser stay fp32. auto: bf16 where the hardware computes it
+    (GPUs from Ampere, CPUs with AVX512-BF16 or AMX), else fp32; run.json says which. fp32 is never TF32 in silence; tf32
+    lets a GPU round products to 10 bits."""
     chunk: int = 0
     """Pairs embedded at a time (gradient caching): a batch of any size in the memory of this many, for about a quarter
     more arithmetic; BatchNorm sees one chunk at a time. 0 = the whole batch at once."""
@@ -182,6 +183,12 @@ class Run:
             )
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
+
+    @property
+    def bf16(self) -> bool:
+        """Whether the networks compute in bf16."""
+        assert self.precision != "auto", "what auto means is decided before (device.pick_precision)"
+        return self.precision == "bf16"
 
     def without_idle(self, spec: DataSpec) -> Run:
         """The same training on a dataset, settings that do nothing there at one value: equal ones train alike."""

@@ -15,6 +15,7 @@ def publish(argv: list[str]) -> None:
     from mvitac.data.pack import Pack
     from mvitac.deploy.artifact import read
     from mvitac.deploy.publish import publish, push
+    from mvitac.system.progress import shown
 
     @dataclass(frozen=True)
     class Options:
@@ -32,7 +33,8 @@ def publish(argv: list[str]) -> None:
         """Make the uploaded repository private."""
 
     options = parse(Options, argv, "publish")
-    out = publish(options.run, options.out, Pack(options.on) if options.on else None)
+    with shown(Console(stderr=True)):
+        out = publish(options.run, options.out, Pack(options.on) if options.on else None)
     console = Console(markup=False)
     table = Table(title=f"{out}: what its probes know", title_justify="left")
     for column in ("task", "from", "accuracy %", "majority %"):
@@ -57,6 +59,7 @@ def export(argv: list[str]) -> None:
     from mvitac.deploy import export as exports
     from mvitac.deploy.artifact import load
     from mvitac.deploy.publish import own_data, with_readouts
+    from mvitac.system.progress import shown
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -70,9 +73,12 @@ def export(argv: list[str]) -> None:
         format: Annotated[Literal["torch", "onnx", "openvino"], tyro.conf.arg(name="format")] = "onnx"
         """torch (torch.export), onnx (ONNX Runtime) or openvino."""
         precision: Literal["fp32", "bf16"] = "fp32"
-        """Arithmetic of openvino: bf16 where the CPU has it."""
+        """Arithmetic of openvino; bf16 only on a CPU that computes it, where it can be checked."""
         int8: bool = False
         """8-bit weights and activations, ranges from train rows of the pack (onnx, openvino)."""
+        target: Literal["auto", "avx2", "vnni"] = "auto"
+        """CPU that --int8 is for. avx2: any CPU (7-bit weights). vnni: x86 with VNNI or AMX, or ARM (8-bit weights). auto:
+        this machine's, as measured."""
         on: Path | None = None
         """Pack whose test rows check the export, and to which the probes of a run are fitted; an artifact keeps its own
         (default: the data the model was trained on)."""
@@ -93,22 +99,24 @@ def export(argv: list[str]) -> None:
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
     usual = exports.TOLERANCES["int8" if options.int8 else options.precision]
-    report = exports.export(
-        with_readouts(model, pack),
-        pack,
-        options.out,
-        kind=options.format,
-        precision=options.precision,
-        int8=options.int8,
-        calibrate=Pack(options.calibrate) if options.calibrate else None,
-        modalities=None if options.modality == "both" else (options.modality,),
-        tolerance=exports.Tolerance(
-            min_cosine=usual.min_cosine if options.min_cosine is None else options.min_cosine,
-            accuracy_loss=options.accuracy_loss,
-        ),
-        num_rows=options.rows,
-        threads=options.threads,
-    )
+    with shown(Console(stderr=True)):
+        report = exports.export(
+            with_readouts(model, pack),
+            pack,
+            options.out,
+            kind=options.format,
+            precision=options.precision,
+            int8=options.int8,
+            target=options.target,
+            calibrate=Pack(options.calibrate) if options.calibrate else None,
+            modalities=None if options.modality == "both" else (options.modality,),
+            tolerance=exports.Tolerance(
+                min_cosine=usual.min_cosine if options.min_cosine is None else options.min_cosine,
+                accuracy_loss=options.accuracy_loss,
+            ),
+            num_rows=options.rows,
+            threads=options.threads,
+        )
     table = Table(title=f"{options.out}: checked on {report['num_rows']} test rows", title_justify="left")
     for column in ("", "original", "export"):
         table.add_column(column)
@@ -116,6 +124,9 @@ def export(argv: list[str]) -> None:
         table.add_row(f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}")
     for name, values in report["cosine"].items():
         table.add_row(f"{name}, least cosine", "", f"{values['min']:.5f}")
+    if options.int8:
+        bits = {"avx2": "any CPU, 7-bit weights", "vnni": "with VNNI, 8-bit weights"}[report["target"]]
+        table.add_row("CPUs it is for", "", f"{report['target']}: {bits}")
     table.add_row("size, MB", "", f"{report['size_mb']}")
     table.add_row("latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"]))
     Console(markup=False).print(table)

@@ -21,6 +21,7 @@ def probe(argv: list[str]) -> None:
     from mvitac.model import load
     from mvitac.report.tables import print_retrieval, print_summary
     from mvitac.system.files import check_place, write_json
+    from mvitac.system.progress import shown, work
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -50,17 +51,17 @@ def probe(argv: list[str]) -> None:
         if not pack:
             raise ValueError("--learn-on says what probes learn from: say with --on which pack they are scored on")
         pack = JoinedPack(Pack(options.learn_on), pack)
-    result = probe_runs(options.runs, options.session, pack)
+    with shown(Console(stderr=True)):
+        result = probe_runs(options.runs, options.session, pack)
     console, worse = Console(markup=False), []
     names = {r["run"]: r["source"].removesuffix(END_TO_END) for r in result["records"] if "run" in r}
     for i, path in enumerate(options.runs if options.stress else (), start=1):
-        console.print(
-            f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)} ...", highlight=False
-        )
-        model = load(path)
-        where = pack or model.run.data.open()
-        own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
-        worse += [{**own, **r} for r in stress(model, where, *chosen(where, options.session))]
+        what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
+        with shown(Console(stderr=True)), work(what):
+            model = load(path)
+            where = pack or model.run.data.open()
+            own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
+            worse += [{**own, **r} for r in stress(model, where, *chosen(where, options.session))]
     for kind in options.session.probes:
         print_summary({**result, "summary": summarise(result["records"], kind)}, console, probe=kind)
     for kind in STRESSES:

@@ -15,6 +15,7 @@ def explore(argv: list[str]) -> None:
     from mvitac.data.pack import Pack
     from mvitac.deploy.artifact import load
     from mvitac.deploy.publish import own_data
+    from mvitac.system.progress import shown, work
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -50,8 +51,10 @@ def explore(argv: list[str]) -> None:
         lands = {}
         for name, model in zip(names, models, strict=True):
             say(f"{name}: features of up to {min(options.rows, pack.num)} pairs, and its probes")
-            lands[name] = ExplorerData(model, pack, limit=options.rows)
-        blocks = page(lands)
+            with shown(Console(stderr=True)):
+                lands[name] = ExplorerData(model, pack, limit=options.rows)
+        with shown(Console(stderr=True)), work("drawing the page"):
+            blocks = page(lands)
     except ModuleNotFoundError as error:
         if error.name != "gradio":
             raise

@@ -166,7 +166,7 @@ def sources(
 def _engine(model: str, threads: int, console: Any) -> "Engine":
     """An export as it is; anything else exported once, into the cache."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine
+    from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, lists_bf16
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_readouts
     from mvitac.model import safetensors_digest
@@ -174,7 +174,13 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     from mvitac.system.files import cache_dir, digest
 
     if (Path(model) / MANIFEST).is_file():
-        return Engine(model, threads=threads)
+        engine = Engine(model, threads=threads)
+        if engine.meta["precision"] == "bf16":
+            import openvino
+
+            if not lists_bf16(openvino.Core()):
+                console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
+        return engine
     loaded = load(model)
     # Artifacts of one run differ in their probes alone. A bare run has none: those fitted below are what its data makes.
     probes = [[to_json(r.question), safetensors_digest(dict(r.state_dict()))] for r in loaded.readouts.values()]

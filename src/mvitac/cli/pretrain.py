@@ -7,7 +7,7 @@ from mvitac.cli.options import parse, selectors
 
 
 def pretrain(argv: list[str]) -> None:
-    """mvitac pretrain --method M --data D --recipe R [--from run.json] [fields] --out DIR [--resume]"""
+    """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [fields] --out DIR [--resume]"""
     chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--sink"))
     from typing import Annotated
 
@@ -31,6 +31,11 @@ def pretrain(argv: list[str]) -> None:
         data = default(DatasetConfig, chosen.get("--data", "materials"))
         base = recipe(chosen.get("--recipe", "demo"), data)
         base = with_method(base, chosen.get("--method", base.method.name))
+        if "--data" not in chosen and not {"-h", "--help"} & set(rest):
+            raise ValueError(
+                f"say what to learn from: --data {'|'.join(DatasetConfig.choices)} (or --from RUN.JSON); without data of"
+                " your own: mvitac demo, or mvitac pretrain --data materials --recipe demo, which simulates"
+            )
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
@@ -46,7 +51,7 @@ def pretrain(argv: list[str]) -> None:
 
     First choose, then change single fields below (defaults are the chosen recipe's):
       --recipe {"|".join(RECIPES)}  (default demo)
-      --data {"|".join(DatasetConfig.choices)}  (default materials)
+      --data {"|".join(DatasetConfig.choices)}  (needed)
       --method {"|".join(MethodConfig.choices)}  (default mvitac)
       --from RUN.JSON   repeat a recorded run instead
       --sink tensorboard|wandb|trackio   also log there (extras; none by default)

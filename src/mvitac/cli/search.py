@@ -32,6 +32,7 @@ def embed(argv: list[str]) -> None:
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import check_pack, describe, embeddings
     from mvitac.system.files import check_place, write_atomic
+    from mvitac.system.progress import shown
 
     @dataclass(frozen=True, kw_only=True)
     class Options(_Embedding):
@@ -51,7 +52,8 @@ def embed(argv: list[str]) -> None:
     found = {}
     for m in check_pack(model, pack):
         rows = np.flatnonzero(pack.has(m))
-        x = np.concatenate(list(embeddings(model, pack, m, rows, shared=options.shared)))
+        with shown(Console(stderr=True)):
+            x = np.concatenate(list(embeddings(model, pack, m, rows, shared=options.shared)))
         found[m] = np.full((pack.num, x.shape[1]), np.nan, np.float32)
         found[m][rows] = x
     if options.out.suffix == ".npz":
@@ -72,6 +74,7 @@ def index(argv: list[str]) -> None:
     from mvitac.data.pack import Pack
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import build
+    from mvitac.system.progress import shown
 
     @dataclass(frozen=True, kw_only=True)
     class Options(_Embedding):
@@ -83,7 +86,8 @@ def index(argv: list[str]) -> None:
         """Only these splits (train, val, test, unlabelled); none given = all."""
 
     options = parse(Options, argv, "index")
-    made = build(load(options.model), Pack(options.pack), options.out, options.splits)
+    with shown(Console(stderr=True)):
+        made = build(load(options.model), Pack(options.pack), options.out, options.splits)
     shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
     Console(markup=False).print(
         f"{options.out}: {shapes}, space: {made.meta['space']}", soft_wrap=True, highlight=False

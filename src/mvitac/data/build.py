@@ -26,7 +26,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mvitac.data.images import fit
 from mvitac.data.jpeg import QUALITY
@@ -38,6 +37,7 @@ from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.malloc import keep_freed_memory
+from mvitac.system.progress import shown, work
 from mvitac.system.provenance import provenance
 
 NUM_PART_ITEMS = 32
@@ -139,12 +139,11 @@ def _build(
         parts.append(Part(partial / f"part-{i:06d}.json", (start, end), firsts[start], stamp))
     # Parts come in order, so the digests are taken beside the other processes' work, of rows still in memory.
     sums = {modality: hashlib.sha256(rows.header(num)) for modality, rows in files.items()}
-    with _progress(quiet) as progress:
-        bar = progress.add_task(f"packing {spec.name}", total=len(items))
+    with shown(quiet=quiet), work(f"packing {spec.name}", len(items), "items", announce=False) as advance:
         for part, made in zip(parts, _run(_Work(source, spec, size, counts, files), parts, workers), strict=True):
             for modality, rows in files.items():
                 sums[modality].update(rows.join(part, made))
-            progress.update(bar, advance=part.items[1] - part.items[0])
+            advance(part.items[1] - part.items[0])
     digests = {rows.path.name: sums[modality].hexdigest() for modality, rows in files.items()}
     pack = _finish(partial, out, request, files, parts, digests, items, max_damaged)
     shutil.rmtree(partial)
@@ -160,11 +159,6 @@ class _Work:
     size: int
     counts: Sequence[int]
     files: dict[str, RowFile | JpegFile]
-
-
-def _progress(quiet: bool) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, disable=quiet)
 
 
 def _check_disk(out: Path, files: Sequence[RowFile | JpegFile]) -> str:

@@ -9,12 +9,12 @@ import json
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from rich.progress import track
 
 from mvitac.data.jpeg import Jpegs
 from mvitac.data.pack import SHARDED, Pack
 from mvitac.data.streaming import reach, shard_name
 from mvitac.system.files import brief, digest
+from mvitac.system.progress import shown, work
 
 
 def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, quiet: bool = False) -> int:
@@ -37,9 +37,11 @@ def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, q
         if system.exists(f"{place}/pack.json"):
             raise ValueError(f"{url} holds a pack already: choose another place, or delete it first")
         system.makedirs(place, exist_ok=True)
-        for number, rows in enumerate(track(parts, f"{len(parts)} shards", disable=quiet)):
-            for modality in pack.spec.modalities:
-                put(shard_name(number, modality, pack.store), _stored(pack, modality, rows))
+        with shown(quiet=quiet), work("writing shards", len(parts), "shards") as advance:
+            for number, rows in enumerate(parts):
+                for modality in pack.spec.modalities:
+                    put(shard_name(number, modality, pack.store), _stored(pack, modality, rows))
+                advance()
         buffer = io.BytesIO()
         pq.write_table(pack.table.take(pa.array(np.concatenate(parts))), buffer)
         put("samples.parquet", buffer.getvalue())

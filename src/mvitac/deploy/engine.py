@@ -51,9 +51,12 @@ class Engine:
         for name in (n for n in self.meta["outputs"] if n.startswith("embedding_")):
             least = float(cosines(found[name], check[name]).min())
             if not least >= self.meta["tolerance"]["min_cosine"]:
+                again = " with this engine"
+                if self.meta["int8"] and self.meta["report"].get("target") != "avx2":
+                    again = ", with --target avx2 if this CPU has no VNNI"
                 raise ValueError(
                     f"{folder}: on this machine {name} has cosine {least:.4f} to what the trained model gave,"
-                    f" at least {self.meta['tolerance']['min_cosine']} is allowed: export it again with this engine"
+                    f" at least {self.meta['tolerance']['min_cosine']} is allowed: export it again{again}"
                 )
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
@@ -108,15 +111,21 @@ def _onnx(path: Path, precision: str, threads: int) -> Call:
     return lambda arrays: session.run(None, dict(zip(names, arrays, strict=True)))  # type: ignore[return-value]
 
 
+def lists_bf16(core: Any) -> bool:
+    """Whether OpenVINO (an ``openvino.Core``) says that this CPU computes bf16; where it does not, fp32 is used."""
+    return "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+
+
 def _openvino(path: Path, precision: str, threads: int) -> Call:
     import openvino
 
+    core = openvino.Core()
     config = {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": threads,
-        "INFERENCE_PRECISION_HINT": {"fp32": "f32", "bf16": "bf16"}[precision],
+        "INFERENCE_PRECISION_HINT": "bf16" if precision == "bf16" and lists_bf16(core) else "f32",
     }
-    request = openvino.Core().compile_model(path, "CPU", config).create_infer_request()
+    request = core.compile_model(path, "CPU", config).create_infer_request()
 
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
         found = request.infer(arrays, share_inputs=True)

@@ -13,7 +13,7 @@ import os
 import shutil
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -27,15 +27,19 @@ from mvitac.data.pack import Pack, has_difference
 from mvitac.deploy.artifact import preprocessing
 from mvitac.deploy.engine import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST, Call, cosines, open_engine
 from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.quantise import Target, quantise, this_machine, to_openvino, write_onnx
 from mvitac.evaluation.features import sample
 from mvitac.model import Model
+from mvitac.system.device import has_bf16
 from mvitac.system.files import check_place, digest, digest_file, write_atomic, write_json
+from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 Kind = Literal["torch", "onnx", "openvino"]
-NUM_CALIBRATION, NUM_CHECK = 128, 4
-"""Images that set the ranges of int8; images that travel with an export for the check on the robot."""
+NUM_CALIBRATION, NUM_CHECK = 128, 16
+"""Images that set the ranges of int8; images that travel with an export for the check on the robot (int8
+products saturate for some images only)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +68,7 @@ def export(
     kind: Kind = "onnx",
     precision: Literal["fp32", "bf16"] = "fp32",
     int8: bool = False,
+    target: Target = "auto",
     calibrate: Pack | None = None,
     modalities: tuple[str, ...] | None = None,
     tolerance: Tolerance | None = None,
@@ -73,16 +78,24 @@ def export(
     """Write ``model`` (with its probes) for ``kind`` into the new folder ``out`` and return the report.
 
     Checked on up to ``num_rows`` test rows of ``pack``; int8 ranges come from train rows of ``calibrate`` (``pack``).
+    ``target`` is the CPU that int8 is for: avx2 has 7-bit weights, vnni 8-bit ones, auto is this machine.
     ValueError, and no folder, if an embedding or the accuracy is off by more than ``tolerance``.
     """
     if out.exists():
         raise ValueError(f"{out} already exists: choose another --out, or delete it first")
     if int8 and kind == "torch":
         raise ValueError("--int8 is for onnx and openvino: give --format onnx or --format openvino")
+    if target != "auto" and not int8:
+        raise ValueError(f"--target {target} chooses the weights of --int8: add --int8, or leave --target out")
     if num_rows < 1:
         raise ValueError(f"--rows {num_rows}: give at least 1")
     if precision == "bf16" and (kind != "openvino" or int8):
         raise ValueError("--precision bf16 is a mode of openvino without --int8: give --format openvino")
+    if precision == "bf16" and not has_bf16(torch.device("cpu")):
+        raise ValueError(
+            "--precision bf16: this CPU does not compute bf16 itself, so OpenVINO would use fp32 or emulate it, and the"
+            " export could not be checked: export it on a CPU with AVX512-BF16 or AMX, or leave --precision out"
+        )
     check_place(out)
     graph = ExportModule(model, modalities)
     for given, (modality, (_, _, channels)) in product((pack, calibrate or pack), graph.inputs.items()):
@@ -106,15 +119,23 @@ def export(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        with silent():
-            _write(graph, partial, kind, _examples(graph, calibrate or pack) if int8 else None)
+        with work(f"writing {kind}"), silent():
+            if int8 and target == "auto":
+                target = this_machine(kind)
+            _write(graph, partial, kind, _examples(graph, calibrate or pack) if int8 else None, target)
         call = open_engine(partial, kind, precision, threads)
-        wanted = reference(model, graph, pack, rows)
-        report = parity(graph, call, model, pack, rows, wanted, tolerance)
+        with work("computing what the model itself answers", len(rows), "rows") as advance:
+            wanted = reference(model, graph, pack, rows, advance)
+        with work("checking what the export answers", len(rows), "rows") as advance:
+            report = parity(graph, call, model, pack, rows, wanted, tolerance, advance)
+        if int8:
+            report["target"] = target
         report["size_mb"] = round(sum((partial / name).stat().st_size for name in FILES[kind]) / 1e6, 2)
-        report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
-        check = {f"input_{m}": pack.images[m][rows[:NUM_CHECK]] for m in graph.modalities}
-        check |= {n: v[:NUM_CHECK] for n, v in wanted.items()}
+        with work("measuring latency"):
+            report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
+        some = np.linspace(0, len(rows) - 1, min(len(rows), NUM_CHECK)).astype(int)
+        check = {f"input_{m}": pack.images[m][rows[some]] for m in graph.modalities}
+        check |= {n: v[some] for n, v in wanted.items()}
         data = safetensors.numpy.save({n: np.ascontiguousarray(v) for n, v in check.items()})
         write_atomic(partial / CHECK, lambda file: file.write(data))
         meta = {
@@ -153,65 +174,20 @@ def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:
     return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in sample(rows, NUM_CALIBRATION)]
 
 
-def _write(graph: ExportModule, folder: Path, kind: Kind, examples: list[list[np.ndarray]] | None) -> None:
+def _write(
+    graph: ExportModule, folder: Path, kind: Kind, examples: list[list[np.ndarray]] | None, target: Target
+) -> None:
     two = tuple(torch.zeros(2, *shape, dtype=torch.uint8) for shape in graph.inputs.values())
     batch = torch.export.Dim("batch", min=1, max=1024)
-    shapes = tuple({0: batch} for _ in two)
+    shapes = (tuple({0: batch} for _ in two),)
     if kind == "torch":
-        program = torch.export.export(graph, two, dynamic_shapes=(shapes,))
-        torch.export.save(program, folder / FILES[kind][0])
+        torch.export.save(torch.export.export(graph, two, dynamic_shapes=shapes), folder / FILES[kind][0])
         return
-    path = folder / "model.onnx"
-    torch.onnx.export(
-        graph,
-        two,
-        path,
-        dynamo=True,
-        dynamic_shapes=(shapes,),
-        input_names=list(graph.inputs),
-        output_names=list(graph.outputs),
-        opset_version=18,
-        external_data=False,
-        verbose=False,
-    )
+    path = write_onnx(graph, two, folder, list(graph.inputs), list(graph.outputs), shapes)
     if examples is not None:
-        _quantise(path, list(graph.inputs), examples)
+        quantise(path, list(graph.inputs), examples, seven_bits=target == "avx2")
     if kind == "openvino":
-        import openvino
-
-        openvino.save_model(openvino.convert_model(path), folder / FILES[kind][0], compress_to_fp16=False)
-
-
-def _quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]]) -> None:
-    """Replace the ONNX file by its int8 version: weights per channel, activations by ranges seen on ``examples``."""
-    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
-    from onnxruntime.quantization.shape_inference import quant_pre_process
-
-    class Reader(CalibrationDataReader):
-        def __init__(self) -> None:
-            self.left = iter(examples)
-
-        def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
-            example = next(self.left, None)
-            return None if example is None else dict(zip(inputs, example, strict=True))
-
-    prepared = path.with_name("prepared.onnx")
-    quant_pre_process(str(path), str(prepared), skip_symbolic_shape=True)
-    quantize_static(
-        str(prepared),
-        str(path),
-        Reader(),
-        quant_format=QuantFormat.QDQ,
-        activation_type=QuantType.QUInt8,
-        weight_type=QuantType.QInt8,
-        per_channel=True,
-        op_types_to_quantize=[
-            "Conv",
-            "Add",
-            "MaxPool",
-            "GlobalAveragePool",
-        ],  # heads and probes stay fp32: they are tiny
-    )
+        to_openvino(path)
 
 
 @contextlib.contextmanager
@@ -230,7 +206,9 @@ def silent() -> Iterator[None]:
 # -- checking ---------------------------------------------------------------------------------------------------------
 
 
-def reference(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+def reference(
+    model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray, advance: Callable[[int], object] = lambda num: None
+) -> dict[str, np.ndarray]:
     """What the trained model itself makes of pack rows: the outputs of ``graph``, by ``Model``'s own code."""
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 64)):
@@ -243,6 +221,7 @@ def reference(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray) -
         }
         found |= {f"probability_{r.question.task}": r(joined) for r in graph.readouts}  # type: ignore[union-attr]
         chunks.append(found)
+        advance(len(chunk))
     return {name: torch.cat([c[name] for c in chunks]).numpy() for name in graph.outputs}
 
 
@@ -254,13 +233,14 @@ def parity(
     rows: np.ndarray,
     wanted: dict[str, np.ndarray],
     tolerance: Tolerance,
+    advance: Callable[[int], object] = lambda num: None,
 ) -> dict[str, Any]:
     """Cosines and accuracies of ``call`` on pack rows beside ``wanted``; ValueError if beyond ``tolerance``, with the
     likeliest reason."""
-    chunks = [
-        call([np.ascontiguousarray(pack.images[m][chunk]) for m in graph.modalities])
-        for chunk in np.array_split(rows, max(1, len(rows) // 16))  # batches of another size than the traced one
-    ]
+    chunks = []
+    for chunk in np.array_split(rows, max(1, len(rows) // 16)):  # batches of another size than the traced one
+        chunks.append(call([np.ascontiguousarray(pack.images[m][chunk]) for m in graph.modalities]))
+        advance(len(chunk))
     found = {name: np.concatenate([c[i] for c in chunks]) for i, name in enumerate(graph.outputs)}
     report: dict[str, Any] = {"num_rows": len(rows), "cosine": {}, "accuracy": {}}
     for name in (n for n in graph.outputs if n.startswith(("embedding_", "shared_"))):

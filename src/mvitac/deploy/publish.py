@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import safetensors.torch
 
 from mvitac.data.pack import Pack
+from mvitac.data.spec import Task
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.features import features
@@ -22,6 +24,7 @@ from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logist
 from mvitac.registry import to_json
 from mvitac.run import load_run
 from mvitac.system.files import brief, check_place, digest_file, write_atomic, write_json
+from mvitac.system.progress import work
 
 
 def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
@@ -31,34 +34,39 @@ def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
     """
     readouts = {}
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
-    for task in pack.spec.tasks:
-        labels = pack.column(f"label_{task.name}").astype(int)
-        for modality in [*modalities, *(["both"] if len(modalities) == 2 else [])]:
-            try:
-                rows = split_rows(pack, task, modality)
-            except ValueError:
-                continue
-            names = modalities if modality == "both" else [modality]
-            everything = np.concatenate([rows.train, rows.val, rows.test])
-            groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
-            seen = labels[np.concatenate([rows.train, rows.val])]
-            common = int(np.bincount(seen).argmax())
-            x = np.concatenate([features(model, pack, m, everything) for m in names], axis=1)
-            learn, choose, test = np.split(x, np.cumsum([len(rows.train), len(rows.val)]))
-            given: dict[str, Any] = {"task": task.name, "modality": modality, "classes": task.classes}
-            given |= {"majority": float((labels[rows.test] == common).mean()), "num_test": len(rows.test)}
-            if len(set(labels[rows.train])) < 2:
-                label = int(labels[rows.train][0])
-                accuracy = float((labels[rows.test] == label).mean())
-                readout = constant(ProbeInfo(**given, accuracy=accuracy), label, x.shape[1])
-            else:
-                fitted, _ = fit_linear(learn, labels[rows.train], choose, labels[rows.val])
-                guess = spread_out(fitted(test), np.unique(seen), len(task.classes))
-                accuracy = score(labels[rows.test], guess, groups, len(task.classes))["accuracy"]
-                question = ProbeInfo(**given, accuracy=accuracy)
-                readout = from_logistic(question, fitted.model, fitted.mean, fitted.std)
-            readouts[readout.question.name] = readout
+    sources = [*modalities, *(["both"] if len(modalities) == 2 else [])]
+    with work("fitting probes", len(pack.spec.tasks) * len(sources), "probes") as advance:
+        for task, source in product(pack.spec.tasks, sources):
+            readout = _fit_readout(model, pack, task, source, modalities if source == "both" else [source])
+            if readout:
+                readouts[readout.question.name] = readout
+            advance()
     return readouts
+
+
+def _fit_readout(model: Model, pack: Pack, task: Task, source: str, modalities: list[str]) -> LinearProbe | None:
+    """The linear probe of one task on the features of ``modalities``; None without labelled rows in train and test."""
+    try:
+        rows = split_rows(pack, task, source)
+    except ValueError:
+        return None
+    labels = pack.column(f"label_{task.name}").astype(int)
+    everything = np.concatenate([rows.train, rows.val, rows.test])
+    groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
+    seen = labels[np.concatenate([rows.train, rows.val])]
+    common = int(np.bincount(seen).argmax())
+    x = np.concatenate([features(model, pack, m, everything) for m in modalities], axis=1)
+    learn, choose, test = np.split(x, np.cumsum([len(rows.train), len(rows.val)]))
+    given: dict[str, Any] = {"task": task.name, "modality": source, "classes": task.classes}
+    given |= {"majority": float((labels[rows.test] == common).mean()), "num_test": len(rows.test)}
+    if len(set(labels[rows.train])) < 2:
+        label = int(labels[rows.train][0])
+        accuracy = float((labels[rows.test] == label).mean())
+        return constant(ProbeInfo(**given, accuracy=accuracy), label, x.shape[1])
+    fitted, _ = fit_linear(learn, labels[rows.train], choose, labels[rows.val])
+    guess = spread_out(fitted(test), np.unique(seen), len(task.classes))
+    accuracy = score(labels[rows.test], guess, groups, len(task.classes))["accuracy"]
+    return from_logistic(ProbeInfo(**given, accuracy=accuracy), fitted.model, fitted.mean, fitted.std)
 
 
 def own_data(model: Model, instead: str) -> Pack:

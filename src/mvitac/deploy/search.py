@@ -27,6 +27,7 @@ from mvitac.model import Images, Model, load
 from mvitac.registry import unknown
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.locks import hold_lock
+from mvitac.system.progress import work
 
 
 def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str, np.ndarray]], list[str]]:
@@ -88,10 +89,12 @@ def nearest(bank: np.ndarray, queries: np.ndarray, k: int, *, block: int = BLOCK
 def embeddings(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, shared: bool) -> Iterator[np.ndarray]:
     """Embeddings of pack rows in chunks of at most 256: features, or the unit vectors of the shared space."""
     device = next(model.parameters()).device
-    for chunk in np.array_split(rows, max(1, -(-len(rows) // 256))):
-        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        x = model.features(modality, images, for_heads=shared)
-        yield (model.project(modality, x) if shared else x).cpu().numpy()
+    with work(f"embedding {modality}", len(rows), "images") as advance:
+        for chunk in np.array_split(rows, max(1, -(-len(rows) // 256))):
+            images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
+            x = model.features(modality, images, for_heads=shared)
+            yield (model.project(modality, x) if shared else x).cpu().numpy()
+            advance(len(chunk))
 
 
 def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:

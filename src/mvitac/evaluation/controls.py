@@ -30,6 +30,7 @@ from mvitac.model import fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.run import Run
 from mvitac.system.processes import in_threads
+from mvitac.system.progress import work
 
 CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority")
 """Names of the controls in the order of a table. The dataset's own controls come before the last."""
@@ -73,14 +74,18 @@ def controls_of(
     Returns:
         Probe records and retrieval records, each with its "source" and "seed".
     """
-    records = _label_controls(pack, tasks) + _pixel_controls(pack, tasks, modalities)
-    starts = starts_of(runs, specs or [pack.spec] * len(runs))
-    found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes)
-    records += found
-    for name in start_weights(runs, imagenet):
-        run, spec = starts[0]
-        start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
-        records += _named("imagenet", None, probe_model(start, pack, tasks, modalities, probes))
+    starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)
+    num_trunks = len(probes) * (len(starts) + len(weights))
+    num = len(tasks) * (len(modalities) * (1 + num_trunks) + ("touch" in modalities))
+    records = _label_controls(pack, tasks)
+    with work("fitting probes of the controls", num, "probes"):
+        records += _pixel_controls(pack, tasks, modalities)
+        found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes)
+        records += found
+        for name in weights:
+            run, spec = starts[0]
+            start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
+            records += _named("imagenet", None, probe_model(start, pack, tasks, modalities, probes))
     return records, retrieval
 
 

@@ -20,6 +20,7 @@ from mvitac.registry import to_json, unknown
 from mvitac.run import load_run
 from mvitac.system.files import check_place, digest, write_json
 from mvitac.system.processes import in_threads
+from mvitac.system.progress import work
 
 END_TO_END = ", end to end"
 """Suffix of a source's name for the scores of its own classifiers, trained along with its encoders."""
@@ -86,10 +87,13 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
             build_trunk(replace(models[0].run.encoder, weights=weights), 3)
     records: Records = []
     retrieval: Records = []
-    for own, found in in_threads(
-        lambda each: _probe_run(*each, pack, tasks, modalities, session),
-        list(zip(paths, models, names, strict=True)),
-    ):
+    num = len(models) * len(tasks) * len(modalities) * len(session.probes)
+    with work("fitting probes", num, "probes"):
+        scored = in_threads(
+            lambda each: _probe_run(*each, pack, tasks, modalities, session),
+            list(zip(paths, models, names, strict=True)),
+        )
+    for own, found in scored:
         records += own
         retrieval += found
     if session.controls:

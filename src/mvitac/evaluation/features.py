@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -10,12 +12,22 @@ from mvitac.data.pack import Pack
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
+from mvitac.system.progress import work
 
 
 def pack_features(
-    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, precision: str = "fp32"
+    model: Model,
+    pack: Pack,
+    modality: str,
+    rows: np.ndarray,
+    *,
+    for_heads: bool = False,
+    bf16: bool = False,
+    advance: Callable[[int], object] = lambda num: None,
 ) -> Tensor:
     """Compute ``Model.features`` of pack rows in chunks on the model's device.
+
+    ``advance`` is called after each chunk with its number of rows.
 
     Returns:
         Features [len(rows), D] on the CPU.
@@ -26,7 +38,8 @@ def pack_features(
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        chunks.append(model.features(modality, images, for_heads=for_heads, precision=precision).cpu())
+        chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
+        advance(len(chunk))
     return torch.cat(chunks)
 
 
@@ -51,6 +64,7 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
             return np.load(path, allow_pickle=False)
         except (ValueError, EOFError, OSError):
             path.unlink()  # damaged file: compute the features again
-    values = pack_features(model, pack, modality, rows, for_heads=for_heads).numpy()
+    with work(f"reading {modality} features", len(rows), "images") as advance:
+        values = pack_features(model, pack, modality, rows, for_heads=for_heads, advance=advance).numpy()
     write_atomic(path, lambda file: np.save(file, values))
     return values

@@ -21,6 +21,7 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.scores import score
 from mvitac.model import Model
 from mvitac.registry import unknown
+from mvitac.system.progress import tick
 
 PROBES = ("linear", "paper", "knn")
 """linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
@@ -184,7 +185,7 @@ def probe_all(
     probes: Sequence[str],
     seed: int,
 ) -> list[dict[str, Any]]:
-    """Records of every (task, modality, probe) on the features of ``source``."""
+    """Records of every (task, modality, probe) on the features of ``source``; each ticks the progress of "probes"."""
     papers = _papers(source, pack, tasks, modalities, seed) if "paper" in probes else {}
     records = []
     for task in tasks:
@@ -193,6 +194,7 @@ def probe_all(
             x = source(modality, rows.all)
             for kind in probes:
                 result = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
+                tick("probes")
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
 

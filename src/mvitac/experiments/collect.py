@@ -26,10 +26,11 @@ from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work, seconds_of
 from mvitac.experiments.plan import Plan, Row, slug
+from mvitac.model import precision_of
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
-from mvitac.run import Run
-from mvitac.system.device import describe, pick_device
+from mvitac.run import Run, load_run
+from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.provenance import provenance
 from mvitac.training.loop import check_same
@@ -121,7 +122,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         raise ValueError(f"no run of {out} is finished: nothing to show yet{f' ({lost})' if lost else ''}")
     scored = [_scores(job) for job in finished]
     controls, found = _controls(work, out, session)
-    made = [read_json(job.out / "run.json", "a run's record") for job in finished]
+    runs = [load_run(job.out) for job in finished]
     return {
         "plan": to_json(work.plan),
         "data": work.pack.spec.name,
@@ -137,8 +138,9 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "unfinished": [job.name for job in work.jobs if not job.done],
         "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
         "device": describe(pick_device(work.jobs[0].run.device)),
-        "run_commits": list(dict.fromkeys(record.get("commit") for record in made)),
-        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for record in made)),
+        "run_commits": list(dict.fromkeys(record.get("commit") for _, record in runs)),
+        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for _, record in runs)),
+        "run_precisions": {job.name: precision_of(*run) for job, run in zip(finished, runs, strict=True)},
         **provenance(),
     }
 
@@ -234,7 +236,11 @@ def forecast(work: Work) -> list[str]:
             f" {sum(j.done for j in mine)} of {len(mine)} finished"
         )
     lines += [f"  left out: {label} ({reason})" for label, reason in work.left_out.items()]
-    left = sum(not job.done for job in work.jobs)
+    todo = [job for job in work.jobs if not job.done]
+    for asked, run in {job.run.precision: job.run for job in todo}.items():
+        device = pick_device(run.device)
+        lines.append(f"on this machine: {describe_precision(asked, pick_precision(asked, device), device)}")
+    left = len(todo)
     if known and left:
         hours = left * statistics.median(known) / 3600
         lines.append(f"{left} runs left, about {hours:.1f} h of training one after another (median of finished runs)")

@@ -85,6 +85,7 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
         "retrieval": retrieval,
         "failed": {name: error for result in results for name, error in result["failed"].items()},
         **{key: list(dict.fromkeys(values)) for key, values in merged.items()},
+        "run_precisions": {name: p for result in results for name, p in result["run_precisions"].items()},
         "unfinished": [name for result in results for name in result["unfinished"]],
         "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),
     }

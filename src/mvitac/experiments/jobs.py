@@ -13,11 +13,12 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import Progress, TaskID
+from rich.progress import TaskID
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
@@ -30,7 +31,8 @@ from mvitac.system.device import pick_device
 from mvitac.system.files import brief, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.system.processes import my_device, side_by_side
-from mvitac.training.log import bars, last_line
+from mvitac.system.progress import Bars, shown
+from mvitac.training.log import Logger, in_a_bar, last_line
 from mvitac.training.loop import Diverged, Interrupted, train
 from mvitac.training.sampler import training_rows
 
@@ -97,7 +99,7 @@ class Work:
     left_out: dict[str, str]
 
 
-def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
+def do(job: Job, pack: Pack | None = None, *, quiet: bool = True, loggers: tuple[Logger, ...] = ()) -> str:
     """Train and score one run; returns a line about it.
 
     Safe to call again after a kill, and from several processes at once: a run that another process works on is skipped.
@@ -106,19 +108,19 @@ def do(job: Job, pack: Pack | None = None, *, quiet: bool = True) -> str:
         with hold_lock(
             job.out, "another process runs it; this command makes the whole table once it is done", wait=False
         ):
-            return "finished before" if job.done else _do(job, pack, quiet)
+            return "finished before" if job.done else _do(job, pack, quiet, loggers)
     except Busy as busy:
         return str(busy)
 
 
-def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
+def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -> str:
     pack = pack or job.run.data.open(quiet=True)
     gpu = pick_device(job.run.device)
     measured = gpu.type == "cuda" and not (job.out / "model.safetensors").exists()
     if measured:
         torch.cuda.reset_peak_memory_stats(gpu)
     try:
-        train(job.run, job.out, resume=True, quiet=quiet, pack=pack)
+        train(job.run, job.out, resume=True, quiet=quiet, loggers=loggers, pack=pack)
     except Diverged as error:
         write_json(job.out / "failed.json", {"error": str(error)})
         return f"diverged: {error}"
@@ -162,7 +164,7 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
         work: The jobs.
         num_jobs: Number of parallel processes.
         say: Receives a line about each job.
-        console: Shows progress bars if it is a terminal.
+        console: Shows progress and the time left.
 
     Raises:
         Exception: The first error of a failed job, after all other jobs ran.
@@ -173,16 +175,14 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
     for job in work.jobs:
         if job.done and not job.failure:
             job.drop_checkpoint()  # a killed process may have left it
-    shown = console if console and console.is_terminal else None
     report = _Reporter(work, say)
     try:
-        if num_jobs == 1 or len(todo) < 2:
-            for job in todo:
-                say(f"{job.name} ...")
-                pack = work.pack if job.run.data == work.plan.data else None
-                report(job, lambda job=job, pack=pack: do(job, pack, quiet=not shown))
-        else:
-            _side_by_side(work, todo, num_jobs, report, shown)
+        with shown(console, quiet=console is None) as bars:
+            pace = _Pace(work, todo, bars, num_jobs)
+            if num_jobs == 1 or len(todo) < 2:
+                _one_by_one(work, todo, report, pace, quiet=console is None)
+            else:
+                _side_by_side(todo, num_jobs, report, pace)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("stopped; the same command continues from here") from None
     except BrokenProcessPool:
@@ -194,37 +194,79 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
         raise report.errors[0]
 
 
-def _side_by_side(work: Work, todo: Sequence[Job], num_jobs: int, report: _Reporter, console: Console | None) -> None:
+def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, pace: _Pace, *, quiet: bool) -> None:
+    for job in todo:
+        report.say(f"{job.name} ...")
+        pack = work.pack if job.run.data == work.plan.data else None
+        look = (lambda *_, job=job: pace.look([job]),)
+        report(job, lambda job=job, pack=pack, look=look: do(job, pack, quiet=quiet, loggers=look))
+        pace.look([])
+
+
+def _side_by_side(todo: Sequence[Job], num_jobs: int, report: _Reporter, pace: _Pace) -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
-    shown = bars(console or Console(), disable=console is None, transient=True, speed_estimate_period=600)
-    with shown as progress, side_by_side(num_jobs, devices) as pool:
-        overall = progress.add_task("all runs", total=len(todo), text="")
-        active: dict[Path, tuple[TaskID, int]] = {}  # progress bar and steps of each active run
+    with side_by_side(num_jobs, devices) as pool:
         jobs = {pool.submit(_do_here, job): job for job in todo}
         waiting = set(jobs)
         while waiting:
             done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
-                report(job := jobs[future], future.result)
-                if job.out in active:
-                    progress.remove_task(active.pop(job.out)[0])
-            running = [jobs[future] for future in waiting if future.running()] if console else []
-            part = sum(_show_progress(work, job, progress, active) for job in running)
-            progress.update(overall, completed=len(todo) - len(waiting) + part)
+                report(jobs[future], future.result)
+            pace.look([jobs[future] for future in waiting if future.running()])
 
 
-def _show_progress(work: Work, job: Job, progress: Progress, active: dict[Path, tuple[TaskID, int]]) -> float:
-    """Update the bar of one active run; returns the fraction that is done."""
-    step, text = last_line(job.out)
-    if step and job.out not in active:
-        steps = job.run.num_steps(len(training_rows(job.run, work.pack)))
-        active[job.out] = progress.add_task(job.name, total=steps, text=""), steps
-    if job.out not in active:
-        return 0.0
-    task, steps = active[job.out]
-    progress.update(task, completed=step, text=text)
-    return min(1, step / steps)  # a fold may take more steps than counted here
+class _Pace:
+    """Shows the progress of a comparison and the time left, from the speeds in the logs of its rows."""
+
+    def __init__(self, work: Work, todo: Sequence[Job], bars: Bars | None, num_jobs: int) -> None:
+        self.todo, self.bars, self.num_jobs = todo, bars, num_jobs
+        self.speeds: dict[str, float] = {}  # pairs per second of each row, as last seen
+        self.tasks: dict[Path, TaskID] = {}  # bars of the active runs
+        if bars:
+            # A fold may take a few steps more or less.
+            self.steps = {job.out: job.run.num_steps(len(training_rows(job.run, work.pack))) for job in work.jobs}
+            for job in work.jobs:
+                self._see(job)
+            self.overall = bars.add_task("all runs", total=len(todo), unit="runs", rate="")
+
+    def _see(self, job: Job) -> dict[str, Any]:
+        """What a bar shows of ``job``. Keeps its speed for its row."""
+        seen = in_a_bar(last_line(job.out), self.steps[job.out], job.run.batch_size)
+        if seen["speed"]:
+            self.speeds[job.label] = seen["speed"]
+        return seen
+
+    def look(self, running: Sequence[Job]) -> None:
+        """Update the bars of the running jobs and the time left."""
+        if not self.bars:
+            return
+        for path in self.tasks.keys() - {job.out for job in running}:
+            self.bars.remove_task(self.tasks.pop(path))
+        steps_done = {}
+        for job in running:
+            seen = self._see(job)
+            steps_done[job.out] = seen["completed"]
+            if len(self.todo) > 1 and self.num_jobs > 1:  # a run in this process has its own bar
+                if job.out not in self.tasks:
+                    many = {"total": self.steps[job.out], "unit": "steps", "rate": "pairs", "silent": True}
+                    self.tasks[job.out] = self.bars.add_task(job.name, **many)
+                self.bars.update(self.tasks[job.out], **seen)
+        todo = [job for job in self.todo if not job.done]
+        part = sum(min(1, steps_done.get(job.out, 0) / self.steps[job.out]) for job in todo)
+        left = self.seconds_left(todo, steps_done)
+        self.bars.update(self.overall, completed=len(self.todo) - len(todo) + part, left=left)
+
+    def seconds_left(self, todo: Sequence[Job], steps_done: dict[Path, int]) -> float | None:
+        """Seconds of training for ``todo``, ``num_jobs`` at a time. A row without a speed gets the mean of the others."""
+        if not self.speeds:
+            return None
+        usual = fmean(1 / max(speed, 1e-9) for speed in self.speeds.values())
+        seconds = 0.0
+        for job in todo:
+            pairs = max(0, self.steps[job.out] - steps_done.get(job.out, 0)) * job.run.batch_size
+            seconds += pairs / self.speeds[job.label] if job.label in self.speeds else pairs * usual
+        return seconds / min(self.num_jobs, max(1, len(todo)))
 
 
 def _do_here(job: Job) -> str:

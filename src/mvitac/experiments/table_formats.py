@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     if shown:
         other = "." if _papers(result, plan) else ", which is other data: compare the order of rows, not values."
         text.append(f'"printed" is the paper\'s number on {plan.printed_on}{other}')
-    text += [f"Note: {note}." for note in result.get("notes", ())]
+    text += [f"Note: {note}." for note in _notes(result)]
     if result["leaks"]:
         text.append(f"**LEAK: {result['leaks']}.**")
     text += [f"Diverged: {name} ({error})." for name, error in result["failed"].items()]
@@ -117,6 +118,17 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     if result["unfinished"]:
         text.append(f"**Not finished: {', '.join(result['unfinished'])}.**")
     return [line for part in text for line in (part, "")][:-1]
+
+
+def _notes(result: dict[str, Any]) -> list[str]:
+    """The notes of the data, and the runs that computed in another precision than most."""
+    runs: dict[str, str] = result.get("run_precisions", {})  # by name; results of 0.1.0 have none
+    most, *others = [precision for precision, _ in Counter(runs.values()).most_common()] or [""]
+    differ = [f"{', '.join(f'{name!r}' for name in runs if runs[name] == other)} in {other}" for other in others]
+    return [
+        *result.get("notes", ()),
+        *([f"the networks of {' and of '.join(differ)}, those of all other runs in {most}"] if differ else []),
+    ]
 
 
 def _budget(result: dict[str, Any]) -> str:
@@ -207,7 +219,7 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if plan.printed_on:
         note += f"; in brackets: printed in the paper on {plan.printed_on}"
-    notes = [note, *(f"% Note: {note}." for note in result.get("notes", ()))]
+    notes = [note, *(f"% Note: {note}." for note in _notes(result))]
     if result["leaks"]:
         notes.append(f"% LEAK: {result['leaks']}.")
     return "\n".join([*notes, *text, r"\bottomrule", r"\end{tabular}"]) + "\n"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Literal, Self
 
 import torch
@@ -17,9 +18,10 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, Head, build_trunk
+from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum, rising
+from mvitac.system.processes import in_branches
 
 PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
 """loss -> modality of its queries, of its keys."""
@@ -128,12 +130,18 @@ class Tower(nn.Module):
 
 def _embed(towers: nn.ModuleDict, batch: Views, name: str, views: list[int]) -> dict[str, Tensor]:
     """Embeddings of ``views`` of each modality by both heads, named e.g. q0_vision_intra."""
-    z = {}
-    for modality, tower in towers.items():
+
+    def of(modality: str) -> dict[str, Tensor]:
+        z = {}
         for view in views:
-            intra, inter = tower(batch.images[modality][view])
+            intra, inter = towers[modality](batch.images[modality][view])
             z |= {f"{name}{view}_{modality}_intra": intra, f"{name}{view}_{modality}_inter": inter}
-    return z
+        return z
+
+    branches = [partial(of, modality) for modality in towers]
+    if batch.rows.device.type != "cpu" or draws_random_numbers(towers):
+        return {key: tensor for branch in branches for key, tensor in branch().items()}
+    return in_branches(branches)
 
 
 class MViTac(Contrastive):

@@ -113,6 +113,12 @@ def num_features(trunk: nn.Module) -> int:
     return int(trunk.num_features)  # type: ignore[arg-type]
 
 
+def draws_random_numbers(network: nn.Module) -> bool:
+    """Whether ``network`` has dropout of any kind: torch's and timm's layers name their rate in one of three ways."""
+    rates = ("p", "drop_prob", "drop_rate")
+    return any(isinstance(rate := getattr(m, name, 0), float) and rate > 0 for m in network.modules() for name in rates)
+
+
 def build_towers(config: EncoderConfig, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
     """A ``Projected`` per modality of ``spec``, with fresh weights drawn in its order; ``head`` makes one for D features."""
     towers = nn.ModuleDict()

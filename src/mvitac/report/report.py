@@ -17,7 +17,7 @@ from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs
 from mvitac.evaluation.probe import cross_modal, split_rows
-from mvitac.model import load
+from mvitac.model import load, precision_of
 from mvitac.registry import to_json
 from mvitac.report import galleries, tables
 from mvitac.report import html as page
@@ -25,6 +25,7 @@ from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
 from mvitac.run import load_run
 from mvitac.system.files import write_atomic
+from mvitac.system.progress import duration, shown, work
 
 
 def write_report(
@@ -54,10 +55,9 @@ def write_report(
     runs = open_runs([Path(path) for path in paths])
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
         raise ValueError("these runs were trained on different data: write one report per dataset")
-    console = Console(stderr=True, quiet=quiet)
     pack = pack or runs[0].run.data.open(quiet=quiet)
     if result is None:
-        with console.status("probing"):
+        with shown(Console(stderr=True), quiet=quiet):
             result = _probe(runs, pack)
     elif not isinstance(result, dict) or {"pack", "records", "retrieval", "summary", "classes"} - set(result):
         raise ValueError("this is not a probe result: make one with `mvitac probe RUN... --json FILE`")
@@ -67,7 +67,7 @@ def write_report(
         )
     _check_scored(runs, result)
     runs = _as_scored(runs, result)
-    with console.status("drawing"):
+    with shown(Console(stderr=True), quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
     write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
     return Path(out) / "report.html"
@@ -138,18 +138,23 @@ def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finishe
 
 def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
-    sections = [
-        ("scores", "Scores of the frozen features", evidence.probe(study)),
-        ("retrieval", "Finding the other modality", evidence.retrieval(study)),
-        ("loss", "Loss", evidence.loss(study)),
-        ("collapse", "Learning or collapsing?", evidence.collapse(study)),
-        ("confusion", "Confusion", evidence.confusions(study)),
-        ("map", "A map of the features", galleries.feature_maps(study)),
-        ("gallery", "Retrieval gallery", galleries.gallery(study)),
-        ("settings", "Settings", _settings(study)),
-        ("cost", "Cost", _cost(study)),
-        ("again", "Reproduce", _again(study)),
-    ]
+    drawn = {
+        "scores": ("Scores of the frozen features", evidence.probe),
+        "retrieval": ("Finding the other modality", evidence.retrieval),
+        "loss": ("Loss", evidence.loss),
+        "collapse": ("Learning or collapsing?", evidence.collapse),
+        "confusion": ("Confusion", evidence.confusions),
+        "map": ("A map of the features", galleries.feature_maps),
+        "gallery": ("Retrieval gallery", galleries.gallery),
+        "settings": ("Settings", _settings),
+        "cost": ("Cost", _cost),
+        "again": ("Reproduce", _again),
+    }
+    sections = []
+    with work("drawing the report", len(drawn), "sections") as advance:
+        for name, (heading, draw) in drawn.items():
+            sections.append((name, heading, draw(study)))
+            advance()
     spec = study.pack.spec
     notes = "".join(f" Note: {note}." for note in spec.notes)
     foot = page.paragraph(
@@ -268,9 +273,10 @@ def _cost(study: Study) -> str:
             "steps": f"{steps:,}",
             "pairs seen": f"{steps * r.run.batch_size:,} (the data has {r.record.get('num_pairs', 0):,})",
             "speed": f"{median(e['pairs_per_s'] for e in lines):,.0f} pairs/s (median)" if lines else "",
-            "wall time": _duration(seconds) if seconds else "",
+            "wall time": duration(seconds) if seconds else "",
             "parameters kept": f"{trunks / 1e6:.2f} M in trunks" + (f", {heads / 1e6:.2f} M in heads" if heads else ""),
             "machine": f"{r.record.get('machine', '')}; device {r.run.device}",
+            "precision": precision_of(r.run, r.record) + " (auto)" * (r.run.precision == "auto"),
             "versions": ", ".join(f"{k} {v}" for k, v in r.record.get("versions", {}).items()),
             "python": str(r.record.get("python", "")),
             "commit": str(r.record.get("commit") or "not a git checkout"),
@@ -282,11 +288,6 @@ def _cost(study: Study) -> str:
     names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
     shown = page.table(["", *names], [[name, *values] for name, values in rows.items()], words=True, label="cost")
     return page.paragraph("Wall time is estimated from the logged speeds and excludes the final scoring.") + shown
-
-
-def _duration(seconds: float) -> str:
-    minutes, hours = seconds / 60, seconds / 3600
-    return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if hours < 2 else f"{hours:.1f} h"
 
 
 def _again(study: Study) -> str:

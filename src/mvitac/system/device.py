@@ -1,8 +1,13 @@
-"""Which device a run computes on, and its name for the record."""
+"""Which device a run computes on and in which precision, and their names for the record."""
 
 from __future__ import annotations
 
+import time
+
 import torch
+
+SIDE = 256
+"""Of the matrices in ``slowdown``: a product takes 10 ms where bf16 is 30 times as slow as fp32."""
 
 
 def pick_device(name: str) -> torch.device:
@@ -28,3 +33,61 @@ def describe(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"{device.type}, {torch.get_num_threads()} threads"
+
+
+def has_bf16(device: torch.device) -> bool:
+    """Whether ``device`` computes bf16 products itself: CUDA from 8.0, CPUs with AVX512-BF16 or AMX that oneDNN may use.
+
+    Elsewhere torch emulates them, up to 100 times as slow as fp32. Arm CPUs count as elsewhere: nobody measured them.
+    """
+    if device.type == "cuda":
+        with torch.cuda.device(device):
+            own = torch.cuda.is_bf16_supported(including_emulation=False)
+            return own and torch.cuda.get_device_capability() >= (8, 0)
+    if device.type != "cpu":
+        return False
+    chip = [getattr(torch.cpu, name, None) for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")]
+    library = getattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", None)  # knows of limits such as ONEDNN_MAX_CPU_ISA
+    # They are private to torch: a version without them gets fp32, which is right everywhere.
+    return any(ask is not None and ask() for ask in chip) and library is not None and library()
+
+
+def pick_precision(name: str, device: torch.device) -> str:
+    """What ``Run.precision`` means on ``device``: auto is bf16 where the hardware computes it, else fp32."""
+    if name == "auto":
+        return "bf16" if has_bf16(device) else "fp32"
+    return name
+
+
+def describe_precision(asked: str, precision: str, device: torch.device) -> str:
+    """What the networks compute in, for the reader: what auto became, and what bf16 costs where it is emulated."""
+    kind = {"cpu": "CPU", "cuda": "GPU"}.get(device.type, "device")
+    if asked == "auto":
+        lacks = "" if precision == "bf16" else f", as this {kind} does not compute bf16 itself"
+        return f"precision: {precision} (auto{lacks})"
+    slower = 1.0 if precision != "bf16" or has_bf16(device) else slowdown(device)
+    if slower <= 1:
+        return f"precision: {precision}"
+    return (
+        f"precision: bf16, which is emulated on this {kind}: a {SIDE}x{SIDE} product takes"
+        f" {slower:.{0 if slower >= 10 else 1}f} times as long as in fp32. Use --precision auto or fp32."
+    )
+
+
+def slowdown(device: torch.device) -> float:
+    """How many times as long as in fp32 a small matrix product takes in bf16, measured now, on a CPU with one thread."""
+    least = []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # others may wait for each other on a busy machine
+    try:
+        for dtype in (torch.float32, torch.bfloat16):
+            matrix = torch.ones(SIDE, SIDE, device=device, dtype=dtype)
+            seconds = []
+            for _ in range(6):  # the first prepares the kernel
+                start = time.perf_counter()
+                (matrix @ matrix)[0, 0].item()  # waits for a GPU
+                seconds.append(time.perf_counter() - start)
+            least.append(min(seconds))
+    finally:
+        torch.set_num_threads(threads)
+    return least[1] / least[0]

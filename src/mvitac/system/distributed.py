@@ -2,7 +2,7 @@
 
 Without torchrun there is a world of one and everything here does nothing. Process r embeds its own rows; the embeddings
 of all are gathered, each process takes the whole loss and so holds the full gradient of its own embeddings; parameter
-gradients are then summed. That is the gradient of one process on the joint batch (tests/test_distributed.py).
+gradients are then summed. That is the gradient of one process on the joint batch (tests/training/test_distributed.py).
 
 Of memory that is sharded, process r holds rows r, r + size, ... (`shard`). What it makes of these with embeddings that all
 have goes through `spread`, what comes of it through `sum`: value and gradient are then complete on every process (the f
@@ -92,7 +92,7 @@ class World:
         """Whether ``flag`` is set on any process; all must ask together."""
         if self.size == 1:
             return flag
-        value = torch.tensor(float(flag), device="cuda" if dist.get_backend() == "nccl" else "cpu")
+        value = torch.tensor(float(flag), device=local_device("cuda") if dist.get_backend() == "nccl" else "cpu")
         dist.all_reduce(value)
         return bool(value > 0)
 

@@ -1,30 +1,30 @@
-"""What a run says of itself while it trains: log.jsonl, the progress line, and the sinks one may add; and others of it."""
+"""What a run says of itself while it trains: log.jsonl, the progress, and the loggers one may add."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from mvitac.registry import to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import naming, write_atomic
+from mvitac.system.progress import WIDE, shown
 
 Logger = Callable[[int, dict[str, float]], None]
-WIDE = 120
-"""Columns of a terminal in which all losses stand beside the progress; in fewer their sum alone."""
+EARLY = 3
+"""Steps after which a run logs for the first time, so that others who look at it know its speed soon."""
 
 
 class Log:
-    """log.jsonl, the progress line, and the sinks; on resume, lines after the checkpoint are dropped."""
+    """log.jsonl, the progress, and the loggers; on resume, lines after the checkpoint are dropped."""
 
-    def __init__(self, out: Path, start: int, num_steps: int, quiet: bool, loggers: tuple[Logger, ...]) -> None:
+    def __init__(
+        self, out: Path, start: int, num_steps: int, batch_size: int, *, quiet: bool, loggers: tuple[Logger, ...]
+    ) -> None:
         path = out / "log.jsonl"
         kept = []
         if path.exists():
@@ -39,37 +39,46 @@ class Log:
         write_atomic(path, lambda file: file.write("".join(kept).encode()))
         self.path, self.file = path, path.open("a")
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
-        columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn())
-        times = (TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[text]}"))
-        self.progress = Progress(*columns, *times, disable=quiet)
-        self.bar = self.progress.add_task("pre-training", total=num_steps, completed=start, text="")
+        self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, batch_size, quiet, ExitStack()
 
     def __enter__(self) -> Log:
-        self.progress.start()
+        self.bars = self.stack.enter_context(shown(quiet=self.quiet))
+        if self.bars:
+            rate = {"unit": "steps", "rate": "pairs", "scale": self.batch_size}
+            self.bar = self.bars.add_task("pre-training", total=self.num_steps, completed=self.start, **rate)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.progress.stop()
+        if self.bars:
+            self.bars.end(self.bar)
+        self.stack.close()
         with naming(self.path):
             self.file.close()
 
-    def step(self, step: int, losses: dict[str, float], lr: float, batch_size: int) -> None:
+    def step(self, step: int, losses: dict[str, float], lr: float) -> None:
         now = time.perf_counter()
-        speed = (step - self.since_step) * batch_size / max(1e-9, now - self.since)
+        speed = (step - self.since_step) * self.batch_size / max(1e-9, now - self.since)
         self.since, self.since_step = now, step
         self._write({"step": step, **losses, "lr": lr, "pairs_per_s": round(speed, 1)})
-        told = losses if self.progress.console.width >= WIDE else {"loss": losses["loss"]}
-        text = " ".join(f"{name} {value:.2f}" for name, value in told.items())
-        self.progress.update(self.bar, text=f"{text}  {speed:.0f}/s")
+        if self.bars:
+            told = losses if self.bars.console.width >= WIDE else {"loss": losses["loss"]}
+            self.bars.update(self.bar, text=" ".join(f"{name} {value:.2f}" for name, value in told.items()))
 
     def advance(self, step: int) -> None:
-        self.progress.update(self.bar, completed=step)
+        if step == self.start + 1:  # the first step starts everything: it measures nothing
+            self.since, self.since_step = time.perf_counter(), step
+        if self.bars:
+            self.bars.update(self.bar, completed=step)
 
     def evaluation(self, step: int, values: dict[str, float]) -> None:
         self._write({"step": step, "eval": values})
         best = [f"{name} {value:.3f}" for name, value in values.items() if "knn" in name or name.endswith("R@5")]
-        if not self.progress.disable:
-            self.progress.console.print(f"step {step}: " + ", ".join(best), soft_wrap=True, highlight=False)
+        self.say(f"step {step}: " + ", ".join(best))
+
+    def say(self, text: str) -> None:
+        """``text`` on a line of its own above the progress."""
+        if self.bars:
+            self.bars.say(text)
 
     def _write(self, entry: dict[str, Any]) -> None:
         with naming(self.path):
@@ -80,26 +89,29 @@ class Log:
             logger(entry["step"], flat)
 
 
-def bars(console: Console, **options: Any) -> Progress:
-    """Bars of runs in other processes; each task has a field ``text`` (``last_line``)."""
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, TextColumn("{task.fields[text]}"), console=console, **options)
-
-
-def last_line(run: Path) -> tuple[int, str]:
-    """The step that the run in a folder has come to, and what its log says of it."""
+def last_line(run: Path) -> dict[str, Any]:
+    """The last line that the log of the run in a folder has about its losses; {} if there is none yet."""
     try:
         lines = (run / "log.jsonl").read_text().splitlines()
     except OSError:  # not there yet
-        return 0, ""
+        return {}
     for line in reversed(lines):
         try:
             entry = json.loads(line)
         except ValueError:  # being written
             continue
         if "loss" in entry:
-            return entry["step"], f"loss {entry['loss']:.2f}  {entry['pairs_per_s']:.0f}/s"
-    return 0, ""
+            return entry
+    return {}
+
+
+def in_a_bar(line: dict[str, Any], num_steps: int, batch_size: int) -> dict[str, Any]:
+    """What a bar (``progress.Bars``) shows of a run in another process, by the last ``line`` of its log."""
+    if not line:
+        return {"completed": 0, "left": None, "speed": None}
+    step, speed = line["step"], line["pairs_per_s"]
+    left = (num_steps - step) * batch_size / max(speed, 1e-9)
+    return {"completed": step, "left": left, "speed": speed, "text": f"loss {line['loss']:.2f}"}
 
 
 LOGGERS = ("tensorboard", "wandb", "trackio")

@@ -10,6 +10,7 @@ import math
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
@@ -17,18 +18,18 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.methods.base import Method
-from mvitac.model import Model
+from mvitac.model import Model, precision_of
 from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run
-from mvitac.system.device import describe, pick_device
+from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.distributed import World, join, local_device, synchronise_norms
 from mvitac.system.files import brief, check_place, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.log import Log, Logger
+from mvitac.training.log import EARLY, Log, Logger
 from mvitac.training.sampler import mix, training_rows
 from mvitac.training.step import Step
 from mvitac.training.validation import evaluate
@@ -67,10 +68,11 @@ def train(
 
 
 def _train(
-    run: Run, out: Path, world: World, *, resume: bool, quiet: bool, loggers: tuple[Logger, ...], pack: Pack | None
+    asked: Run, out: Path, world: World, *, resume: bool, quiet: bool, loggers: tuple[Logger, ...], pack: Pack | None
 ) -> Path:
     """``train`` for the one process that does, and its ranks."""
-    device = pick_device(local_device(run.device))
+    device = pick_device(local_device(asked.device))
+    run = replace(asked, precision=_precision(asked, device, world))
     if world.rank:
         world.wait()  # rank 0 simulates or packs what is not there yet, the others find it
     pack = pack or run.data.open(quiet=quiet or not world.writes)
@@ -82,9 +84,10 @@ def _train(
     _check_world(run, world)
     again = (out / "run.json").exists()
     if again:
-        check_same(run, pack, out)
-    if again and (out / "model.safetensors").exists():
-        return out  # resumed after its end
+        begun = check_same(asked, pack, out)
+        if (out / "model.safetensors").exists():
+            return out  # resumed after its end
+        _check_begun(begun, asked, run, out)
 
     if device.type == "cpu":
         keep_freed_memory()
@@ -101,13 +104,17 @@ def _train(
         start = checkpoint.restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
     world.same_everywhere(replicated(method))  # and no one writes before all have looked
     if not again and world.writes:
-        record = {"run": to_json(run), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
-        write_json(out / "run.json", {**record, "device": describe(device), **provenance()})
+        record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
+        here = {"device": describe(device), "precision": run.precision}
+        write_json(out / "run.json", {**record, **here, **provenance()})
     every = run.checkpoint_every or max(1, num_steps // 10)
     method.train()
 
-    log_here = Log(out, start, num_steps, quiet, loggers) if world.writes else nullcontext()
+    telling = {"quiet": quiet, "loggers": loggers}
+    log_here = Log(out, start, num_steps, run.batch_size, **telling) if world.writes else nullcontext()
     with log_here as log, _stop_signals() as stopped:
+        if log and not quiet:  # not measured for nobody
+            log.say(describe_precision(asked.precision, run.precision, device))
         for at, parts in enumerate(
             feed_parts(run, pack, rows, method.views, device, world, start, num_steps, mirror), start=start
         ):
@@ -115,12 +122,13 @@ def _train(
             losses = step(parts, lr=rate, seed=mix(run.seed, at) + 1, progress=(at + 1) / num_steps)
 
             done = at + 1
-            report = done % run.log_every == 0 or done == num_steps
+            early = done - start == EARLY < run.log_every
+            report = done % run.log_every == 0 or done == num_steps or early
             if report:
                 values = {name: float(value) for name, value in losses.items()}  # the only place that waits for a GPU
                 _check_finite(values, done, run)
                 if log:
-                    log.step(done, values, rate, run.batch_size)
+                    log.step(done, values, rate)
             stopping = stopped() if world.size == 1 else report and world.anyone(stopped())
             saving = done == num_steps or done % every == 0 or stopping
             if saving:
@@ -177,11 +185,29 @@ def _check_world(run: Run, world: World) -> None:
         )
 
 
-def check_same(run: Run, pack: Pack, out: Path) -> None:
-    """ValueError unless the folder ``out`` is that of ``run`` on ``pack``."""
+def _precision(run: Run, device: torch.device, world: World) -> str:
+    """``run.precision`` on ``device``; auto is bf16 only where every process has it."""
+    precision = pick_precision(run.precision, device)
+    return "fp32" if run.precision == "auto" and world.anyone(precision == "fp32") else precision
+
+
+def check_same(run: Run, pack: Pack, out: Path) -> str:
+    """The precision in which ``out`` was begun; ValueError unless it is that of ``run`` on ``pack``, where auto is any."""
     old, record = load_run(out)
-    if old.digest() != run.digest() or record.get("pack") != pack.digest:
+    begun = precision_of(old, record)
+    same = replace(run, precision=begun) if run.precision == "auto" else run
+    if replace(old, precision=begun).digest() != same.digest() or record.get("pack") != pack.digest:
         raise ValueError(f"{out} holds a different run (other settings or data): give the same ones, or another --out")
+    return begun
+
+
+def _check_begun(begun: str, asked: Run, run: Run, out: Path) -> None:
+    """Refuse to go on in another precision than the run in ``out`` was ``begun`` in: the weights would be no run's."""
+    if begun != run.precision:
+        raise ValueError(
+            f"{out} was begun in {begun}, and --precision {asked.precision} means {run.precision} on this machine:"
+            f" continue it with --precision {begun}, or delete it to start over in {run.precision}"
+        )
 
 
 @torch.no_grad()

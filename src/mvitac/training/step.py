@@ -1,4 +1,4 @@
-"""One optimiser step: forward, losses, backward, update; fast or small, and equal to the plain one (tests/test_step.py).
+"""One optimiser step: forward, losses, backward, update; fast or small, and equal to the plain one (tests/training).
 
 A batch comes as parts, functions that make its views anew, the same each time. One part is the plain step. Several are
 gradient caching (Gao et al., arXiv:2101.06983): every part is embedded without a graph, the losses are taken over all
@@ -26,7 +26,7 @@ class Step:
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world = method, device, world or World()
-        self.bf16 = run.precision == "bf16"
+        self.bf16 = run.bf16
         self.optimiser = build_optimiser(run.optim, method)
         if (run.chunk or self.world.size > 1) and not isinstance(method, Contrastive):
             raise ValueError(

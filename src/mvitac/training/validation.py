@@ -31,13 +31,13 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     val_rows = pack.rows("val", having=whole)
     held_out = len(val_rows) > 1
     panel_rows = some(val_rows, NUM_EVAL_VAL) if held_out else train_rows[:NUM_EVAL_VAL]
-    z = {m: pack_features(model, pack, m, panel_rows, precision=run.precision) for m in model.encoders}
+    z = {m: pack_features(model, pack, m, panel_rows, bf16=run.bf16) for m in model.encoders}
     values: dict[str, float] = {}
     for modality, features in z.items():
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
     if held_out:
-        bank = {m: pack_features(model, pack, m, train_rows, precision=run.precision) for m in model.encoders}
+        bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in model.encoders}
         for task in pack.spec.tasks:
             known, asked = (torch.from_numpy(pack.labels(task.name, split)) for split in ("train", "val"))
             keep_bank, keep = known[train_rows] >= 0, asked[panel_rows] >= 0
@@ -53,7 +53,7 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     if len(model.projectors) == 2:
         device = next(model.parameters()).device
         if run.augment.size != run.augment.eval_size:
-            z = {m: pack_features(model, pack, m, panel_rows, for_heads=True, precision=run.precision) for m in z}
+            z = {m: pack_features(model, pack, m, panel_rows, for_heads=True, bf16=run.bf16) for m in z}
         shared = {m: model.project(m, z[m].to(device)).cpu() for m in z}
         groups = torch.from_numpy(np.unique(pack.column("group")[panel_rows], return_inverse=True)[1])
         values["alignment"] = diagnostics.alignment(shared["vision"], shared["touch"])

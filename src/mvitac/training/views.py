@@ -89,7 +89,7 @@ def make_views(
     sources = dict.fromkeys(pack.spec.modalities, views)
     if run.positives == "same-touch-pairs" and num_views == 1:
         sources["touch"] = [partners(pack, rows, generator)]
-    dtype = torch.bfloat16 if run.precision == "bf16" else torch.float32
+    dtype = torch.bfloat16 if run.bf16 else torch.float32
     images: dict[str, list[Tensor]] = {}
     for modality in pack.spec.modalities:
         config, images[modality] = getattr(run.augment, modality), []

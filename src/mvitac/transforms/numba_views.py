@@ -1,4 +1,4 @@
-"""The CPU's views in one pass per image: crop, resize, flip, grayscale, normalisation; compiled by numba (extra ``fast``).
+"""The CPU's views in one pass per image: crop, resize, flip, grayscale, normalisation; compiled by numba.
 
 The fixed-point arithmetic of torch's antialiased uint8 resize, so its levels bit for bit. Each direction is weighted sums
 of whole lines (of the rows as they lie along the height, of gathered pixels along the width), which LLVM makes vectors of.

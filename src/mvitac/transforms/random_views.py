@@ -141,7 +141,7 @@ def apply(
 
 @cache
 def fused() -> ModuleType | None:
-    """``mvitac.transforms.numba_views``, where a numba that works with this numpy is installed (extra ``fast``)."""
+    """``mvitac.transforms.numba_views``, where a numba that works with this numpy is installed."""
     try:
         from mvitac.transforms import numba_views
     except ImportError:

@@ -1,0 +1,102 @@
+"""ONNX files, their int8 versions, and which CPU an int8 version is for.
+
+A CPU without VNNI adds pairs of 8-bit products in 16 bits, and what does not fit is cut off (it saturates). With weights
+of 7 bits the sums fit; this is onnxruntime's ``reduce_range`` and OpenVINO's overflow fix.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from mvitac.deploy.engine import FILES, open_engine
+
+Target = Literal["auto", "avx2", "vnni"]
+"""CPU of an int8 export: avx2 = any (7-bit weights), vnni = 8-bit weights, for CPUs that do not saturate (x86 with VNNI
+or AMX, ARM), auto = this machine's."""
+
+
+def write_onnx(
+    module: torch.nn.Module,
+    inputs: tuple[torch.Tensor, ...],
+    folder: Path,
+    names: list[str],
+    outputs: list[str],
+    shapes: Any,
+) -> Path:
+    """``module`` as model.onnx in ``folder``."""
+    path = folder / "model.onnx"
+    torch.onnx.export(
+        module,
+        inputs,
+        path,
+        dynamo=True,
+        dynamic_shapes=shapes,
+        input_names=names,
+        output_names=outputs,
+        opset_version=18,
+        external_data=False,
+        verbose=False,
+    )
+    return path
+
+
+def to_openvino(path: Path) -> None:
+    """Write the ONNX file for OpenVINO too, into the same folder."""
+    import openvino
+
+    openvino.save_model(openvino.convert_model(path), path.with_name(FILES["openvino"][0]), compress_to_fp16=False)
+
+
+def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]], *, seven_bits: bool) -> None:
+    """Replace the ONNX file by its int8 version: weights per channel, activations by ranges seen on ``examples``."""
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+    from onnxruntime.quantization.shape_inference import quant_pre_process
+
+    class Reader(CalibrationDataReader):
+        def __init__(self) -> None:
+            self.left = iter(examples)
+
+        def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
+            example = next(self.left, None)
+            return None if example is None else dict(zip(inputs, example, strict=True))
+
+    prepared = path.with_name("prepared.onnx")
+    quant_pre_process(str(path), str(prepared), skip_symbolic_shape=True)
+    quantize_static(
+        str(prepared),
+        str(path),
+        Reader(),
+        quant_format=QuantFormat.QDQ,
+        activation_type=QuantType.QUInt8,
+        weight_type=QuantType.QInt8,
+        per_channel=True,
+        reduce_range=seven_bits,
+        op_types_to_quantize=[
+            "Conv",
+            "Add",
+            "MaxPool",
+            "GlobalAveragePool",
+        ],  # heads and probes stay fp32: they are tiny
+    )
+
+
+def this_machine(kind: str) -> Literal["avx2", "vnni"]:
+    """The target of this machine: ``kind``'s engine takes the mean of 576 ones in int8, which saturates at about half.
+
+    Asked of the engine, not of the CPU's flags: it has its own choice of instructions, and variables that restrict it.
+    """
+    conv = torch.nn.Conv2d(64, 64, 3, bias=False).requires_grad_(False)
+    conv.weight.fill_(1 / 576)
+    ones = torch.ones(1, 64, 8, 8)
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_onnx(conv, (ones,), Path(folder), ["ones"], ["mean"], None)
+        quantise(path, ["ones"], [[ones.numpy()]], seven_bits=False)
+        if kind == "openvino":
+            to_openvino(path)
+        found = open_engine(Path(folder), kind)([ones.numpy()])[0]
+    return "vnni" if np.abs(found - 1).max() < 0.02 else "avx2"

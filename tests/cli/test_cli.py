@@ -1,0 +1,174 @@
+"""The command line: quick to answer, a help that is a golden file, and the whole road in one process."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mvitac.cli.main import COMMANDS, HELP, main
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """`mvitac --help` in a fresh interpreter: no torch, numpy, tyro or rich among the modules it loads."""
+    code = "import sys; from mvitac.cli.main import main; main(['--help']); print(sorted(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.startswith(HELP)
+    for heavy in ("torch", "numpy", "tyro", "rich", "mvitac.training"):
+        assert f"'{heavy}'" not in out
+
+
+def test_importing_the_package_imports_no_torch() -> None:
+    code = "import sys, mvitac; print('torch' in sys.modules, 'numpy' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.split() == ["False", "False"]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"), [({}, "10000"), ({"OMP_WAIT_POLICY": "ACTIVE"}, None), ({"GOMP_SPINCOUNT": "7"}, "7")]
+)
+def test_threads_wait_briefly_unless_told_otherwise(given: dict[str, str], expected: str | None) -> None:
+    code = "import os; from mvitac.cli.main import main; main(['--version']); print(os.environ.get('GOMP_SPINCOUNT'))"
+    clean = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    out = subprocess.run([sys.executable, "-c", code], env=clean | given, capture_output=True, text=True, check=True)
+    assert out.stdout.split()[-1] == str(expected)
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_leaves_is_no_error(unbuffered: str) -> None:
+    """As in `mvitac --help | true`: nothing on stderr, and the exit code of what SIGPIPE ends."""
+    inlet, outlet = os.pipe()
+    os.close(inlet)
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run(
+        [sys.executable, "-m", "mvitac", "--help"], stdout=outlet, stderr=subprocess.PIPE, env=environment
+    )
+    os.close(outlet)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_a_pipe_of_its_own_that_breaks_is_one(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(arguments: list[str]) -> int:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr("mvitac.cli.main._run", broken)
+    assert main(["probe"]) == 2
+    assert "Broken pipe" in capsys.readouterr().err
+
+
+def test_help_names_every_command_in_80_columns() -> None:
+    assert all(len(line) <= 80 for line in HELP.splitlines())
+    for name in COMMANDS:
+        assert f"  {name} " in HELP, name
+
+
+def test_pretrain_help_is_golden(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every field of a run with its default and meaning. After a wanted change: MVITAC_GOLDEN=1 pytest -k golden"""
+    import os
+
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setenv("TERM", "dumb")
+    with pytest.raises(SystemExit) as stopped:
+        main(["pretrain", "--recipe", "paper", "--help"])
+    assert stopped.value.code == 0
+    text = "\n".join(line.rstrip() for line in capsys.readouterr().out.splitlines()) + "\n"
+    path = GOLDEN / "pretrain-help.txt"
+    if "MVITAC_GOLDEN" in os.environ:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    assert text == path.read_text()
+
+
+@pytest.mark.parametrize("options", [[], ["--recipe", "paper", "--method", "ssvtp"]])
+def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["pretrain", *options]) == 2
+    said = capsys.readouterr().err
+    for word in (
+        "--data",
+        "folder",
+        "--from RUN.JSON",
+        "mvitac demo",
+        "mvitac pretrain --data materials --recipe demo",
+    ):
+        assert word in said
+
+
+def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """simulate -> info -> pretrain -> probe -> report, as a user types it, on the real simulator."""
+    pack, run, scores = tmp_path / "pack", tmp_path / "run", tmp_path / "scores.json"
+    assert (
+        main(
+            [
+                "data",
+                "simulate",
+                "materials",
+                "--num",
+                "400",
+                "--touches",
+                "2",
+                "--size",
+                "32",
+                "--out",
+                str(pack),
+                "--quiet",
+            ]
+        )
+        == 0
+    )
+    assert main(["data", "info", str(pack)]) == 0
+    assert "category" in capsys.readouterr().out
+    choice = ["--data", "pack", "--data.path", str(pack), "--recipe", "smoke"]
+    assert main(["pretrain", *choice, "--out", str(run), "--quiet"]) == 0
+    assert main(["probe", str(run), "--probes", "knn", "--json", str(scores)]) == 0
+    shown = capsys.readouterr().out
+    summary = json.loads(scores.read_text())["summary"]
+    assert set(summary) == {"category", "soft", "rough"}
+    mean = summary["category"]["touch"]["mvitac"]["mean"]
+    assert f"{100 * mean:.1f} [" in shown
+    assert "\n95 % intervals: bootstrap over test instances and seeds.\n" in shown
+    assert main(["report", str(run), "--probe", str(scores), "--out", str(tmp_path / "report")]) == 0
+    assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
+
+
+def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = [
+        "--data.num",
+        "800",
+        "--data.touches",
+        "2",
+        "--data.size",
+        "32",
+        "--augment.size",
+        "32",
+        "--augment.whole",
+        "32",
+    ]
+    tiny = ["--encoder.trunk", "mvitac_tiny", "--steps", "2", "--batch-size", "16", "--precision", "fp32"]
+    command = ["demo", "--out", str(tmp_path / "demo"), "--seeds", "2", *small, *tiny]
+    assert main(command) == 0
+    summary = json.loads((tmp_path / "demo" / "summary.json").read_text())
+    for modality in ("touch", "vision", "both"):
+        cell = summary["category"][modality]["mvitac"]
+        assert set(cell) == {"mean", "low", "high", "seeds"} and cell["seeds"] == [0, 1]
+        assert cell["low"] <= cell["mean"] <= cell["high"]
+    trained = json.loads((tmp_path / "demo" / "seed0" / "run.json").read_text())["run"]
+    assert trained["recipe"] == "quick" and trained["method"]["keys"] == "end-to-end"
+    shown = capsys.readouterr().out
+    assert "recipe quick: " in shown and "2 steps of 16 pairs" in shown
+    assert "report.html" in shown and "majority" in shown
+    assert "pre-training: 4/4 steps in" in shown  # of both seeds; no terminal: a line instead of bars
+    weights = tmp_path / "demo" / "seed1" / "model.safetensors"
+    before = weights.stat().st_mtime_ns
+    assert main(command) == 0
+    assert weights.stat().st_mtime_ns == before

@@ -1,0 +1,491 @@
+"""The doctor: a healthy dataset is called healthy, and each of sixteen faults is called by its name and nothing else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.checks.contact_sheet import MISSING, strips_of
+from mvitac.data.checks.examine import examine, examine_pack, examine_source
+from mvitac.data.checks.finding import Finding, exit_code
+from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
+from mvitac.data.checks.image_stats import area_means, look_at
+from mvitac.data.pack import Pack
+from mvitac.data.source import Count, Sample, Source
+from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.folder import FolderConfig
+
+NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32
+TEST, VAL = (3, 8, 13, 18), (4, 9)
+
+
+@dataclass
+class Presses(Source):
+    """20 objects of 3 materials, each filmed and touched for 16 frames in which it slides at varying speed.
+
+    A camera sees the object's texture on a brown table, a gel of blue and red light the bump it makes. ``fault`` breaks
+    one thing.
+    """
+
+    fault: str = ""
+
+    def spec(self) -> DataSpec:
+        return DataSpec(
+            name="presses",
+            vision_channels=3,
+            touch_channels=3,
+            tasks=(Task(name="material", classes=("wood", "metal", "cloth")),),
+            group_by="object",
+            licence="none",
+            source="tests/data/checks/test_checks.py",
+        )
+
+    def items(self) -> list[str]:
+        return [f"object {obj} frame {k}" for obj in range(NUM_OBJECTS) for k in range(NUM_FRAMES)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"presses": self.fault}
+
+    def expected(self) -> list[Count]:
+        num = NUM_OBJECTS + (self.fault == "published")
+        return [Count("objects", num, NUM_OBJECTS, "missing 20" if num > NUM_OBJECTS else "")]
+
+    def read(self, item: int) -> list[Sample]:
+        obj, k = divmod(item, NUM_FRAMES)
+        fault, held_out = self.fault, obj in TEST
+        if fault == "unreadable" and item % 40 == 7:
+            raise ValueError("broken on purpose")
+        shown, frame = obj, k
+        if fault == "copies" and held_out and k == 0:
+            shown = 0  # the very pictures of object 0
+        if fault == "near-copies" and held_out and k < 4:
+            shown = 0
+        vision = camera(shown, frame)
+        touch = gel(shown, max(0, frame - 2) if fault == "offset" else frame)
+        if fault == "near-copies" and shown != obj:
+            noise = np.random.default_rng(item)
+            vision, touch = (
+                np.clip(0.94 * i + 6 + noise.normal(0, 1, i.shape), 0, 255).astype(np.uint8) for i in (vision, touch)
+            )
+        if fault == "constant" and item % 50 == 3:
+            touch = np.full_like(touch, 7)
+        if fault == "bgr" and obj in (2, 5, 8):
+            touch = touch[:, :, ::-1].copy()
+        if fault == "gray" and obj == 6:
+            vision = np.repeat(vision.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+        if fault == "swapped" and obj == 7:
+            vision, touch = touch, vision
+        if fault == "sizes" and obj % 4 == 1:
+            vision = np.repeat(np.repeat(vision, 2, axis=0), 2, axis=1)
+        material = obj % 3
+        columns: dict[str, Any] = {
+            "id": f"{obj:02d}-{k:02d}",
+            "group": f"object {0 if fault == 'leak' and held_out and k == 2 else obj}",
+            "touch_group": f"touch {obj}",
+            "split": "test" if held_out else "val" if obj in VAL else "train",
+            "label_material": material,
+            "seq": k,
+            "sensor": "a" if obj // 3 % 2 else "b",
+            "force": 1.0 + (obj * 7 + k * 5) % 11,
+        }
+        if fault == "labels" and item % 30 == 1:
+            columns["label_material"] = -1
+        if fault == "unseen class":
+            columns["label_material"] = 2 if held_out else obj % 2
+        if fault == "numbers" and item == 41:
+            columns["force"] = float("nan")
+        if fault == "range" and item == 41:
+            columns["force"] = 1e6
+        if fault == "sensor":
+            columns["sensor"] = f"lab {material}"
+        if fault == "give-away":
+            columns["force"] = material + (obj * 7 + k * 5) % 11 / 10
+        return [Sample(vision=vision, touch=touch, columns=columns)]
+
+
+def path_of(obj: int) -> np.ndarray:
+    """[NUM_FRAMES] positions in pixels: a slide in bursts, another for every object."""
+    steps = np.random.default_rng([5, obj]).choice([0.05, 0.3, 1.6], NUM_FRAMES)
+    return np.cumsum(steps)
+
+
+def camera(obj: int, k: int) -> np.ndarray:
+    rng = np.random.default_rng([1, obj])
+    y, x = np.mgrid[0:SIDE, 0:SIDE].astype(float)
+    shift = path_of(obj)[k]
+    waves = sum(np.sin((x - shift) * a + y * b + c) for a, b, c in rng.uniform((0.2, 0.2, 0), (1, 1, 6), (4, 3)))
+    colour = np.array([130, 100, 70]) + rng.uniform(-60, 60, 3)
+    inside = (np.abs(x - 16) < 12) & (np.abs(y - 16) < 12)
+    image = np.where(inside[:, :, None], colour + 22 * np.asarray(waves)[:, :, None], np.array([120.0, 95, 70]))
+    return noisy(image, [2, obj, k])
+
+
+def gel(obj: int, k: int) -> np.ndarray:
+    y, x = np.mgrid[0:SIDE, 0:SIDE].astype(float)
+    rng = np.random.default_rng([3, obj])
+    left, top, wide, angle = rng.uniform((5, 9, 2, 0), (11, 23, 4, 3))
+    u, v = x - left - path_of(obj)[k], y - top
+    u, v = u * np.cos(angle) + v * np.sin(angle), v * np.cos(angle) - u * np.sin(angle)
+    bump = 80 * np.exp(-((u / wide) ** 2) - (v / (7 - wide)) ** 2) * np.sin(u + obj)
+    image = np.stack([60 + 3 * x + bump, 90 + bump, 170 - 2 * x - bump], axis=2)
+    return noisy(image, [4, obj, k])
+
+
+def noisy(image: np.ndarray, seed: list[int]) -> np.ndarray:
+    return np.clip(image + np.random.default_rng(seed).normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+
+
+def check(fault: str, tmp_path: Path) -> dict[str, Finding]:
+    source = Presses(fault)
+    pack = build(source, tmp_path / "pack", size=SIDE, max_damaged=1.0, quiet=True)
+    return {finding.item: finding for finding in examine(pack, source.expected())}
+
+
+def test_the_healthy_one_is_healthy(tmp_path: Path) -> None:
+    findings = check("", tmp_path)
+    assert {f.item: f.evidence for f in findings.values() if f.verdict != "ok"} == {}
+    assert exit_code(findings.values()) == 0
+    assert "best" in findings["time offset between streams"].evidence
+
+
+FAULTS = {
+    "unreadable": ("unreadable items", "broken", "object 0 frame 7: broken on purpose"),
+    "constant": ("constant frames", "look", "touch: 7 of 320 (2.2 %), first 00-03"),
+    "bgr": ("red and blue swapped", "look", "whole groups: object 2, object 5, object 8"),
+    "gray": ("grayscale among colour", "look", "vision: 16 of 320"),
+    "swapped": ("vision and touch swapped", "look", "whole groups: object 7"),
+    "offset": ("time offset between streams", "look", "touch comes 2 rows late"),
+    "unseen class": ("classes of material", "broken", "tested but never seen in training: cloth"),
+    "copies": ("identical images across splits", "broken", "vision: 5 of 320"),
+    "near-copies": ("near-copies across splits", "look", "vision: 16 of"),
+    "leak": ("groups across splits", "broken", "e.g. 'object 0'; 1 of 5 in test are also in train"),
+    "labels": ("missing labels", "look", "first 00-01"),
+    "numbers": ("numbers", "look", "force is no number in 1 of 320 (0.3 %), first row 41"),
+    "range": ("numbers", "look", "force is 1e+06 in row 41"),
+    "sensor": ("sensors and resolutions", "look", "sensor alone tells material to 100 %"),
+    "give-away": ("columns that give a label away", "look", "force tells material to 91 %"),
+    "published": ("published: objects", "look", "20 found, 21 published; missing 20"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_is_named_and_nothing_else(fault: str, tmp_path: Path) -> None:
+    item, verdict, evidence = FAULTS[fault]
+    findings = check(fault, tmp_path)
+    assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {item}
+    assert (findings[item].verdict, evidence in findings[item].evidence) == (verdict, True), findings[item].evidence
+    assert findings[item].advice
+    assert exit_code(findings.values()) == {"look": 1, "broken": 2}[verdict]
+
+
+# -- the source and the pack --------------------------------------------------------------------------------------------
+
+
+def test_a_source_is_examined_as_it_came(tmp_path: Path) -> None:
+    """Only the source knows how large the images were; the pack made of it does not, and says so."""
+    findings, strips = examine_source(Presses("sizes"), size=SIDE, quiet=True)
+    found = {f.item: f for f in findings}["sensors and resolutions"]
+    assert found.verdict == "look" and "vision_size: 32 x 32 75 %, 64 x 64 25 %" in found.evidence
+    assert "vision_size 32 x 32 75 %" not in check("sizes", tmp_path)["sensors and resolutions"].evidence
+    assert not strips
+
+
+def test_images_that_a_reader_shrinks_keep_their_size(tmp_path: Path) -> None:
+    """Readers of files hand over images as the pack will store them: the sizes told are those on the disk."""
+    rng = np.random.default_rng(0)
+    rows = ["touch,label,group"]
+    for i in range(16):
+        size = (48, 64, 3) if i < 4 else (24, 32, 3)
+        Image.fromarray(rng.integers(0, 256, size, np.uint8)).save(tmp_path / f"{i}.png")
+        rows.append(f"{i}.png,{'ab'[i % 2]},g{i // 2}")
+    (tmp_path / "m.csv").write_text("\n".join(rows))
+    source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), size=40).source()
+    findings, _ = examine_source(source, size=SIDE, quiet=True)
+    found = {f.item: f for f in findings}["sensors and resolutions"]
+    assert found.verdict == "look" and "touch_size: 32 x 24 75 %, 64 x 48 25 %" in found.evidence
+
+
+def test_a_part_of_a_source_is_spread_over_it() -> None:
+    findings, _ = examine_source(Presses(), num=40, size=SIDE, quiet=True)
+    assert findings[0].evidence == "presses: 40 of 320 items examined, kept at 32 px"
+    assert {f.item: f for f in findings}["classes of material"].verdict == "ok"
+
+
+def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
+    rows = ["touch,label,object,split"]
+    for i in range(60):
+        noise = np.random.default_rng(i).integers(0, 255, (16, 16, 3), np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"{i}.png")
+        rows.append(f"{i}.png,c{i % 10},{i},{'train' if i < 40 else 'test'}")
+    (tmp_path / "m.csv").write_text("\n".join(rows))
+    source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), group="object", size=16).source()
+    for num, verdict in ((0, "ok"), (12, "look")):
+        findings, _ = examine_source(source, num=num, size=16, quiet=True)
+        found = {f.item: f for f in findings}["classes of label"]
+        assert found.verdict == verdict and exit_code(findings) <= ("ok", "look").index(verdict)
+    assert found.evidence.startswith("in the items examined: 10 classes") and "never seen in training" in found.evidence
+
+
+def test_paths_with_brackets_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "set [left]" / "[/red]"  # would end rich's markup
+    build(Presses(), path, size=SIDE, quiet=True)
+    for arguments in (["info"], ["check"], ["show", "--limit", "1", "--out", f"{path}.png"]):
+        assert main(["data", arguments[0], str(path), *arguments[1:]]) == 0
+        assert "set[left]/[/red]" in "".join(capsys.readouterr().out.split())  # wherever the line was broken
+
+
+def test_a_damaged_pack_names_its_row_and_training_refuses_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "pack"
+    build(Presses(), path, size=SIDE, quiet=True)
+    images = np.lib.format.open_memmap(path / "vision.npy", mode="r+")
+    images[137, 5, 5, 0] ^= 1
+    images.flush()
+    findings, _ = examine_pack(path)
+    assert [f.verdict for f in findings] == ["broken"] and exit_code(findings) == 2
+    assert "vision.npy does not match its digest in 1 of 320 rows, first row 137 (id '08-09')" in findings[0].evidence
+    command = ["pretrain", "--data", "pack", "--data.path", str(path), "--recipe", "smoke"]
+    assert main([*command, "--out", str(tmp_path / "run")]) == 2
+    assert "first row 137 (id '08-09')" in capsys.readouterr().err
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit codes 0, 1, 2; the JSON says what the table says; the sheet shows the rows themselves."""
+    codes = {}
+    for fault in ("", "constant", "copies"):
+        path = tmp_path / f"pack {fault}"
+        build(Presses(fault), path, size=SIDE, quiet=True)
+        options = ["--json", str(tmp_path / f"{fault or 'fine'}.json")]
+        options += ["--sheet", str(tmp_path / f"{fault or 'fine'}.png")]
+        codes[fault] = main(["data", "check", str(path), *options])
+    assert codes == {"": 0, "constant": 1, "copies": 2}
+    assert not capsys.readouterr().err
+    told = json.loads((tmp_path / "constant.json").read_text())
+    assert told["exit_code"] == 1
+    found = next(f for f in told["findings"] if f["item"] == "constant frames")
+    assert found["verdict"] == "look" and found["rows"] == [3, 53, 103, 153, 203, 253, 303]
+    with Image.open(tmp_path / "constant.png") as sheet:
+        pixels = np.asarray(sheet)
+    assert (pixels[60, 110] == 7).all() and (pixels[60, 300] == 7).all()  # the touch halves of the first two rows
+
+
+def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    rows = ["touch,label,group,split"]
+    for i in range(40):
+        Image.fromarray(rng.integers(0, 256, (24, 24, 3), np.uint8)).save(tmp_path / f"{i}.png")
+        rows.append(f"{i}.png,{'ab'[i % 2]},g{i // 2},{'test' if i < 10 else 'train'}")
+    (tmp_path / "5.png").write_bytes(b"not a picture")
+    (tmp_path / "m.csv").write_text("\n".join(rows))
+    command = ["data", "check", "--data", "folder", "--data.path", str(tmp_path / "m.csv"), "--labels", "label"]
+    command += ["--quiet", "--workers", "1"]
+    assert main(command) == 2
+    assert "row 6: " in capsys.readouterr().out
+    (tmp_path / "m.csv").write_text("\n".join([*rows, "30.png,a,g0,train"]))  # g0 is in test
+    assert main([*command, "--json", str(tmp_path / "leak.json")]) == 2
+    told = {f["item"]: f for f in json.loads((tmp_path / "leak.json").read_text())["findings"]}
+    assert told["groups across splits"]["verdict"] == told["unreadable items"]["verdict"] == "broken"
+    assert "group (group): 1 of 20 on two sides, e.g. 'g0'" in told["groups across splits"]["evidence"]
+    assert main([*command, "--sheet", "sheet.jpg"]) == 2
+    assert "ends in .png" in capsys.readouterr().err
+    assert main(["data", "check", str(tmp_path / "nothing")]) == 2
+    assert "no pack at" in capsys.readouterr().err
+
+
+# -- the parts ----------------------------------------------------------------------------------------------------------
+
+
+def test_area_means_count_every_pixel_once() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (2, 12, 12, 3), np.uint8)
+    expected = image.reshape(2, 4, 3, 4, 3, 3).mean(axis=(2, 4)).round()
+    assert np.abs(area_means(image, 4) - expected).max() <= 1
+    assert area_means(np.full((1, 13, 17, 3), 200, np.uint8), 5).tolist() == np.full((1, 5, 5, 3), 200).tolist()
+
+
+@pytest.mark.parametrize("late", [-3, 0, 2])
+def test_the_lag_is_touch_after_vision(late: int, tmp_path: Path) -> None:
+    """Brightness jumps of the same sizes in both streams, in touch ``late`` rows after vision; the signs are random."""
+
+    @dataclass
+    class Flashes(Presses):
+        def read(self, item: int) -> list[Sample]:
+            obj, k = divmod(item, NUM_FRAMES)
+            jumps = np.random.default_rng(obj).choice([1, 12], NUM_FRAMES + 20)
+            level = 128 + np.cumsum(jumps * np.resize([1, -1], len(jumps)))
+            sample = super().read(item)[0]
+            images = [np.full((SIDE, SIDE, 3), level[10 + k - shift], np.uint8) for shift in (0, late)]
+            return [Sample(vision=images[0], touch=images[1], columns=sample.columns)]
+
+    pack = build(Flashes(), tmp_path / "p", size=SIDE, quiet=True)
+    curves = motion_correlations(pack, look_at(pack), pack.column("seq").astype(float))
+    assert curves.mean(0).argmax() - MAX_LAG == late
+    assert len(curves) == NUM_OBJECTS
+
+
+def test_what_cannot_be_checked_is_said_and_costs_nothing(tmp_path: Path) -> None:
+    @dataclass
+    class TouchOnly(Presses):
+        def spec(self) -> DataSpec:
+            spec = super().spec()
+            return DataSpec(**{**spec.__dict__, "vision_channels": 0, "touch_channels": 6})
+
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            assert sample.touch is not None
+            columns = {name: value for name, value in sample.columns.items() if name not in ("seq", "sensor")}
+            both = np.concatenate([sample.touch, sample.touch[::-1]], axis=2)
+            return [Sample(vision=None, touch=both, columns=columns)]
+
+    pack = build(TouchOnly(), tmp_path / "p", size=SIDE, quiet=True)
+    findings = {f.item: f for f in examine(pack)}
+    cannot = {item for item, f in findings.items() if f.verdict == "not checkable"}
+    assert cannot == {"vision and touch swapped", "time offset between streams", "sensors and resolutions"}
+    assert "touch 2: all in one order" in findings["red and blue swapped"].evidence
+    assert exit_code(findings.values()) == 0
+
+
+def test_missing_images_are_no_faults_of_the_others(tmp_path: Path) -> None:
+    """A third of the rows without vision: no constant frames, no copies; only a split without any is worth a look."""
+
+    class Gaps(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            gone = item // NUM_FRAMES in TEST if self.fault == "test" else item % 3 == 1
+            columns = {**sample.columns, "has_vision": not gone}
+            return [Sample(vision=None if gone else sample.vision, touch=sample.touch, columns=columns)]
+
+    for fault in ("", "test"):
+        findings, _ = examine_source(Gaps(fault), size=SIDE, quiet=True)
+        told = {f.item: f for f in findings}
+        wrong = {f.item for f in findings if f.verdict in ("look", "broken")}
+        assert wrong == ({"missing images"} if fault else set())
+        assert f"{64 if fault else 107} of 320" in told["missing images"].evidence
+    assert "no row of test has vision" in told["missing images"].evidence
+
+
+def test_a_gap_is_gray_on_the_sheet(tmp_path: Path) -> None:
+    """Black would say that the camera was covered."""
+
+    class Blind(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            columns = {**sample.columns, "has_vision": item != 3}
+            return [replace(sample, vision=sample.vision if item != 3 else None, columns=columns)]
+
+    pack = build(Blind("constant"), tmp_path / "p", size=SIDE, quiet=True)
+    ((_, first), *_), *_ = strips_of(pack, examine(pack)).values()
+    assert (first[:, :96] == MISSING).all() and (first[:, 96:] == 7).all()
+
+
+def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:
+    """As Touch and Go's rough/smooth: its lists divide recordings otherwise than those of the categories, and of those
+    that they divide they may leave frames out."""
+
+    @dataclass
+    class Otherwise(Presses):
+        def spec(self) -> DataSpec:
+            spec = super().spec()
+            other = Task(name="rough", classes=("smooth", "rough"), split="split_rough")
+            return replace(spec, tasks=(*spec.tasks, other))
+
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            obj = item // NUM_FRAMES
+            # By ``split`` no object of class 1 is learned from; by its own column both classes are on both sides.
+            own = {"label_rough": int(obj in TEST), "split_rough": "test" if obj in (3, 8, 0, 1) else "train"}
+            if item % NUM_FRAMES == 9 and obj > 8:
+                own = {"label_rough": -1, "split_rough": "test"}
+            return [replace(sample, columns={**sample.columns, **own})]
+
+    findings = {f.item: f for f in examine(build(Otherwise(), tmp_path / "p", size=SIDE, quiet=True))}
+    assert findings["classes of rough"].verdict == "ok"
+    assert "always saying 'smooth' scores 50.0 % on test" in findings["classes of rough"].evidence
+    assert "rough: 11 of 75 (14.7 %) in test, first 09-09" in findings["missing labels"].evidence
+    assert {f.item for f in findings.values() if f.verdict in ("look", "broken")} == {"missing labels"}
+    assert findings["groups across split columns"].evidence.startswith("split_rough: none of group")
+
+
+def test_names_of_groups_are_no_measurements(tmp_path: Path) -> None:
+    """20220319_002026 is a recording, though Python reads the number 20220319002026 in it."""
+
+    @dataclass
+    class Recordings(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            obj = item // NUM_FRAMES
+            day = obj % 3 * 100 + obj  # sorted by material
+            own = {"group": f"{day}", "touch_group": f"2022_{day:06d}", "take": f"{day}_0", "day": str(day)}
+            return [replace(sample, columns={**sample.columns, **own})]
+
+    findings = {f.item: f for f in examine(build(Recordings(), tmp_path / "p", size=SIDE, quiet=True))}
+    assert findings["columns that give a label away"].verdict == "ok"
+
+
+def test_a_label_as_its_table_wrote_it_is_no_measurement(tmp_path: Path) -> None:
+    """An empty cell is an unlabelled row there, which is no number to repair."""
+
+    class Table(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            written = {"material": "" if item % 16 == 9 else str(sample.columns["label_material"])}
+            return [replace(sample, columns={**sample.columns, **written})]
+
+    findings = {f.item: f for f in examine(build(Table(), tmp_path / "p", size=SIDE, quiet=True))}
+    assert findings["numbers"].verdict == "ok"
+
+
+def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
+    @dataclass
+    class Untested(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            colours = np.random.default_rng(item).integers(0, 256, (2, 1, 1, 3), np.uint8)
+            vision, touch = (np.full((SIDE, SIDE, 3), c, np.uint8) for c in colours)
+            vision[:4], touch[:4] = 0, 0
+            return [Sample(vision=vision, touch=touch, columns={**sample.columns, "split": "train"})]
+
+    findings = {f.item: f for f in examine(build(Untested(), tmp_path / "p", size=SIDE, quiet=True))}
+    near, colour = findings["near-copies across splits"], findings["red and blue swapped"]
+    assert (near.verdict, near.evidence) == ("not checkable", "vision: all on one side; touch: all on one side")
+    assert colour.verdict == "not checkable" and "colours vary too much to tell" in colour.evidence
+
+
+def test_other_keys_and_other_splits_are_looked_at_too(tmp_path: Path) -> None:
+    """Touch and Go's own split: touches are apart, recordings are not. And a fold column that cuts objects in two."""
+
+    @dataclass
+    class Recorded(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            obj, k = divmod(item, NUM_FRAMES)
+            extra = {"recording": f"day {obj // 5}", "fold1": "test" if k < 4 else "train"}
+            return [Sample(vision=sample.vision, touch=sample.touch, columns={**sample.columns, **extra})]
+
+    pack = build(Recorded(), tmp_path / "p", size=SIDE, quiet=True)
+    findings = {f.item: f for f in examine(pack)}
+    own, fold = findings["groups across splits"], findings["groups across column fold1"]
+    assert own.verdict == "look" and "recording: 4 of 4 on two sides" in own.evidence
+    assert "4 of 4 in test are also in train" in own.evidence
+    assert fold.verdict == "broken" and "group (object): 20 of 20 on two sides" in fold.evidence
+
+
+def test_half_a_dataset_in_the_other_order_is_seen_too(tmp_path: Path) -> None:
+    class Half(Presses):
+        def read(self, item: int) -> list[Sample]:
+            sample = super().read(item)[0]
+            assert sample.touch is not None
+            touch = sample.touch[:, :, ::-1].copy() if item // NUM_FRAMES % 2 else sample.touch
+            return [Sample(vision=sample.vision, touch=touch, columns=sample.columns)]
+
+    pack: Pack = build(Half(), tmp_path / "p", size=SIDE, quiet=True)
+    found = {f.item: f for f in examine(pack)}["red and blue swapped"]
+    assert found.verdict == "look" and "160 of 320 (50.0 %)" in found.evidence

@@ -1,0 +1,160 @@
+"""Two packs as one: learned from is the one's train, scored the other's test, and nothing leaks between them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.pack import PackConfig
+from mvitac.recipes import recipe
+from mvitac.training.loop import train
+from support.toy import Toy, toy_pack
+
+
+class Negative(Toy):
+    """The toy under another sensor, whose touch is inverted and whose classes are numbered otherwise."""
+
+    order = ("checks", "columns", "rows")
+
+    def spec(self) -> DataSpec:
+        spec = super().spec()
+        return replace(spec, name="negative", tasks=(replace(spec.tasks[0], classes=self.order),), controls={})
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        assert sample.touch is not None
+        columns = {**sample.columns, "label_pattern": (sample.columns["label_pattern"] + 1) % 3, "has_touch": True}
+        del columns["label_bright"]
+        return [replace(sample, touch=255 - sample.touch, columns=columns)]
+
+
+@pytest.fixture(scope="module")
+def negative(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Negative(), tmp_path_factory.mktemp("negative") / "p", size=32, quiet=True)
+
+
+def test_train_is_of_the_one_and_test_of_the_other(pack: Pack, negative: Pack) -> None:
+    both = JoinedPack(pack, negative)
+    np.testing.assert_array_equal(both.rows("train", "val"), pack.rows("train", "val"))
+    np.testing.assert_array_equal(both.rows("test"), pack.num + negative.rows("test"))
+    assert both.num == pack.num + negative.num == len(both.column("id")) == len(set(both.column("id")))
+    rows = np.array([pack.num + 3, 5, pack.num, 5])
+    for modality in ("vision", "touch"):
+        images = [negative.images[modality][3], pack.images[modality][5], negative.images[modality][0]]
+        np.testing.assert_array_equal(both.images[modality][rows], [*images, images[1]])
+    assert [task.name for task in both.spec.tasks] == ["pattern"]
+    assert both.spec.tasks[0].classes == pack.spec.tasks[0].classes
+    np.testing.assert_array_equal(both.labels("pattern"), np.tile(pack.labels("pattern"), 2), "classes go by name")
+    assert both.has("touch").all()
+    assert not both.spec.controls
+    assert both.spec.name == f"{negative.path.name}, probes learned on {pack.path.name}"
+    assert both.digest not in (pack.digest, negative.digest)
+    assert JoinedPack(negative, pack).digest != both.digest
+
+
+def test_rows_without_an_image_stay_without(pack: Pack, tmp_path: Path) -> None:
+    class Holes(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            gone = item % 5 == 0
+            return [
+                replace(sample, touch=None if gone else sample.touch, columns={**sample.columns, "has_touch": not gone})
+            ]
+
+    holes = build(Holes(), tmp_path / "p", size=32, quiet=True)
+    both = JoinedPack(pack, holes)
+    np.testing.assert_array_equal(both.has("touch"), np.concatenate([pack.has("touch"), holes.has("touch")]))
+
+
+@pytest.mark.parametrize("column", ["sensor", "phase"])
+def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
+    """A name here, a number there: of no matter in a column beside, an error in one that says what a task is about."""
+
+    class Marked(Toy):
+        mark: object = "during"
+
+        def spec(self) -> DataSpec:
+            spec = super().spec()
+            only = {"phase": "during"} if column == "phase" else {}
+            return replace(spec, tasks=(replace(spec.tasks[0], only=only),))
+
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            return [replace(sample, columns={**sample.columns, column: self.mark})]
+
+    packs = []
+    for name, mark in (("a", "during"), ("b", 3)):
+        source = Marked()
+        source.mark = mark
+        packs.append(build(source, tmp_path / name, size=32, quiet=True))
+    if column == "sensor":
+        assert "sensor" not in JoinedPack(*packs).table.column_names
+    else:
+        with pytest.raises(ValueError, match=r"columns differ in kind .*phase"):
+            JoinedPack(*packs)
+        with pytest.raises(ValueError, match=r"task 'pattern' is about other rows or split otherwise in"):
+            JoinedPack(packs[0], toy_pack(tmp_path / "c"))
+
+
+def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path: Path) -> None:
+    class Shuffled(Toy):
+        """Other groups are test here."""
+
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            turned = {"train": "test", "test": "train", "val": "train"}
+            return [replace(sample, columns={**sample.columns, "split": turned[sample.columns["split"]]})]
+
+    class Other(Toy):
+        def spec(self) -> DataSpec:
+            spec = super().spec()
+            return replace(spec, tasks=tuple(replace(task, name=f"other {task.name}") for task in spec.tasks))
+
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            labels = {name.replace("label_", "label_other "): value for name, value in sample.columns.items()}
+            return [replace(sample, columns=labels)]
+
+    class New(Toy):
+        def spec(self) -> DataSpec:
+            spec = super().spec()
+            return replace(spec, tasks=(Task(name="pattern", classes=("columns", "rows", "waves")),))
+
+    with pytest.raises(
+        ValueError, match=r"instance '.*' is learned from in .* and scored in .*, one of \d+: give packs"
+    ):
+        JoinedPack(pack, build(Shuffled(), tmp_path / "shuffled", size=32, quiet=True))
+    with pytest.raises(
+        ValueError, match=r"no task is in both packs: .* has pattern, bright, .* other pattern, other bright"
+    ):
+        JoinedPack(pack, build(Other(), tmp_path / "other", size=32, quiet=True))
+    with pytest.raises(ValueError, match=r"class of pattern.*waves"):
+        JoinedPack(pack, build(New(), tmp_path / "new", size=32, quiet=True))
+    with pytest.raises(ValueError, match=r"vision has 3 channels at 32 px in .* and 3 at 24 px in"):
+        JoinedPack(pack, toy_pack(tmp_path / "small", size=24))
+
+
+def test_probe_learns_on_one_pack_and_meets_another(
+    pack: Pack, negative: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, eval_every=0)
+    train(run, tmp_path / "run", quiet=True)
+    asked = ["probe", str(tmp_path / "run"), "--tasks", "pattern", "--modalities", "touch", "--json"]
+    assert not main([*asked, str(tmp_path / "new.json"), "--on", str(negative.path), "--learn-on", str(pack.path)])
+    result = json.loads((tmp_path / "new.json").read_text())
+    assert result["pack"] == JoinedPack(pack, negative).digest
+    assert {r["num_test"] for r in result["records"]} == {len(negative.rows("test"))}
+    assert {r["source"] for r in result["records"]} == {"mvitac", "majority", "untrained", "pixels", "border"}
+    assert "probes learned on" in capsys.readouterr().out
+    assert main(["probe", str(tmp_path / "run"), "--learn-on", str(pack.path)]) == 2
+    assert "say with --on which pack they are scored on" in " ".join(capsys.readouterr().err.split())

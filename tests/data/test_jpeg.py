@@ -1,0 +1,460 @@
+"""Packs that store JPEG: what Pillow would decode, resumable to the same bytes, refused where damaged, and trained on."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from PIL import Image, JpegImagePlugin
+
+from mvitac.cli.main import main
+from mvitac.data import build as packing
+from mvitac.data import jpeg
+from mvitac.data.build import build
+from mvitac.data.jpeg import Jpegs, decode, encode
+from mvitac.data.pack import Pack
+from mvitac.data.partial_pack import JpegFile
+from mvitac.data.source import Lost, Sample, Source
+from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.deploy import search
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import pack_features
+from mvitac.recipes import recipe
+from mvitac.registry import to_json
+from mvitac.run import Run
+from mvitac.system.files import digest
+from mvitac.training import views
+from mvitac.training.loop import train
+from support.forged_packs import described, seal
+from support.toy import Counting, Toy
+from support.training_runs import assert_equal_weights, power_cut, smoke
+
+FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
+
+
+def jpeg_pack(path: Path, source: Source | None = None, **options: Any) -> Pack:
+    return build(source or Toy(), path, size=32, quiet=True, store="jpeg", **options)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """The toy's 120 pairs as JPEG."""
+    return jpeg_pack(tmp_path_factory.mktemp("jpeg") / "pack")
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {name: (path / name).read_bytes() for name in FILES}
+
+
+# -- what is stored ---------------------------------------------------------------------------------------------------
+
+
+def test_rows_are_what_pillow_decodes(pack: Pack, small: Pack, tmp_path: Path) -> None:
+    assert small.meta["format_version"] == 2 and pack.meta["format_version"] == 1
+    assert {p.name for p in small.path.iterdir()} == {*FILES, "provenance.json"}
+    for modality in ("vision", "touch"):
+        images, raw = small.images[modality], pack.images[modality]
+        ends = np.cumsum(small.column(f"bytes_{modality}").astype(int))
+        blob = (small.path / f"{modality}.jpegs").read_bytes()
+        assert len(blob) == ends[-1] < raw.nbytes
+        for row in (0, 17, 119):
+            (tmp_path / "one.jpg").write_bytes(blob[ends[row - 1] if row else 0 : ends[row]])
+            with Image.open(tmp_path / "one.jpg") as image:
+                assert JpegImagePlugin.get_sampling(image) == 0  # 4:4:4
+                assert np.array_equal(images[row], np.asarray(image))
+        assert 0 < np.abs(images[:].astype(int) - raw).mean() < 4  # of noise with a spread of 8
+    for name in pack.table.column_names:
+        if not name.startswith("crc_"):
+            assert small.column(name).tolist() == pack.column(name).tolist()
+
+
+def test_quality_is_obeyed(small: Pack, tmp_path: Path) -> None:
+    rough = jpeg_pack(tmp_path / "p", quality=30)
+    assert (rough.path / "touch.jpegs").stat().st_size < 0.5 * (small.path / "touch.jpegs").stat().st_size
+    assert rough.digest != small.digest and rough.meta["quality"] == 30
+
+
+INDICES: list[Any] = [
+    3,
+    -1,
+    np.int64(7),
+    slice(5, 40, 3),
+    slice(0, 0),
+    slice(100, 500),
+    np.array([5, 1, 5, 119]),
+    np.arange(120)[::-1],
+    np.zeros(0, int),
+    [2, 4],
+    np.arange(120) % 7 == 0,
+    np.array([[1, 2], [3, 4]]),
+    (4, slice(None), slice(None), slice(0, 2)),
+    (slice(3, 90), slice(None, None, 2), slice(5), 1),
+    (np.array([9, 0]), 3),
+]
+
+
+@pytest.mark.parametrize("index", INDICES, ids=str)
+@pytest.mark.parametrize("num_threads", [1, 3])
+def test_indexed_like_the_array_it_stands_for(
+    small: Pack, monkeypatch: pytest.MonkeyPatch, index: Any, num_threads: int
+) -> None:
+    images = small.images["touch"]
+    whole = np.stack([images[row] for row in range(120)])
+    with ThreadPoolExecutor(num_threads) as pool:
+        monkeypatch.setattr(jpeg, "_num_threads", lambda: num_threads)
+        monkeypatch.setattr(jpeg, "_threads", lambda: pool)
+        found = images[index]
+    assert found.dtype == np.uint8 and np.array_equal(found, whole[index])
+    assert found.shape == whole[index].shape
+    assert (len(images), images.shape, images.dtype, images.nbytes) == (120, whole.shape, whole.dtype, whole.nbytes)
+
+
+@pytest.mark.parametrize("row", [120, -121])
+def test_rows_that_are_not_there(small: Pack, row: int) -> None:
+    with pytest.raises(IndexError):
+        small.images["touch"][row]
+
+
+def test_two_sensors_keep_apart(tmp_path: Path) -> None:
+    """At a side of whole blocks nothing of one sensor gets into the other; each is what it is alone."""
+    source = Toy(num=24, touch_channels=6)
+    two, raw = jpeg_pack(tmp_path / "two", source), build(source, tmp_path / "raw", size=32, quiet=True)
+    assert two.images["touch"].shape == (24, 32, 32, 6)
+    for row in (0, 23):
+        both = two.images["touch"][row]
+        for sensor in (slice(0, 3), slice(3, 6)):
+            alone = raw.images["touch"][row, :, :, sensor]
+            assert np.array_equal(both[:, :, sensor], decode(encode(alone, 95), (32, 32, 3)))
+
+
+def test_a_missing_image_has_no_bytes(tmp_path: Path) -> None:
+    class Holes(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            there = item % 3 != 1
+            touch = sample.touch if there else None
+            return [replace(sample, touch=touch, columns={**sample.columns, "has_touch": there})]
+
+    found = jpeg_pack(tmp_path / "p", Holes(num=12), quality=3)
+    assert ((found.column("bytes_touch") == 0) == ~found.has("touch")).all()
+    assert ((found.images["touch"][:] == 0).all((1, 2, 3)) == ~found.has("touch")).all()
+
+
+def test_a_pack_of_black_images(tmp_path: Path) -> None:
+    class Black(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            return [replace(sample, touch=np.zeros((40, 40, 3), np.uint8))]
+
+    found = jpeg_pack(tmp_path / "p", Black(num=12))
+    assert not found.images["touch"][:].any() and found.images["touch"][3:5].shape == (2, 32, 32, 3)
+
+
+KEPT: dict[str, dict[str, Any]] = {
+    "raw": {"store": "raw", "quality": 50},
+    "jpeg": {"store": "jpeg"},
+    "rough": {"store": "jpeg", "quality": 50},
+}
+
+
+# -- packing ----------------------------------------------------------------------------------------------------------
+
+
+def test_two_processes_give_the_bytes_of_one(small: Pack, tmp_path: Path) -> None:
+    assert contents(jpeg_pack(tmp_path / "two", workers=2).path) == contents(small.path)
+
+
+def kill(path: Path, owner: Any, name: str, after: int = 0) -> None:
+    """Pack the toy, with Ctrl-C instead of the ``after``-th call of ``owner``'s ``name``, which then does nothing."""
+    left, real = iter(range(after)), getattr(owner, name)
+
+    def stop(*args: Any) -> Any:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, stop)
+        with pytest.raises(KeyboardInterrupt):
+            jpeg_pack(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "calls", "done"), [("put", 0, 0), ("put", 101, 32), ("put", 239, 96), ("join", 0, 32), ("join", 5, 96)]
+)
+def test_interrupted_build_resumes_to_the_same_bytes(
+    small: Pack, tmp_path: Path, name: str, calls: int, done: int
+) -> None:
+    """An item is two puts, a part 32 items and two joins."""
+    kill(tmp_path / "p", JpegFile, name, calls)
+    assert not (tmp_path / "p").exists()
+    source = Counting()
+    jpeg_pack(tmp_path / "p", source)
+    assert source.seen == list(range(done, 120)), "what was done is not read again"
+    assert contents(tmp_path / "p") == contents(small.path)
+    assert {p.name for p in (tmp_path / "p").iterdir()} == {*FILES, "provenance.json"}
+    assert not (tmp_path / "p.partial").exists()
+
+
+@pytest.mark.parametrize("lost", ["file", "end", "bit", "part's file"])
+def test_what_lost_power_took_is_read_again(small: Pack, tmp_path: Path, lost: str) -> None:
+    kill(tmp_path / "p", packing, "_finish")
+    part = tmp_path / "p.partial" / "part-000001.touch.jpegs"
+    data = part.read_bytes()
+    if lost == "part's file":
+        part.with_name("part-000001.json").unlink()
+    elif lost == "file":
+        part.unlink()
+    else:
+        part.write_bytes(data[:-10] if lost == "end" else data[:-10] + bytes(10))
+    source = Counting()
+    jpeg_pack(tmp_path / "p", source)
+    assert source.seen == list(range(32, 64))
+    assert contents(tmp_path / "p") == contents(small.path)
+
+
+def test_lost_samples_and_damaged_items_leave_no_hole(small: Pack, tmp_path: Path) -> None:
+    class Torn(Toy):
+        def read(self, item: int) -> list[Sample | Lost]:  # type: ignore[override]
+            return [Lost(f"sample {item}", "torn")] if item in (0, 64) else super().read(item)  # type: ignore[return-value]
+
+    found = jpeg_pack(tmp_path / "p", Torn(damaged=(3, *range(32, 64))), max_damaged=0.5)
+    rows = [int(name) for name in found.column("id")]
+    assert rows == [i for i in range(120) if i not in (0, 3, *range(32, 65))]
+    for modality in ("vision", "touch"):
+        assert np.array_equal(found.images[modality][:], small.images[modality][rows])
+    Pack(found.path)  # the digests agree
+
+
+def test_an_unfinished_pack_stored_otherwise_is_not_continued(tmp_path: Path) -> None:
+    kill(tmp_path / "p", JpegFile, "put", 3)
+    for options in ({"store": "jpeg", "quality": 94}, {"store": "raw"}):
+        with pytest.raises(ValueError, match="unfinished pack of something else"):
+            build(Toy(), tmp_path / "p", size=32, quiet=True, **options)  # type: ignore[arg-type]
+
+
+def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = 2 * 120 * 32 * 32 * 3
+    free = [2 * raw // 3 - 1]  # two copies of a third
+    monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, free[0]))  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="packing needs about"):
+        jpeg_pack(tmp_path / "p")
+    assert not list(tmp_path.iterdir())
+    free[0] += 1
+    kill(tmp_path / "p", JpegFile, "join", 6)
+    free[0] = 1000  # what is there already is not asked for again
+    jpeg_pack(tmp_path / "p")
+
+
+@pytest.mark.parametrize("quality", [0, 101, -5])
+def test_impossible_requests(tmp_path: Path, capsys: pytest.CaptureFixture[str], quality: int) -> None:
+    words = ["data", "simulate", "materials", "--num", "20", "--out", str(tmp_path / "p")]
+    assert main([*words, "--store", "jpeg", "--quality", str(quality)]) == 2
+    error = capsys.readouterr().err
+    assert f"quality {quality} is not possible: give JPEG's 1 to 100" in error and error.count("\n") == 1
+    assert main([*words, "--store", "png"]) == 2
+    assert "--store" in (error := capsys.readouterr().err) and "png" in error and error.count("\n") == 1
+    with pytest.raises(ValueError, match="unknown store 'png'"):
+        build(Toy(), tmp_path / "p", size=32, store="png")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_line_and_the_cache(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["data", "simulate", "materials", "--num", "20", "--size", "16", "--workers", "1", "--quiet"]
+    assert main([*words, "--store", "jpeg", "--quality", "80", "--out", str(tmp_path / "p")]) == 0
+    assert main(["data", "info", str(tmp_path / "p")]) == 0
+    assert "JPEG of quality 80" in " ".join(capsys.readouterr().out.split())
+    config = MaterialsConfig(num=20, size=16, workers=1, store="jpeg", quality=80)
+    assert config.source().fingerprint() == replace(config, store="raw").source().fingerprint()
+    kept = [replace(config, **changes).open(quiet=True) for changes in ({}, {"store": "raw"}, {"quality": 81})]  # type: ignore[arg-type]
+    assert kept[0].digest == Pack(tmp_path / "p").digest and len({pack.path for pack in kept}) == 3
+    assert isinstance(kept[0].images["touch"], Jpegs) and isinstance(kept[1].images["touch"], np.ndarray)
+
+
+def test_a_raw_run_is_the_run_it_was() -> None:
+    """Checkpoints and caches of before hold its digest; and its record says nothing of what could not be chosen then."""
+    config = MaterialsConfig(num=20, size=16)
+    run = recipe("smoke", config)
+    kept = {name: replace(run, data=replace(config, **changes)).digest() for name, changes in KEPT.items()}  # type: ignore[arg-type]
+    assert kept["raw"] == run.digest() and len(set(kept.values())) == 3
+    record = to_json(run)
+    for name in ("workers", "store", "quality"):
+        del record["data"][name]
+    del record["augment"]["gel_flip"], record["method"]["pairs"]
+    del record["augment"]["vision"]["noise"], record["augment"]["touch"]["noise"]
+    assert Run.load(record) == run
+    for name in ("device", "log_every", "eval_every", "checkpoint_every"):
+        del record[name]
+    assert digest(record) == run.digest()
+
+
+# -- damage -----------------------------------------------------------------------------------------------------------
+
+
+def lengths(change: Callable[[np.ndarray], pa.Array | None]) -> Callable[[Path], None]:
+    """Column bytes_touch otherwise, or away; consistently sealed."""
+
+    def spoil(path: Path) -> None:
+        table = pq.read_table(path / "samples.parquet")
+        new = change(table.column("bytes_touch").to_numpy().copy())
+        table = table.drop_columns("bytes_touch")
+        pq.write_table(table if new is None else table.append_column("bytes_touch", new), path / "samples.parquet")
+        seal(path)
+
+    return spoil
+
+
+def longer(values: np.ndarray) -> pa.Array:
+    values[7] += 1
+    return pa.array(values)
+
+
+def cut(path: Path) -> None:
+    data = (path / "touch.jpegs").read_bytes()
+    (path / "touch.jpegs").write_bytes(data[: len(data) // 2])
+
+
+def flip(path: Path) -> None:
+    data = bytearray((path / "touch.jpegs").read_bytes())
+    data[-9] ^= 1
+    (path / "touch.jpegs").write_bytes(data)
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
+    "bit": (
+        flip,
+        r"touch\.jpegs does not match its digest in 1 of 120 rows, first row 119 \(id '0119'\).*make it again",
+    ),
+    "truncated": (cut, r"touch\.jpegs holds \d+ bytes, its table promises \d+: .*damaged"),
+    "emptied": (lambda path: (path / "touch.jpegs").write_bytes(b"") and None, r"touch\.jpegs holds 0 bytes"),
+    "missing": (lambda path: (path / "touch.jpegs").unlink(), r"touch\.jpegs is missing"),
+    "offsets": (lengths(longer), r"touch\.jpegs holds \d+ bytes, its table promises \d+"),
+    "no-offsets": (lengths(lambda _: None), r"samples\.parquet has no column bytes_touch"),
+    "text": (lengths(lambda v: pa.array([str(x) for x in v])), r"samples\.parquet has no column bytes_touch of uint32"),
+    "holes": (lengths(lambda v: pa.array([None, *v[1:].tolist()], pa.uint32())), "column bytes_touch has empty rows"),
+    "called-raw": (described("store", value="raw"), r"pack\.json is damaged \(store: raw is not of format 2"),
+    "called-png": (described("store", value="png"), r"pack\.json is damaged .*png"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damage_is_named(small: Pack, tmp_path: Path, name: str) -> None:
+    spoil, says = DAMAGES[name]
+    spoil(Path(shutil.copytree(small.path, tmp_path / "p")))
+    with pytest.raises(ValueError, match=says) as raised:
+        Pack(tmp_path / "p")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["garbage", "other size", "gray"])
+def test_a_row_that_cannot_be_decoded_is_named(small: Pack, tmp_path: Path, kind: str) -> None:
+    """Where nothing was verified, or a pack was sealed by someone else."""
+    path = Path(shutil.copytree(small.path, tmp_path / "p"))
+    ends = np.cumsum(small.column("bytes_touch").astype(int))
+    data, row = bytearray((path / "touch.jpegs").read_bytes()), slice(ends[4], ends[5])
+    one = bytes(data[row])
+    if kind == "garbage":
+        new = bytes(range(256)) * 10
+    else:
+        shape = (16, 64, 3) if kind == "other size" else (32, 32)  # as many pixels
+        Image.fromarray(np.full(shape, 9, np.uint8)).save(tmp_path / "x.jpg", quality=20)
+        new = (tmp_path / "x.jpg").read_bytes()
+    data[row] = new[: len(one)] + bytes(max(0, len(one) - len(new)))
+    (path / "touch.jpegs").write_bytes(data)
+    found = Pack(path, verify=False)
+    with pytest.raises(
+        ValueError, match=r"touch\.jpegs: row 5 cannot be decoded \(.*\): the pack is damaged"
+    ) as raised:
+        found.images["touch"][np.arange(20)]
+    assert "\n" not in str(raised.value)
+    assert found.images["touch"][6].any()
+    with pytest.raises(OSError, match="truncated"):
+        decode(one[: len(one) // 2], (32, 32, 3))
+
+
+# -- what reads packs -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def decoded(small: Pack, tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """A raw pack of the pixels that the pack of JPEGs decodes to."""
+
+    class Decoded(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            return [replace(sample, **{m: small.images[m][item] for m in ("vision", "touch")})]  # type: ignore[arg-type]
+
+    return build(Decoded(), tmp_path_factory.mktemp("decoded") / "pack", size=32, quiet=True)
+
+
+def run_on(pack: Pack, **changes: Any) -> Run:
+    return smoke(pack, **{"steps": 4, "eval_every": 4, **changes})
+
+
+@pytest.fixture(scope="module")
+def trained(small: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(run_on(small), tmp_path_factory.mktemp("trained") / "run", quiet=True)
+
+
+def test_trains_as_on_the_same_pixels_raw(trained: Path, small: Pack, decoded: Pack, tmp_path: Path) -> None:
+    assert_equal_weights(trained, train(run_on(decoded), tmp_path / "raw", quiet=True))
+    assert_equal_weights(trained, train(run_on(small), tmp_path / "again", quiet=True))
+
+
+def test_trains_in_chunks_with_partners_too(small: Pack, decoded: Pack, tmp_path: Path) -> None:
+    changes: dict[str, Any] = {"positives": "same-touch", "chunk": 8, "steps": 1, "eval_every": 0}
+    packs = {"jpeg": small, "raw": decoded}
+    made = [train(run_on(pack, **changes), tmp_path / name, quiet=True) for name, pack in packs.items()]
+    assert_equal_weights(*made)
+
+
+def test_resumed_equals_straight(trained: Path, small: Pack, tmp_path: Path) -> None:
+    run = run_on(small, checkpoint_every=1)
+    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "r", quiet=True)
+    train(run, tmp_path / "r", resume=True, quiet=True)
+    assert_equal_weights(trained, tmp_path / "r")
+
+
+def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a thread for JPEGs; a raw pack's views are made where they are used, as ever."""
+    import threading
+
+    from mvitac.system.distributed import World
+
+    makers: list[str] = []
+    real = views.make_views
+    monkeypatch.setattr(
+        views, "make_views", lambda *args: makers.append(threading.current_thread().name) or real(*args)
+    )
+    for pack, name in ((small, "prefetch"), (decoded, "MainThread")):
+        makers.clear()
+        run, rows = run_on(pack), pack.rows("train")
+        for parts in views.feed_parts(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
+            assert len(parts[0]().rows) == run.batch_size
+        assert makers == [name] * 3
+
+
+def test_probed_and_searched_as_the_same_pixels(trained: Path, small: Pack, decoded: Pack, tmp_path: Path) -> None:
+    from mvitac.deploy.artifact import load
+
+    model, rows = load(trained), small.rows("test")
+    for modality in ("vision", "touch"):
+        pair = [pack_features(model, pack, modality, rows) for pack in (small, decoded)]
+        assert torch.equal(*pair)
+    records = [
+        probe_runs([trained], ProbeConfig(tasks=("pattern",), probes=("knn",)), pack)["records"]
+        for pack in (small, decoded)
+    ]
+    assert records[0] and records[0] == records[1]
+    index = search.build(model, small, tmp_path / "index", ("test",))
+    assert index.find(model, small.images["touch"][rows[3]], "touch", "touch", 1)[0].tolist() == [[3]]

@@ -1,0 +1,386 @@
+"""The pack: whole or not there, resumable to the same bytes, and never mistaken for something else."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import io
+import json
+import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from filelock import FileLock
+
+from mvitac.data import build as packing
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.partial_pack import RowFile
+from mvitac.data.source import Lost, Sample, Source
+from mvitac.datasets.pack import PackConfig
+from mvitac.system import locks
+from support.toy import Counting, Toy, toy_pack
+
+FILES = ("pack.json", "samples.parquet", "vision.npy", "touch.npy")
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {name: (path / name).read_bytes() for name in FILES}
+
+
+def test_rows_and_images_belong_together(pack: Pack) -> None:
+    source = Toy()
+    for row in (0, 17, 119):
+        sample = source.read(row)[0]
+        assert pack.column("id")[row] == sample.columns["id"]
+        for modality in ("vision", "touch"):
+            assert np.array_equal(pack.images[modality][row], getattr(sample, modality))
+
+
+def test_splits_share_no_group(pack: Pack) -> None:
+    groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
+    assert all(groups.values())
+    assert not groups["train"] & groups["test"] and not groups["val"] & (groups["train"] | groups["test"])
+
+
+def test_two_processes_give_the_bytes_of_one(pack: Pack, tmp_path: Path) -> None:
+    build(Toy(), tmp_path / "two", size=32, workers=2, quiet=True)
+    assert contents(tmp_path / "two") == contents(pack.path)
+
+
+class Stop:
+    """Raises instead of the ``after``-th call of the method ``name`` of a pack's image files, which then does nothing."""
+
+    def __init__(self, name: str, after: int, error: BaseException) -> None:
+        self.name, self.after, self.error, self.real = name, after, error, getattr(RowFile, name)
+
+    def __enter__(self) -> None:
+        def stopping(*args: Any) -> Any:
+            self.after -= 1
+            if self.after < 0:
+                raise self.error
+            return self.real(*args)
+
+        setattr(RowFile, self.name, stopping)
+
+    def __exit__(self, *_: object) -> None:
+        setattr(RowFile, self.name, self.real)
+
+
+@pytest.mark.parametrize("writes_before_the_kill", [0, 1, 64, 100, 239])
+def test_interrupted_build_resumes_to_the_same_bytes(pack: Pack, tmp_path: Path, writes_before_the_kill: int) -> None:
+    with pytest.raises(KeyboardInterrupt), Stop("write", writes_before_the_kill, KeyboardInterrupt()):
+        toy_pack(tmp_path / "p")
+    assert not (tmp_path / "p").exists()
+    source = Counting()
+    build(source, tmp_path / "p", size=32, quiet=True)
+    done = writes_before_the_kill // 64 * 32  # an item is two writes, a part 32 items
+    assert source.seen == list(range(done, 120)), "what was done is not read again"
+    assert contents(tmp_path / "p") == contents(pack.path)
+    assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted([*FILES, "provenance.json"])
+    assert not (tmp_path / "p.partial").exists()
+
+
+class Held(Counting):
+    """Reads no second item before ``go``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.go = threading.Event(), threading.Event()
+
+    def read(self, item: int) -> list[Sample]:
+        self.begun.set()
+        assert self.go.wait(60)
+        return super().read(item)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_one_process_packs_and_the_others_wait(
+    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], fails: bool
+) -> None:
+    waits = threading.Event()
+
+    class Lock(FileLock):
+        def acquire(self, *args: Any, blocking: bool = True, **options: Any) -> Any:
+            if blocking:
+                waits.set()
+            return super().acquire(*args, blocking=blocking, **options)
+
+    monkeypatch.setattr(locks, "FileLock", Lock)
+    first, second = Held(), Counting()
+    with ThreadPoolExecutor(2) as threads:
+        one = threads.submit(build, first, tmp_path / "p", size=32, quiet=True)
+        assert first.begun.wait(60)
+        other = threads.submit(build, second, tmp_path / "p", size=32, exist_ok=True)
+        assert waits.wait(60) and not other.done()
+        if fails:
+            first.damaged = (100,)
+        first.go.set()
+        if fails:
+            with pytest.raises(ValueError, match="item 100 is damaged on purpose"):
+                one.result()
+        else:
+            assert one.result().digest == pack.digest
+        assert other.result().digest == pack.digest
+    assert second.seen == (list(range(96, 120)) if fails else []), "what the first one did is not done again"
+    assert contents(tmp_path / "p") == contents(pack.path)
+    assert [path.name for path in tmp_path.iterdir()] == ["p"], "no lock, no unfinished pack"
+    assert "is being packed by another process: waiting for it" in " ".join(capsys.readouterr().out.split())
+    assert build(Toy(), tmp_path / "p", size=32, exist_ok=True).digest == pack.digest
+
+
+def test_packs_where_files_cannot_be_locked(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def flock(*_: Any) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    assert toy_pack(tmp_path / "p").digest == pack.digest
+    assert [path.name for path in tmp_path.iterdir()] == ["p"]
+
+
+def almost_finished(path: Path, source: Source) -> Path:
+    """What is left of packing ``source`` if the build is killed after the last part."""
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(packing, "_finish", killed)
+        with pytest.raises(KeyboardInterrupt):
+            build(source, path, size=32, quiet=True)
+    return path.with_name(path.name + ".partial")
+
+
+@pytest.mark.parametrize("lost", ["row", "end of the images", "part's file", "half of the part's file"])
+def test_what_lost_power_took_is_read_again(pack: Pack, tmp_path: Path, lost: str) -> None:
+    partial = almost_finished(tmp_path / "p", Toy())
+    images, part = partial / "pack" / "touch.npy", partial / "part-000001.json"
+    if lost == "row":
+        with images.open("r+b") as file:
+            file.seek(128 + 40 * 32 * 32 * 3)
+            file.write(bytes(32 * 32 * 3))
+    elif lost == "end of the images":
+        with images.open("r+b") as file:
+            file.truncate(128 + 40 * 32 * 32 * 3)
+    else:
+        part.write_bytes(part.read_bytes()[: 500 * (lost != "part's file")])
+    source = Counting()
+    build(source, tmp_path / "p", size=32, quiet=True)
+    assert source.seen == list(range(32, 120 if lost == "end of the images" else 64))
+    assert contents(tmp_path / "p") == contents(pack.path)
+
+
+@pytest.mark.parametrize("writes_before_the_kill", [0, 1, 2, 4])
+def test_killed_while_holes_are_closed(tmp_path: Path, writes_before_the_kill: int) -> None:
+    """Three of the four parts move up, first those of vision, then those of touch."""
+    source = Toy(damaged=(3, 40))
+    options: dict[str, Any] = {"size": 32, "max_damaged": 0.05, "quiet": True}
+    straight = build(source, tmp_path / "straight", **options)
+    almost_finished(tmp_path / "p", source)
+    with pytest.raises(KeyboardInterrupt), Stop("write", writes_before_the_kill, KeyboardInterrupt()):
+        build(source, tmp_path / "p", **options)
+    build(source, tmp_path / "p", **options)
+    assert contents(tmp_path / "p") == contents(straight.path)
+
+
+def test_leftovers_in_the_folder_do_not_get_into_the_pack(pack: Pack, tmp_path: Path) -> None:
+    """Those of a build that was killed at its very end, or of a version that kept images in its parts."""
+    partial = almost_finished(tmp_path / "p", Toy())
+    for name in ("pack/pack.json", "pack/.pack.json.1.tmp", "part-000001.npz", "part-000002.json", "pack/vision.npy"):
+        (partial / name).write_bytes(b"of old")
+    toy_pack(tmp_path / "p")
+    assert contents(tmp_path / "p") == contents(pack.path)
+    assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted([*FILES, "provenance.json"])
+
+
+def test_unfinished_pack_of_something_else_is_not_continued(tmp_path: Path) -> None:
+    almost_finished(tmp_path / "p", Toy())
+    with pytest.raises(ValueError, match="unfinished pack of something else"):
+        toy_pack(tmp_path / "p", num=60)
+
+
+@dataclass
+class Stamped(Counting):
+    """The toy as if read from a file per item."""
+
+    changed: tuple[int, ...] = ()
+
+    def stamps(self) -> list[int]:
+        return [int(item in self.changed) for item in range(self.num)]
+
+
+def test_only_parts_whose_files_have_changed_are_made_again(pack: Pack, tmp_path: Path) -> None:
+    partial = almost_finished(tmp_path / "p", Stamped())
+    source = Stamped(changed=(40, 119))
+    build(source, tmp_path / "p", size=32, quiet=True)
+    assert source.seen == [*range(32, 64), *range(96, 120)]
+    assert not partial.exists()
+    assert contents(tmp_path / "p") == contents(pack.path), "no pack tells when its files were written"
+
+
+def test_parts_that_remember_no_files_are_made_again(pack: Pack, tmp_path: Path) -> None:
+    """Those of a version that did not ask when they were written."""
+    part = almost_finished(tmp_path / "p", Stamped()) / "part-000001.json"
+    known = json.loads(part.read_text())
+    del known["stamp"]
+    part.write_text(json.dumps(known))
+    source = Stamped()
+    build(source, tmp_path / "p", size=32, quiet=True)
+    assert source.seen == list(range(32, 64))
+    assert contents(tmp_path / "p") == contents(pack.path)
+
+
+def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:
+    source = Toy(damaged=(3, 40))
+    with pytest.raises(ValueError, match=r"2 of 120 items cannot be read, first item 3: item 3 is damaged"):
+        build(source, tmp_path / "strict", size=32, quiet=True)
+    lenient = build(source, tmp_path / "lenient", size=32, max_damaged=0.05, quiet=True)
+    assert lenient.num == 118
+    assert [name for name, _ in lenient.meta["damaged"]] == ["item 3", "item 40"]
+    assert "0003" not in lenient.column("id")
+    check_images(lenient, [item for item in range(120) if item not in (3, 40)])
+
+
+def check_images(pack: Pack, items: list[int]) -> None:
+    """Every row's images, against the toy's ``items``."""
+    samples = [Toy().read(item)[0] for item in items]
+    assert pack.column("id").tolist() == [sample.columns["id"] for sample in samples]
+    for modality in ("vision", "touch"):
+        file = io.BytesIO()
+        np.save(file, np.stack([getattr(s, modality) for s in samples]))
+        assert (pack.path / f"{modality}.npy").read_bytes() == file.getvalue(), modality
+    Pack(pack.path)  # the digests agree
+
+
+class Strings(Toy):
+    """The toy in items of seven samples, of which a few are lost; the last item has one less than it says."""
+
+    def items(self) -> list[str]:
+        return [f"string {i}" for i in range(6)]
+
+    def samples_per_item(self) -> list[int]:
+        return [7] * 6
+
+    def read(self, item: int) -> list[Sample | Lost]:  # type: ignore[override]
+        numbers = range(7 * item, 41 if item == 5 else 7 * item + 7)
+        lost = (0, 20, 21, 22, 33)
+        return [Lost(f"sample {i}", "torn") if i in lost else super(Strings, self).read(i)[0] for i in numbers]
+
+
+@pytest.mark.parametrize("part", [1, 2, 32])
+def test_lost_samples_leave_no_hole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
+    monkeypatch.setattr(packing, "NUM_PART_ITEMS", 7 * part)
+    found = build(Strings(), tmp_path / "p", size=32, max_damaged=0.2, quiet=True)
+    check_images(found, [i for i in range(41) if i not in (0, 20, 21, 22, 33)])
+    assert found.meta["damaged"] == [[f"sample {i}", "torn"] for i in (0, 20, 21, 22, 33)]
+
+
+def test_more_samples_than_promised_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Strings, "samples_per_item", lambda _: [5] * 6)
+    with pytest.raises(ValueError, match="item 0 gives 6 samples, its source promised 5"):
+        build(Strings(), tmp_path / "p", size=32, max_damaged=0.2, quiet=True)
+
+
+def test_repaired_items_are_read_on_the_next_try(pack: Pack, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be read"):
+        build(Toy(damaged=(3,)), tmp_path / "p", size=32, quiet=True)
+    build(Toy(), tmp_path / "p", size=32, quiet=True)
+    assert contents(tmp_path / "p") == contents(pack.path)
+
+
+def copy_of(pack: Pack, path: Path) -> Path:
+    shutil.copytree(pack.path, path)
+    return path
+
+
+def test_one_flipped_bit_is_noticed(pack: Pack, tmp_path: Path) -> None:
+    path = copy_of(pack, tmp_path / "p") / "touch.npy"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(
+        ValueError, match=r"touch\.npy does not match its digest in 1 of 120 rows, first row 119 .*0119"
+    ):
+        Pack(path.parent)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_missing_and_truncated_files(pack: Pack, tmp_path: Path, name: str) -> None:
+    path = copy_of(pack, tmp_path / "p") / name
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(ValueError, match=r"damaged|digest"):
+        Pack(path.parent)
+    path.unlink()
+    with pytest.raises(ValueError, match="missing"):
+        Pack(path.parent)
+
+
+def test_foreign_folders(pack: Pack, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no pack at"):
+        Pack(tmp_path / "nowhere")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "pack.json").write_text('{"name": "an npm package"}')
+    with pytest.raises(ValueError, match="does not describe a pack"):
+        Pack(tmp_path / "other")
+    path = copy_of(pack, tmp_path / "p")
+    meta = json.loads((path / "pack.json").read_text())
+    (path / "pack.json").write_text(json.dumps({**meta, "format_version": 99}))
+    with pytest.raises(ValueError, match="pack format 99"):
+        Pack(path)
+
+
+def test_never_overwrites(pack: Pack) -> None:
+    with pytest.raises(ValueError, match="already exists"):
+        toy_pack(pack.path)
+
+
+def free(monkeypatch: pytest.MonkeyPatch, num_bytes: int) -> None:
+    monkeypatch.setattr(packing.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, num_bytes))  # type: ignore[attr-defined]
+
+
+def test_disk_is_told_before_it_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    free(monkeypatch, 3 * 10**9)
+    build(Toy(), tmp_path / "p", size=32)
+    assert f"into {tmp_path / 'p'}: needs about 0.7 MB of disk, 3.0 GB are free" in capsys.readouterr().out
+    build(Toy(), tmp_path / "q", size=32, quiet=True)
+    assert "disk" not in capsys.readouterr().out
+
+
+def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For one copy of the images, less what an interrupted build has written of it."""
+    need = 2 * (128 + 120 * 32 * 32 * 3)
+    free(monkeypatch, need - 1)
+    with pytest.raises(ValueError, match="packing needs about"):
+        toy_pack(tmp_path / "p")
+    assert not list(tmp_path.iterdir())
+    free(monkeypatch, need)
+    almost_finished(tmp_path / "p", Toy())
+    free(monkeypatch, 1000)
+    toy_pack(tmp_path / "p")
+
+
+def test_full_disk_leaves_no_half_part(pack: Pack, tmp_path: Path) -> None:
+    with Stop("write", 101, OSError(28, "No space left on device")), pytest.raises(OSError, match="No space"):
+        toy_pack(tmp_path / "p")
+    assert sorted(p.name for p in (tmp_path / "p.partial").iterdir()) == ["pack", "part-000000.json", "request.json"]
+    toy_pack(tmp_path / "p")
+    assert contents(tmp_path / "p") == contents(pack.path)
+
+
+def test_scoring_on_val_hides_test(pack: Pack) -> None:
+    whole = PackConfig(path=pack.path).open()
+    choosing = PackConfig(path=pack.path, score_on="val").open()
+    assert len(whole.rows("val")) and len(whole.rows("test"))
+    np.testing.assert_array_equal(choosing.rows("test"), whole.rows("val"))
+    np.testing.assert_array_equal(choosing.rows("train", "unlabelled"), whole.rows("train", "unlabelled"))
+    assert not len(choosing.rows("val"))
+    task = whole.spec.tasks[0].name
+    unseen = whole.rows("test")
+    assert (choosing.labels(task, "train", "val", "test")[unseen] == -1).all()

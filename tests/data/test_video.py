@@ -1,0 +1,288 @@
+"""Frame i is frame i, whatever the codec does to the order; each is decoded once; damage is told, never painted over."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvitac.data import video
+from mvitac.data.video import frames, num_frames
+from mvitac.datasets.table import video_times
+from support.videos import edited, numbered, read_number, write_video
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "touch_and_go_sample"
+NUM = 150
+KINDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "mpeg4": ("v.mp4", {}),
+    "mpeg4-reordered": ("v.mp4", {"b_frames": 2}),
+    "avi": ("v.avi", {}),
+    "avi-reordered": ("v.avi", {"b_frames": 2}),
+    "mov": ("v.mov", {"gop": 1000}),  # one key frame for all
+    "mjpeg": ("v.avi", {"codec": "mjpeg"}),
+    "h264": ("v.mp4", {"codec": "libx264", "gop": 40, "b_frames": 3}),
+    "h264-open": ("v.mp4", {"codec": "libx264", "b_frames": 3, "options": {"x264-params": "open-gop=1:keyint=20"}}),
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One numbered video of every kind that this PyAV can encode."""
+    folder = tmp_path_factory.mktemp("videos")
+    return {
+        name: write_video(folder / name / file, NUM, lambda i: numbered(i, "touch"), **options)
+        for name, (file, options) in KINDS.items()
+        if options.get("codec", "mpeg4") in av.codecs_available
+    }
+
+
+@pytest.fixture(params=KINDS)
+def path(request: pytest.FixtureRequest, made: dict[str, Path]) -> Path:
+    if request.param not in made:
+        pytest.skip("this PyAV cannot encode it")
+    return made[request.param]
+
+
+def packets_of(path: Path) -> list[tuple[int, int]]:
+    """(position, bytes) of every packet in the file."""
+    with av.open(str(path)) as container:
+        return [(p.pos or 0, p.size) for p in container.demux(video=0) if p.size]
+
+
+def copy_with(path: Path, out: Path, at: int, data: bytes) -> Path:
+    whole = bytearray(path.read_bytes())
+    whole[at : at + len(data)] = data
+    out.write_bytes(whole)
+    return out
+
+
+def test_every_frame_is_the_one_it_says(path: Path) -> None:
+    assert num_frames(path) == NUM
+    found = list(frames(path, range(NUM)))
+    assert [number for number, _ in found] == list(range(NUM))
+    assert [read_number(image) for _, image in found] == [(i, "touch") for i in range(NUM)]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_choice_of_frames_is_the_one_it_says(path: Path, seed: int) -> None:
+    rng = random.Random(seed)
+    wanted = rng.sample(range(NUM), rng.choice((1, 2, 7, 40)))
+    found = list(frames(path, wanted, 48))
+    assert [number for number, _ in found] == sorted(wanted)
+    for number, image in found:
+        assert image.shape == (48, 48, 3) and image.dtype == np.uint8
+        assert read_number(image)[0] == number
+
+
+def test_the_pixels_are_those_of_decoding_from_the_start(path: Path) -> None:
+    with av.open(str(path)) as container:
+        plain = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    for number, image in frames(path, (0, 13, 14, 39, 41, 77, 149)):
+        assert np.array_equal(image, plain[number])
+
+
+@pytest.mark.parametrize("kind", ["mpeg4", "mpeg4-reordered", "mov", "h264", "h264-open"])
+@pytest.mark.parametrize(("first", "num"), [(1, 149), (7, 60), (43, 107), (0, 33)])
+def test_a_trim_without_encoding_anew_counts_what_is_shown(
+    made: dict[str, Path], tmp_path: Path, kind: str, first: int, num: int
+) -> None:
+    if kind not in made:
+        pytest.skip("this PyAV cannot encode it")
+    path = edited(made[kind], tmp_path / "v.mp4", (first, num))
+    with av.open(str(path)) as container:
+        shown = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
+    assert [read_number(image)[0] for _, image in shown] == [*range(first, first + num)]
+    assert num_frames(path) == video_times.num_frames(path) == num
+    assert np.allclose(video_times.timestamps(path), [time for time, _ in shown])
+    for wanted in ([0], [1, 2, 30], range(num)):
+        found = list(frames(path, wanted))
+        assert [number for number, _ in found] == list(wanted)
+        assert all(np.array_equal(image, shown[number][1]) for number, image in found)
+
+
+def test_pieces_put_together_without_encoding_anew_are_refused(made: dict[str, Path], tmp_path: Path) -> None:
+    path = edited(made["mpeg4"], tmp_path / "v.mp4", (31, 20), (5, 10))
+    with pytest.raises(ValueError, match=r"v\.mp4 is put together from pieces by an edit list: encode it anew"):
+        num_frames(path)
+
+
+def test_a_player_that_seeks_shows_the_same_frame(path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")  # what the owners of Touch and Go extract their JPEGs with
+    player = cv2.VideoCapture(str(path))
+    for number, image in frames(path, (3, 60, 137)):
+        player.set(cv2.CAP_PROP_POS_FRAMES, number)
+        seen = player.read()[1][:, :, ::-1]
+        assert read_number(seen) == read_number(image) == (number, "touch")
+    player.release()
+
+
+def test_shrinking_is_that_of_pillow(made: dict[str, Path]) -> None:
+    rng = np.random.default_rng(0)
+    small = rng.integers(40, 215, (12, 16, 1), np.uint8).repeat(3, 2)  # gray: codecs store colour more coarsely
+    path = write_video(made["mpeg4"].with_name("noise.mp4"), 1, lambda _: small.repeat(10, 0).repeat(10, 1))
+    (_, whole), (_, shrunk) = *frames(path, [0]), *frames(path, [0], 50)
+    expected = np.asarray(Image.fromarray(whole).resize((50, 50), Image.Resampling.BILINEAR)).astype(int)
+    difference = np.abs(shrunk - expected)
+    assert difference.mean() < 2
+    nearest = np.asarray(Image.fromarray(whole).resize((50, 50), Image.Resampling.NEAREST)).astype(int)
+    assert np.abs(shrunk - nearest).mean() > 5  # dropping pixels would show
+
+
+@pytest.fixture
+def count(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """How often the decoder is started and how many packets it gets."""
+    counted = {"runs": 0, "packets": 0}
+    start, decode = video._Run.__init__, video._Run._decoded
+
+    def counting_start(self: Any, *args: Any) -> None:
+        counted["runs"] += 1
+        start(self, *args)
+
+    def counting_decode(self: Any, packet: Any) -> Any:
+        counted["packets"] += packet is not None
+        return decode(self, packet)
+
+    monkeypatch.setattr(video._Run, "__init__", counting_start)
+    monkeypatch.setattr(video._Run, "_decoded", counting_decode)
+    return counted
+
+
+def test_one_forward_pass_decodes_no_frame_twice_and_skips_the_rest(
+    made: dict[str, Path], count: dict[str, int]
+) -> None:
+    list(frames(made["mpeg4"], range(NUM)))
+    assert count == {"runs": 1, "packets": NUM}
+    count.update(runs=0, packets=0)
+    touches = [*range(20, 50), *range(100, 130)]  # key frames are at 0, 12, 24, ...
+    assert [number for number, _ in frames(made["mpeg4"], touches)] == touches
+    assert count == {"runs": 2, "packets": (50 - 12) + (130 - 96)}
+
+
+def test_frames_come_as_they_are_decoded(made: dict[str, Path], count: dict[str, int]) -> None:
+    found = frames(made["mpeg4"], range(NUM))
+    next(found)
+    assert count["packets"] <= 2  # not a list of all in disguise
+
+
+def test_order_and_repetition_of_the_request_do_not_matter(made: dict[str, Path]) -> None:
+    assert [number for number, _ in frames(made["mpeg4"], (40, 3, 40, 17))] == [3, 17, 40]
+    assert list(frames(made["mpeg4"], ())) == []
+
+
+# -- damage -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("harm", ["zeros", "noise", "bit"])
+def test_a_damaged_packet_costs_frames_up_to_the_next_key_frame_and_no_other(
+    path: Path, tmp_path: Path, harm: str
+) -> None:
+    good = dict(frames(path, range(NUM)))
+    at, size = packets_of(path)[75]
+    whole = path.read_bytes()[at : at + size]
+    middle = size // 2
+    data = {
+        "zeros": bytes(size),
+        "noise": np.random.default_rng(1).bytes(size),
+        "bit": whole[:middle] + bytes([whole[middle] ^ 16]) + whole[middle + 1 :],
+    }[harm]
+    hurt = copy_with(path, tmp_path / path.name, at, data)
+    lost: dict[int, str] = {}
+    found = dict(frames(hurt, range(NUM), lost=lost))
+    assert sorted({*found, *lost}) == list(range(NUM))
+    assert not {*found} & {*lost}
+    # One bit may be harmless to the picture; anything that is shown must be right.
+    assert all(np.abs(image.astype(int) - good[number]).max() < 40 for number, image in found.items())
+    assert all(read_number(image)[0] == number for number, image in found.items())
+    if harm != "bit":
+        assert lost
+        with pytest.raises(ValueError, match=f"frame {min(lost)} cannot be decoded|frame {min(lost)} is beyond"):
+            list(frames(hurt, range(NUM)))
+
+
+def test_a_lost_chunk_shifts_no_number(made: dict[str, Path], tmp_path: Path) -> None:
+    at, size = packets_of(made["avi"])[75]
+    hurt = copy_with(
+        made["avi"], tmp_path / "v.avi", at + 8, bytes(size)
+    )  # up to the middle of the next chunk's header
+    lost: dict[int, str] = {}
+    found = {number: read_number(image)[0] for number, image in frames(hurt, range(NUM), lost=lost)}
+    assert found == {number: number for number in found} and {*range(75)} <= {*found} and 76 in lost
+    assert any("disagree" in why for why in lost.values())
+    again = frames(hurt, [100], lost=lost)  # found through the table, behind the damage
+    assert [read_number(image)[0] for _, image in again] == [100]
+
+
+def test_a_file_cut_off_before_its_table_says_so(made: dict[str, Path], tmp_path: Path) -> None:
+    whole = made["mpeg4"].read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"cut\.mp4 cannot be read as a video .* damaged or cut off, fetch it again"):
+        num_frames(tmp_path / "cut.mp4")
+
+
+def test_a_file_cut_off_behind_its_table_gives_what_it_holds(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", NUM, lambda i: numbered(i, "touch"), flags={"movflags": "faststart"})
+    at = packets_of(path)[80][0]
+    (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[:at])
+    lost: dict[int, str] = {}
+    found = dict(frames(tmp_path / "cut.mp4", range(70, 90), lost=lost))
+    assert {*range(70, 80)} == {*found} and {*range(80, 90)} == {*lost}
+    with pytest.raises(ValueError, match="frame 85 is beyond the end of what can be read: the file is cut off"):
+        list(frames(tmp_path / "cut.mp4", [85]))
+
+
+def test_frames_that_are_not_there(made: dict[str, Path]) -> None:
+    with pytest.raises(ValueError, match="frame 150 is wanted, the video ends after frame 149"):
+        list(frames(made["mpeg4"], [3, 150]))
+    with pytest.raises(ValueError, match="frame -1 is wanted: frames are counted from 0"):
+        list(frames(made["mpeg4"], [-1]))
+    lost: dict[int, str] = {}
+    assert [i for i, _ in frames(made["mpeg4"], [149, 150, 900], lost=lost)] == [149]
+    assert sorted(lost) == [150, 900]
+
+
+def test_files_that_are_no_videos(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("not a video " * 100)
+    (tmp_path / "empty.mp4").touch()
+    for name in ("text.mp4", "empty.mp4"):
+        with pytest.raises(ValueError, match=f"{name} cannot be read as a video"):
+            num_frames(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match=r"gone\.mp4"):
+        num_frames(tmp_path / "gone.mp4")
+    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
+        stream = container.add_stream("aac", rate=48000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 48000
+        for packet in [*stream.encode(frame), *stream.encode(None)]:
+            container.mux(packet)
+    with pytest.raises(ValueError, match="holds no video"):
+        num_frames(tmp_path / "sound.mp4")
+
+
+def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", 10, lambda i: numbered(i, "touch"))
+    assert num_frames(path) == 10
+    write_video(path, 25, lambda i: numbered(i, "touch"))
+    assert num_frames(path) == 25
+
+
+def test_decoding_needs_no_torch() -> None:
+    code = "import sys, mvitac.data.video; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not here")
+def test_real_gelsight_videos() -> None:
+    for path in sorted(REAL.glob("*/gelsight.mp4")):
+        times = np.load(path.with_name("time2.npy"))
+        assert num_frames(path) == len(times)
+        with av.open(str(path)) as container:
+            plain = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        for number, image in frames(path, (5, 6, 100, 137, len(times) - 1)):
+            assert np.array_equal(image, plain[number])

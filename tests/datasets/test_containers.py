@@ -1,0 +1,401 @@
+"""Images inside something else: LeRobot datasets in and out, tars, parquet of the hub; each pixel beside its own row."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.datasets.hub import HubConfig
+from mvitac.datasets.lerobot import writer
+from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
+from mvitac.datasets.lerobot.writer import write_lerobot
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.datasets.table.video_times import nearest
+from mvitac.datasets.webdataset import WebDatasetConfig
+from support.films import film, shade
+from support.toy import Toy
+
+
+def packed(config: RowsConfig, out: Path) -> Pack:
+    return build(config.source(), out, size=config.size, quiet=True)
+
+
+def png(value: int, size: tuple[int, int] = (20, 16)) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", size, (value, value, value)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def level(image: np.ndarray) -> float:
+    return float(image.mean())
+
+
+# -- LeRobot ----------------------------------------------------------------------------------------------------------
+
+FRONT, GEL = "observation.images.front", "observation.images.gelsight"
+LENGTHS = (12, 8, 10)
+
+
+def make_lerobot(root: Path, *, gel_rate: int = 10, version: str = "v3.0") -> Path:
+    """Three episodes at 10 Hz: front embedded in two data files, the gel in two videos of ``gel_rate``."""
+    info = {
+        "codebase_version": version,
+        "fps": 10,
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+        "features": {
+            FRONT: {"dtype": "image", "shape": [16, 20, 3]},
+            GEL: {"dtype": "video", "shape": [48, 64, 3]},
+            "kind": {"dtype": "int64", "shape": [1]},
+            "observation.state": {"dtype": "float32", "shape": [2]},
+            **{n: {"dtype": "int64", "shape": [1]} for n in ("frame_index", "episode_index", "index", "task_index")},
+            "timestamp": {"dtype": "float32", "shape": [1]},
+        },
+    }
+    (root / "meta/episodes/chunk-000").mkdir(parents=True)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    index = "__index_level_0__"
+    pq.write_table(pa.table({"task_index": [0, 1], index: ["press", "slide"]}), root / "meta/tasks.parquet")
+    factor = gel_rate // 10
+    film(root / f"videos/{GEL}/chunk-000/file-000.mp4", 20 * factor, which=1, rate=gel_rate)
+    film(root / f"videos/{GEL}/chunk-000/file-001.mp4", 10 * factor, which=2, rate=gel_rate)
+    key, at = f"videos/{GEL}", ((0, 0.0, 1.2), (0, 1.2, 2.0), (1, 0.0, 1.0))
+    names = ("file_index", "from_timestamp", "to_timestamp")
+    episodes = [
+        {"episode_index": e, f"{key}/chunk_index": 0, **{f"{key}/{n}": v for n, v in zip(names, values, strict=True)}}
+        for e, values in enumerate(at)
+    ]
+    pq.write_table(pa.Table.from_pylist(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
+    rows: list[dict[str, Any]] = []
+    for e, length in enumerate(LENGTHS):
+        for i in range(length):
+            row = {"frame_index": i, "episode_index": e, "index": len(rows), "task_index": e % 2, "kind": e % 2}
+            image = {"bytes": png(10 * e + i), "path": None}
+            rows.append({FRONT: image, "timestamp": i / 10, "observation.state": [1.0, 2.0], **row})
+    for file, part in enumerate((rows[:12], rows[12:])):
+        path = root / f"data/chunk-000/file-{file:03d}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist(part), path, row_group_size=5)
+    return root
+
+
+@pytest.mark.parametrize("gel_rate", [10, 30])
+def test_lerobot_pairs_by_time(tmp_path: Path, gel_rate: int) -> None:
+    root = make_lerobot(tmp_path / "set", gel_rate=gel_rate)
+    pack = packed(LeRobotConfig(path=root, size=16, labels=("kind",), tolerance=0.01), tmp_path / "pack")
+    assert pack.num == sum(LENGTHS)
+    for i in range(pack.num):
+        e, frame = int(pack.column("episode")[i]), int(pack.column("frame")[i])
+        assert (pack.images["vision"][i] == 10 * e + frame).all()
+        at, which = ((frame, 1), (12 + frame, 1), (frame, 2))[e]
+        assert abs(level(pack.images["touch"][i]) - shade(at * gel_rate // 10, which)) < 6
+        assert pack.column("task")[i] == ("press", "slide")[e % 2]
+    assert pack.spec.group_by == "episode"
+
+
+def test_lerobot_takes_every_nth_row(tmp_path: Path) -> None:
+    root = make_lerobot(tmp_path / "set")
+    pack = packed(LeRobotConfig(path=root, size=16, labels=("kind",), every=4), tmp_path / "pack")
+    assert sorted(pack.column("frame").astype(int)) == [0, 0, 0, 4, 4, 4, 8, 8]
+
+
+def test_lerobot_beyond_the_tolerance(tmp_path: Path) -> None:
+    root = make_lerobot(tmp_path / "set")
+    film(root / f"videos/{GEL}/chunk-000/file-001.mp4", 6, which=2, rate=10)  # the third episode's touch ends early
+    config = LeRobotConfig(path=root, size=16, labels=("kind",), split="by-group")
+    with pytest.raises(ValueError, match=r"no frame within 0\.04 s of 0\.600 s \(episode 2, the nearest is 0\.100 s"):
+        config.source()
+    pack = packed(LeRobotConfig(path=root, size=16, labels=("kind",), allow_missing=True), tmp_path / "pack")
+    late = (pack.column("episode") == "2") & (pack.column("frame").astype(int) > 5)
+    assert (pack.has("touch") == ~late).all() and late.sum() == 4
+
+
+def test_lerobot_takes_no_frame_of_another_episode(tmp_path: Path) -> None:
+    root = make_lerobot(tmp_path / "set")
+    file = root / "meta/episodes/chunk-000/file-000.parquet"
+    episodes = pq.read_table(file).to_pylist()
+    episodes[0][f"videos/{GEL}/to_timestamp"] = 1.1  # the frame at 1.1 s, which row 11 would want, is the next one's
+    pq.write_table(pa.Table.from_pylist(episodes), file)
+    with pytest.raises(ValueError, match=r"no frame within 0\.04 s of 1\.100 s \(episode 0, the nearest is 0\.100 s"):
+        LeRobotConfig(path=root, size=16, labels=("kind",)).source()
+
+
+def test_nearest_of_two_rates() -> None:
+    times, wanted = np.arange(10) / 15, np.arange(20) / 30 + 0.01
+    at, away = nearest(times, wanted)
+    brute = np.abs(times[None] - wanted[:, None])
+    assert np.allclose(away, brute.min(1))
+    assert np.allclose(brute[np.arange(20), at], brute.min(1))
+    assert nearest(np.array([2.0]), np.array([1.0, 5.0]))[1].tolist() == [1.0, 3.0]
+
+
+def test_cameras_are_chosen_or_guessed() -> None:
+    where, three = Path("set"), ["cam.front", "cam.tactile_l", "cam.tactile_r"]
+    assert choose(three, None, (), where) == {"left": "cam.tactile_l", "right": "cam.tactile_r", "vision": "cam.front"}
+    assert choose(three, "", ("cam.front",), where) == {"cam.front": "cam.front"}
+    assert choose(["a", "b"], "b", ("a",), where) == {"a": "a", "b": "b"}
+    assert choose(["front", "finger_cam", "gel"], "finger_cam", (), where) == {
+        "touch": "gel",
+        "finger_cam": "finger_cam",
+    }
+    assert choose(["front", "finger_cam"], "finger_cam", (), where) == {"finger_cam": "finger_cam"}  # never both senses
+    assert choose(["digital_front", "digit_left"], None, (), where) == {
+        "touch": "digit_left",
+        "vision": "digital_front",
+    }
+    for vision, touch, says in (("cam.frnt", (), "did you mean 'cam.front'"), (None, ("x",), "unknown camera 'x'")):
+        with pytest.raises(ValueError, match=says):
+            choose(three, vision, touch, where)
+    with pytest.raises(ValueError, match="3 cameras that may be touch"):
+        choose(["touch1", "touch2", "touch3"], None, (), where)
+
+
+def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
+    def refused(root: Path, says: str) -> None:
+        with pytest.raises(ValueError, match=says) as caught:
+            LeRobotConfig(path=root, labels=("kind",)).source()
+        assert "\n" not in str(caught.value)
+
+    refused(tmp_path / "nowhere", r"info\.json does not exist")
+    refused(make_lerobot(tmp_path / "old", version="v2.1"), r"version v2\.1, this reads v3\.0: convert it")
+    root = make_lerobot(tmp_path / "set")
+    (root / f"videos/{GEL}/chunk-000/file-001.mp4").unlink()
+    refused(root, r"file-001\.mp4 is missing: fetch the videos too")
+    (root / "data/chunk-000/file-001.parquet").write_text("no")
+    refused(root, r"file-001\.parquet is not a parquet file")
+
+
+@pytest.fixture(params=[3, 6])
+def toy(request: pytest.FixtureRequest, tmp_path: Path) -> Pack:
+    return build(Toy(touch_channels=request.param), tmp_path / "toy", size=32, quiet=True)
+
+
+def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "FILE_BYTES", 100_000)  # several files
+    assert main(["data", "export-lerobot", str(toy.path), "--out", str(tmp_path / "set"), "--fps", "25"]) == 0
+    assert len(list((tmp_path / "set/data/chunk-000").iterdir())) > 2
+    names = ("label_pattern", "label_bright")
+    options: dict[str, Any] = {"labels": names, "group": "group", "touch_group": "touch_group", "split": "split"}
+    back = packed(LeRobotConfig(path=tmp_path / "set", size=32, **options), tmp_path / "back")
+    assert back.num == toy.num and back.spec.touch_channels == toy.spec.touch_channels
+    order = np.argsort(toy.touch_groups, kind="stable")
+    at = order[back.column("id").astype(int)]  # lerobot's index counts the rows as written
+    for modality in toy.images:
+        assert (back.images[modality] == toy.images[modality][at]).all()
+    for name in ("group", "split"):
+        assert (back.column(name) == toy.column(name)[at]).all()
+    assert (back.column("id_in_pack") == toy.column("id")[at]).all()
+    assert (back.column("label_label_bright") == toy.column("label_bright")[at]).all()
+    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    assert "crc_touch" in toy.table.column_names and not {"crc_vision", "crc_touch"} & set(features)
+    times = back.column("timestamp").astype(float)
+    assert np.allclose(times * 25, back.column("frame").astype(int), atol=1e-4)
+    episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert sum(e["length"] for e in episodes) == toy.num
+    for e in episodes:
+        data = pq.read_table(tmp_path / f"set/data/chunk-000/file-{e['data/file_index']:03d}.parquet").to_pylist()
+        mine = [row for row in data if row["episode_index"] == e["episode_index"]]
+        assert [row["index"] for row in mine] == list(range(e["dataset_from_index"], e["dataset_to_index"]))
+
+
+def test_columns_named_like_the_formats_own_survive_it(tmp_path: Path) -> None:
+    class Named(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (s,) = super().read(item)
+            given = {"frame": 100 + item, "episode": f"e{item}", "timestamp": item / 2, "task": "press", "index": -item}
+            return [Sample(vision=s.vision, touch=s.touch, columns={**s.columns, **given, "task_in_pack": "older"})]
+
+    pack = build(Named(), tmp_path / "pack", size=32, quiet=True)
+    write_lerobot(pack, tmp_path / "set")
+    back = packed(
+        LeRobotConfig(path=tmp_path / "set", size=32, labels=("label_pattern",), group="group"), tmp_path / "b"
+    )
+    at = {name: i for i, name in enumerate(pack.column("id"))}
+    rows = [at[name] for name in back.column("id_in_pack")]
+    for name in ("frame", "episode", "index"):
+        assert back.column(f"{name}_in_pack").tolist() == [str(pack.column(name)[i]) for i in rows]
+    assert back.column("timestamp_in_pack").astype(float).tolist() == [pack.column("timestamp")[i] for i in rows]
+    assert set(back.column("task_in_pack")) == {"older"} and set(back.column("task_in_pack_in_pack")) == {"press"}
+    assert set(back.column("frame").astype(int)) <= set(range(pack.num))  # and these are the format's
+
+
+def test_export_leaves_gaps_out_and_never_overwrites(tmp_path: Path) -> None:
+    class Holes(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (s,) = super().read(item)
+            has = item % 3 != 0
+            columns = {**s.columns, "has_touch": has}
+            return [Sample(vision=s.vision, touch=s.touch if has else None, columns=columns)]
+
+    pack = build(Holes(), tmp_path / "pack", size=32, quiet=True)
+    assert write_lerobot(pack, tmp_path / "set") == 80
+    with pytest.raises(ValueError, match="already exists"):
+        write_lerobot(pack, tmp_path / "set")
+    with pytest.raises(ValueError, match="fps 0"):
+        write_lerobot(pack, tmp_path / "other", fps=0)
+
+
+# -- WebDataset -------------------------------------------------------------------------------------------------------
+
+
+def add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+    member = tarfile.TarInfo(name)
+    member.size = len(content)
+    tar.addfile(member, io.BytesIO(content))
+
+
+def make_tars(root: Path, mode: str = "w") -> Path:
+    root.mkdir(parents=True)
+    for shard in (0, 1):
+        with tarfile.open(root / f"shard-{shard}.tar", mode) as tar:  # type: ignore[call-overload]
+            for i in range(12 * shard, 12 * shard + 12):
+                known = {"material": ("wood", "metal")[i // 2 % 2], "object": i // 2, "force": i / 2, "pose": [1, 2]}
+                add(tar, f"set/{i:04d}.vision.png", png(i))
+                add(tar, f"set/{i:04d}.json", json.dumps(known).encode())
+                if i != 5:
+                    add(tar, f"set/{i:04d}.touch.PNG", png(100 + i))
+                add(tar, f"set/{i:04d}.cls", b"7\n")
+    return root
+
+
+def test_a_webdataset_is_read_in_place(tmp_path: Path) -> None:
+    root = make_tars(tmp_path / "tars")
+    options: dict[str, Any] = {"labels": ("material",), "group": "object", "size": 16, "controls": ("force=force",)}
+    with pytest.raises(ValueError, match=r"row 6 has no touch path: .*allow_missing"):
+        WebDatasetConfig(path=root, **options).source()
+    pack = packed(WebDatasetConfig(path=root, allow_missing=True, **options), tmp_path / "pack")
+    assert pack.num == 24
+    for row, name in enumerate(pack.column("id")):
+        i = int(name.split("/")[1])
+        assert (pack.images["vision"][row] == i).all()
+        assert (pack.images["touch"][row] == (0 if i == 5 else 100 + i)).all()
+        assert pack.column("label_material")[row] == (1, 0)[i // 2 % 2]
+        assert pack.column("force")[row] == i / 2
+    one = packed(WebDatasetConfig(path=root / "shard-1.tar", **options), tmp_path / "one")
+    assert one.num == 12
+
+
+def test_the_cache_knows_another_tar_of_the_same_size(tmp_path: Path) -> None:
+    """By its time or, where that is the same too, by where its members lie."""
+    options, packs = WebDatasetConfig(path=tmp_path / "shard.tar", size=16, workers=1), []
+    for value, extra, when in ((40, 0, 10), (200, 0, 20), (90, 3, 20)):
+        with tarfile.open(options.path, "w") as tar:
+            for i in range(8):
+                add(tar, f"{i:04d}.touch.png", png(value) + bytes(extra))
+                add(tar, f"{i:04d}.json", json.dumps({"split": "train" if i < 4 else "test"}).encode())
+        os.utime(options.path, (when, when))
+        packs.append(options.open(quiet=True))
+    assert len({pack.meta["fingerprint"]["file_sizes"] for pack in packs}) == 1
+    assert [int(pack.images["touch"][0, 0, 0, 0]) for pack in packs] == [40, 200, 90]
+
+
+def test_tars_that_cannot_be_read(tmp_path: Path) -> None:
+    root = make_tars(tmp_path / "gz", "w:gz")
+    (tmp_path / "empty").mkdir()
+    with tarfile.open(tmp_path / "bare.tar", "w") as tar:
+        add(tar, "a.json", b"{}")
+    for path, says in (
+        (root, r"shard-0\.tar cannot be read as a tar that is not compressed"),
+        (tmp_path / "empty", r"is no \.tar and holds none"),
+        (tmp_path / "bare.tar", "holds no images"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            WebDatasetConfig(path=path).source()
+
+
+# -- parquet of the hub -----------------------------------------------------------------------------------------------
+
+
+def make_hub(root: Path) -> Path:
+    """Two train files and one test file, class numbers whose names stand in the metadata, one image beside the file."""
+    features = {"kind": {"names": ["wood", "metal"], "_type": "ClassLabel"}, "touch": {"_type": "Image"}}
+    note = {b"huggingface": json.dumps({"info": {"features": features}}).encode()}
+    root.mkdir(parents=True)
+    names = ("train-00000-of-00002", "train-00001-of-00002", "test-00000-of-00001")
+    for file, name in enumerate(names):
+        rows: list[dict[str, Any]] = []
+        for i in range(10 * file, 10 * file + 10):
+            image: dict[str, Any] = {"bytes": png(i), "path": f"{i}.png"}
+            if i == 13:
+                (root / "13.png").write_bytes(png(13))
+                image["bytes"] = None
+            rows.append(
+                {"touch": image, "photo": png(100 + i), "kind": -1 if i == 4 else i // 2 % 2, "thing": f"t{i // 2}"}
+            )
+        table = pa.Table.from_pylist(rows)
+        pq.write_table(table.replace_schema_metadata(note), root / f"{name}.parquet", row_group_size=4)
+    return root
+
+
+def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
+    root = make_hub(tmp_path / "data")
+    config = HubConfig(path=root, size=16, labels=("kind",), group="thing", vision="photo")
+    pack = packed(config, tmp_path / "pack")
+    assert pack.num == 30
+    assert pack.spec.tasks[0].classes == ("metal", "wood")
+    for row, i in enumerate(int(level(image)) for image in pack.images["touch"]):
+        assert (pack.images["vision"][row] == 100 + i).all()
+        assert pack.column("label_kind")[row] == (-1 if i == 4 else (1, 0)[i // 2 % 2])
+        assert pack.column("group")[row] == f"t{i // 2}"
+        assert pack.column("split")[row] == ("test" if i >= 20 else "train")
+    assert len({level(image) for image in pack.images["touch"]}) == 30
+
+
+def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
+    rows = [{"touch": b"no picture" if i == 3 else png(i), "kind": i % 2} for i in range(20)]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "bad.parquet")
+    source = HubConfig(path=tmp_path / "bad.parquet", labels=("kind",), size=16).source()
+    with pytest.raises(
+        ValueError, match=r"1 of 20 samples cannot be read, first row 4: .*bad\.parquet row group 0 row 3"
+    ):
+        build(source, tmp_path / "none", size=16, quiet=True)
+    pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
+    assert [level(image) for image in pack.images["touch"]] == [i for i in range(20) if i != 3]
+    assert [name for name, _ in pack.meta["damaged"]] == ["row 4"]
+
+
+def test_hub_files_name_their_split_all_or_none(tmp_path: Path) -> None:
+    root = make_hub(tmp_path / "data")
+    options: dict[str, Any] = {"path": root, "size": 16, "labels": ("kind",), "group": "thing"}
+    (root / "train-00001-of-00002.parquet").rename(root / "more.parquet")
+    with pytest.raises(ValueError, match=r"the name of more\.parquet says no split, others do: begin it with train-"):
+        HubConfig(**options).source()
+    assert HubConfig(**options, split="by-group").source().spec().group_by == "thing"
+
+
+def test_hub_gaps_of_a_column_whose_name_has_dots(tmp_path: Path) -> None:
+    images = [None if i == 3 else {"bytes": png(i), "path": None} for i in range(20)]
+    rows = [{"obs.touch": image, "photo": png(i), "kind": i % 2} for i, image in enumerate(images)]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "gaps.parquet")
+    options: dict[str, Any] = {"labels": ("kind",), "vision": "photo", "touch": ("obs.touch",), "size": 16}
+    pack = packed(HubConfig(path=tmp_path / "gaps.parquet", allow_missing=True, **options), tmp_path / "pack")
+    assert pack.num == 20 and level(pack.images["vision"][~pack.has("touch")]) == 3
+
+
+def test_hub_parquet_with_gaps_or_without_images(tmp_path: Path) -> None:
+    rows = [{"touch": None if i == 3 else png(i), "photo": png(i), "kind": i % 2} for i in range(20)]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "gaps.parquet")
+    options: dict[str, Any] = {"labels": ("kind",), "vision": "photo", "size": 16}
+    with pytest.raises(ValueError, match="row 4 has no touch path"):
+        HubConfig(path=tmp_path / "gaps.parquet", **options).source()
+    pack = packed(HubConfig(path=tmp_path / "gaps.parquet", allow_missing=True, **options), tmp_path / "pack")
+    assert (~pack.has("touch")).sum() == 1 and level(pack.images["vision"][~pack.has("touch")]) == 3
+    pq.write_table(pa.table({"a": [1, 2]}), tmp_path / "bare.parquet")
+    with pytest.raises(ValueError, match="has no image column"):
+        HubConfig(path=tmp_path / "bare.parquet", **options).source()
+    with pytest.raises(ValueError, match=r"is no \.parquet and holds none"):
+        HubConfig(path=tmp_path / "nowhere", **options).source()

@@ -1,0 +1,700 @@
+"""The generic reader: right pixels beside right labels, honest splits, and every mistake named before work begins."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.images import decode, fit, shrink
+from mvitac.data.pack import Pack
+from mvitac.datasets.folder import FolderConfig
+from mvitac.datasets.table.splits import assign_splits
+from mvitac.datasets.table.table import Rows
+from mvitac.recipes import recipe
+from mvitac.registry import from_json, to_json
+from mvitac.run import Run
+from mvitac.system.files import cache_dir
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+NUM = 24
+Table = list[dict[str, Any]]
+
+
+def colour(row: int, which: int) -> tuple[int, int, int]:
+    """A colour that belongs to one image of one row alone."""
+    return (10 * row, 80 * which, 255 - 5 * row)
+
+
+def make_rows(root: Path) -> Table:
+    """24 rows of plain pictures: 8 objects x 3 touches, 2 materials, one object unlabelled, three image columns."""
+    rows: Table = []
+    for i in range(NUM):
+        for which, name in enumerate(("vision", "left", "right")):
+            path = root / name / f"{i:02d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (20, 16), colour(i, which)).save(path)
+        place = i // 3
+        rows.append(
+            {
+                "vision": f"vision/{i:02d}.png",
+                "left": f"left/{i:02d}.png",
+                "right": f"right/{i:02d}.png",
+                "material": ("wood", "metal")[place % 2] if place < 7 else "",
+                "stiffness": (place * 2) % 12,
+                "object": f"{place:03d}",
+                "seq": i % 3,
+                "width": 1.5 * i,
+                "side": "train" if place < 4 or place == 7 else "val" if place == 4 else "test",
+            }
+        )
+    return rows
+
+
+def write(rows: Table, file: Path) -> Path:
+    if file.suffix == ".csv":
+        with file.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]) if rows else ["vision", "touch"])
+            writer.writeheader()
+            writer.writerows(rows)
+    elif file.suffix == ".jsonl":
+        file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    else:
+        pq.write_table(pa.Table.from_pylist(rows), file)
+    return file
+
+
+@pytest.fixture
+def rows(tmp_path: Path) -> Table:
+    return make_rows(tmp_path)
+
+
+def config(path: Path, **options: Any) -> FolderConfig:
+    """A reader of ``make_rows``, small enough to pack at once."""
+    given: dict[str, Any] = {"labels": ("material",), "group": "object", "size": 16, "path": path}
+    return FolderConfig(**(given | options))
+
+
+def packed(options: FolderConfig, out: Path, *, workers: int = 1) -> Pack:
+    return build(options.source(), out, size=options.size, workers=workers, quiet=True)
+
+
+# -- content ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{"split": "side"}, {}, {"only": ("seq>=1",)}, {"only": ("object!=002", "seq=1")}])
+def test_every_image_stands_beside_its_own_row(tmp_path: Path, rows: Table, options: dict[str, Any]) -> None:
+    pack = packed(config(write(rows, tmp_path / "manifest.csv"), **options), tmp_path / "pack")
+    assert pack.spec.touch_channels == 6
+    assert pack.spec.vision_channels == 3
+    for i, name in enumerate(pack.column("id")):
+        row = int(name) - 1
+        assert (pack.images["vision"][i] == colour(row, 0)).all()
+        assert (pack.images["touch"][i] == (*colour(row, 1), *colour(row, 2))).all()  # left first, then right
+        assert pack.column("object")[i] == rows[row]["object"] == pack.column("group")[i]
+        label = pack.column("label_material")[i]
+        assert (("metal", "wood", "")[label]) == rows[row]["material"]
+
+
+def test_two_sensors_stack_in_the_order_given(tmp_path: Path, rows: Table) -> None:
+    options = config(write(rows, tmp_path / "manifest.csv"), touch=("right", "left"), vision="")
+    pack = packed(options, tmp_path / "pack")
+    assert pack.spec.modalities == ("touch",)
+    assert (pack.images["touch"][5] == (*colour(5, 2), *colour(5, 1))).all()
+
+
+def test_csv_parquet_and_jsonl_give_one_pack(tmp_path: Path, rows: Table) -> None:
+    digests, options = set(), {"split": "side", "controls": ("width=width", "which=object"), "labels": ("stiffness",)}
+    for suffix in ("csv", "parquet", "jsonl"):
+        folder = tmp_path / suffix
+        digests.add(
+            packed(config(write(make_rows(folder), folder / f"manifest.{suffix}"), **options), folder / "p").digest
+        )
+    assert len(digests) == 1
+
+
+def test_two_workers_give_the_pack_of_one(tmp_path: Path, rows: Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    many = [row for row in rows for _ in range(6)]
+    options = config(write(many, tmp_path / "manifest.csv"))
+    one = packed(options, tmp_path / "one")
+    sent: list[Rows] = []
+    monkeypatch.setattr(Rows, "__getstate__", lambda self: sent.append(self) or self.__dict__, raising=False)
+    assert packed(options, tmp_path / "two", workers=2).digest == one.digest
+    assert len(sent) <= 2  # to each worker once, not with each of five parts
+
+
+def test_paths_are_relative_to_the_manifest_and_the_fingerprint_to_nothing(tmp_path: Path) -> None:
+    prints = []
+    for place in ("here/set", "there/below/set"):
+        write(make_rows(tmp_path / place), tmp_path / place / "manifest.csv")
+        prints.append(config(tmp_path / place).source().fingerprint())
+    assert prints[0] == prints[1]
+    assert str(tmp_path) not in json.dumps(prints[0])
+    assert config(tmp_path / place, split_seed=1).source().fingerprint() != prints[0]
+    Image.new("RGB", (64, 64), (1, 2, 3)).save(tmp_path / place / "vision" / "03.png")
+    assert config(tmp_path / place).source().fingerprint() != prints[0]
+
+
+# -- files that change ------------------------------------------------------------------------------------------------
+
+
+def write_plain(folder: Path, level: int, when: int, *, suffix: str = "bmp") -> FolderConfig:
+    """40 plain pictures, of one size as BMP, all written at second ``when``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"{i}.{suffix}" for i in range(40)]
+    for name in names:
+        Image.new("RGB", (16, 16), (level, 0, 0)).save(folder / name)
+        os.utime(folder / name, (when, when))
+    rows = [{"touch": name, "split": "train" if i < 20 else "test"} for i, name in enumerate(names)]
+    return FolderConfig(path=write(rows, folder / "manifest.csv"), size=16, workers=1)
+
+
+def test_the_cache_knows_changed_files_of_the_same_size(tmp_path: Path) -> None:
+    sets = [("x", 40, 10), ("y", 200, 20), ("x", 90, 30), ("x", 90, 30)]  # two of one name, one written over, unchanged
+    packs = [write_plain(tmp_path / name / "session", level, when).open(quiet=True) for name, level, when in sets]
+    assert [int(pack.images["touch"][0, 0, 0, 0]) for pack in packs] == [40, 200, 90, 90]
+    assert packs[2].path == packs[3].path and len({pack.path for pack in packs}) == 3
+    assert packs[0].meta["fingerprint"] == packs[1].meta["fingerprint"], "when files were written is not told"
+
+
+def seen_while_packing(options: FolderConfig, out: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Items that are read."""
+    seen: list[int] = []
+    read = Rows.read
+    with monkeypatch.context() as patch:
+        patch.setattr(Rows, "read", lambda self, item: seen.append(item) or read(self, item))
+        packed(options, out)
+    return seen
+
+
+@pytest.mark.parametrize("suffix", ["bmp", "png"])
+def test_a_repaired_image_costs_its_part_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """Of the same size (BMP) or not (PNG)."""
+    options = write_plain(tmp_path / "set", 200, 10, suffix=suffix)
+    bad = tmp_path / "set" / f"5.{suffix}"
+    good = bad.read_bytes()
+    bad.write_bytes(b"x" * (len(good) if suffix == "bmp" else 7))
+    with pytest.raises(ValueError, match=r"1 of 40 items cannot be read, first row 6: .*repair it"):
+        packed(options, tmp_path / "p")
+    bad.write_bytes(good)
+    os.utime(bad, (20, 20))
+    assert seen_while_packing(options, tmp_path / "p", monkeypatch) == list(range(32))
+    assert (Pack(tmp_path / "p").images["touch"][:, :, :, 0] == 200).all()
+
+
+def test_an_unfinished_pack_of_files_that_have_all_changed_mixes_no_old_pixels(tmp_path: Path) -> None:
+    options = write_plain(tmp_path / "set", 200, 10)
+    bad = tmp_path / "set" / "5.bmp"
+    bad.write_bytes(bytes(bad.stat().st_size))
+    with pytest.raises(ValueError, match="1 of 40 items cannot be read"):
+        packed(options, tmp_path / "p")
+    pack = packed(write_plain(tmp_path / "set", 90, 20), tmp_path / "p")
+    assert (pack.images["touch"][:, :, :, 0] == 90).all()
+    straight = packed(options, tmp_path / "straight")
+    assert (pack.path / "pack.json").read_bytes() == (straight.path / "pack.json").read_bytes()
+
+
+def test_an_unfinished_pack_of_another_table_is_not_continued(tmp_path: Path) -> None:
+    options = write_plain(tmp_path / "set", 200, 10)
+    (tmp_path / "set" / "5.bmp").write_bytes(b"x")
+    for changed in ({}, {"only": ("split!=val",)}):
+        with pytest.raises(ValueError, match="something else" if changed else "cannot be read"):
+            packed(replace(options, **changed), tmp_path / "p")
+
+
+def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_path: Path, rows: Table) -> None:
+    floats = [{**row, "stiffness": float(row["stiffness"]) if row["stiffness"] else float("nan")} for row in rows]
+    for suffix in ("csv", "parquet", "jsonl"):
+        file = write(floats, tmp_path / f"{suffix}.{suffix}")
+        spec = config(file, labels=("stiffness", "material"), split="side", allow_leak=True).source().spec()
+        assert [t.classes for t in spec.tasks] == [("2", "4", "6", "8", "10"), ("metal", "wood")]
+
+
+def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Table) -> None:
+    pack = packed(config(write(rows, tmp_path / "m.csv"), label_only=("seq<=1",)), tmp_path / "pack")
+    labels = pack.column("label_material")
+    assert pack.num == NUM
+    assert (labels[pack.column("seq").astype(int) == 2] == -1).all()
+    assert set(pack.column("split")[pack.column("group") == "007"]) == {"unlabelled"}  # no label at all
+    assert (labels[pack.rows("unlabelled")] == -1).all()
+
+
+def test_controls_are_numbers_or_one_hot(tmp_path: Path, rows: Table) -> None:
+    options = config(write(rows, tmp_path / "m.csv"), controls=("how wide=width", "mixed=width,side"))
+    pack = packed(options, tmp_path / "pack")
+    assert pack.spec.controls == {"how wide": ("width",), "mixed": ("width", "side=test", "side=train", "side=val")}
+    assert pack.column("width").tolist() == [row["width"] for row in rows]
+    one_hot = np.stack([pack.column(c) for c in pack.spec.controls["mixed"][1:]], axis=1)
+    assert (one_hot.sum(1) == 1).all()
+    assert ((one_hot[:, 0] == 1) == (pack.column("side") == "test")).all()
+
+
+def test_has_touch_is_seen_not_believed(tmp_path: Path, rows: Table) -> None:
+    rows = [{**row, "has_touch": "True", "has_vision": ""} for row in rows]
+    pack = packed(config(write(rows, tmp_path / "m.csv")), tmp_path / "pack")
+    assert pack.has("touch").all() and not {"has_touch", "has_vision"} & set(pack.table.column_names)
+
+
+def test_a_control_must_not_take_the_place_of_a_column_of_the_pack(tmp_path: Path, rows: Table) -> None:
+    rows = [{**row, "group": i // 3} for i, row in enumerate(rows)]
+    with pytest.raises(
+        ValueError, match=r"control column 'group' holds numbers and has the name of a column of the pack"
+    ):
+        config(write(rows, tmp_path / "m.csv"), group="group", controls=("which=group",)).source()
+
+
+def test_a_config_survives_json(tmp_path: Path) -> None:
+    run = recipe("smoke", config(tmp_path, controls=("a=b",), only=("seq<=4",), vision=""))
+    assert from_json(Run, json.loads(json.dumps(to_json(run)))) == run
+
+
+def test_reading_needs_no_torch() -> None:
+    code = "import sys, mvitac.datasets.folder; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# -- class folders ----------------------------------------------------------------------------------------------------
+
+
+def picture(path: Path, shade: int = 0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (16, 16), (shade, 0, 0)).save(path)
+    return path
+
+
+def test_class_folders_pair_by_name(tmp_path: Path) -> None:
+    for i in range(12):
+        kind = ("brick", "moss")[i % 2]
+        picture(tmp_path / f"vision/{kind}/{i}.png", i)
+        picture(tmp_path / f"touch/{kind}/{i}.bmp", 100 + i)
+    (tmp_path / "vision/brick/notes.txt").write_text("no image")
+    pack = packed(FolderConfig(path=tmp_path, size=16), tmp_path / "pack")
+    assert pack.spec.tasks[0].classes == ("brick", "moss")
+    assert pack.num == 12
+    assert (pack.images["touch"][:, 0, 0, 0] == pack.images["vision"][:, 0, 0, 0] + 100).all()
+    assert (pack.column("label_label") == pack.images["vision"][:, 0, 0, 0] % 2).all()
+
+
+def test_class_folders_may_be_grouped_and_split(tmp_path: Path) -> None:
+    for split in ("train", "test"):
+        for i in range(8):
+            for gel in ("left", "right"):
+                picture(tmp_path / split / gel / ("soft", "hard")[i % 2] / f"{split}{i // 4}" / f"{i}.png")
+    pack = packed(FolderConfig(path=tmp_path, size=16), tmp_path / "pack")
+    assert pack.spec.touch_channels == 6
+    assert pack.spec.group_by == "group"
+    assert set(pack.column("group")) == {
+        f"{kind}/{s}{g}" for kind in ("soft", "hard") for s in ("train", "test") for g in "01"
+    }
+    assert all(split in group for split, group in zip(pack.column("split"), pack.column("group"), strict=True))
+
+
+# -- decoding ---------------------------------------------------------------------------------------------------------
+
+
+def test_sixteen_bits_are_scaled_not_clipped(tmp_path: Path) -> None:
+    values = np.arange(0, 65536, 257, dtype=np.uint16).reshape(16, 16)
+    Image.fromarray(values).save(tmp_path / "deep.png")
+    Image.fromarray(values).save(tmp_path / "deep.tif")
+    for name in ("deep.png", "deep.tif"):
+        image = np.asarray(decode(tmp_path / name))
+        assert image.dtype == np.uint8
+        assert image.shape == (16, 16, 3)
+        assert (image[..., 0].ravel() == np.arange(256)).all()
+        assert (image[..., 1] == image[..., 2]).all()
+
+
+def test_gray_palette_bilevel_and_alpha_become_rgb(tmp_path: Path) -> None:
+    rgb = Image.fromarray(np.random.default_rng(0).integers(0, 4, (12, 10, 3), np.uint8) * 80)
+    gray = rgb.convert("L")
+    gray.save(tmp_path / "gray.png")
+    assert (np.asarray(decode(tmp_path / "gray.png")) == np.asarray(gray)[..., None]).all()
+    palette = rgb.quantize(256)
+    palette.save(tmp_path / "palette.png")
+    assert decode(tmp_path / "palette.png") == palette.convert("RGB")
+    gray.point(lambda v: 255 * (v > 99)).convert("1").save(tmp_path / "bits.png")
+    assert set(np.unique(decode(tmp_path / "bits.png"))) == {0, 255}
+    alpha = np.dstack([np.asarray(rgb), np.full((12, 10), 255, np.uint8)])
+    alpha[0, :, 3] = 0
+    Image.fromarray(alpha).save(tmp_path / "alpha.png")
+    seen = np.asarray(decode(tmp_path / "alpha.png"))
+    assert (seen[0] == 0).all()
+    assert (seen[1:] == np.asarray(rgb)[1:]).all()
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L"])
+def test_exif_rotation_is_applied(tmp_path: Path, mode: str) -> None:
+    upright = Image.new(mode, (30, 20))
+    upright.paste(255 if mode == "L" else (255, 255, 255), (0, 0, 30, 5))  # a bright top edge
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was turned: rotate by 90 degrees clockwise to see it upright
+    upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "turned.png", exif=exif)
+    seen = np.asarray(decode(tmp_path / "turned.png"))
+    assert seen.shape == (20, 30, 3)
+    assert (seen[:5] == 255).all()
+    assert (seen[5:] == 0).all()
+
+
+def test_shrunk_without_its_array_it_has_the_same_pixels(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8)
+    for mode, name in [("RGB", "a.jpg"), ("RGB", "a.png"), ("L", "l.jpg"), ("CMYK", "c.jpg"), ("RGBA", "a.webp")]:
+        Image.fromarray(pixels).convert(mode).save(tmp_path / name)
+        array = np.asarray(decode(tmp_path / name))
+        for size in (16, 60, 75, 90, 128):
+            assert (shrink(decode(tmp_path / name), size) == fit(array, size)).all(), (name, size)
+    Image.fromarray(pixels[:, :60]).save(tmp_path / "square.png")
+    assert (shrink(decode(tmp_path / "square.png"), 60) == pixels[:, :60]).all()
+
+
+def damage_truncated(path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    Image.fromarray(noise).save(path, "JPEG")
+    path.write_bytes(path.read_bytes()[:2000])
+
+
+def damage_png(path: Path) -> None:
+    whole = bytearray(path.read_bytes())
+    whole[30:] = bytes(len(whole) - 30)
+    path.write_bytes(whole)
+
+
+def damage_frames(path: Path) -> None:
+    frames = [Image.new("L", (16, 16), shade) for shade in (0, 255)]
+    frames[0].save(path, "GIF", save_all=True, append_images=frames[1:])
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "not an image": (lambda path: path.write_text("hello"), "cannot"),
+    "truncated": (damage_truncated, "truncated"),
+    "broken png": (damage_png, "cannot"),
+    "animation": (damage_frames, "2 frames"),
+    "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
+    "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "16 bits"),
+    "other size": (lambda path: Image.new("RGB", (9, 9)).save(path), "one size"),
+    "gone": (lambda path: path.unlink(), "not exist any more"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_image_is_named_or_counted(tmp_path: Path, rows: Table, kind: str) -> None:
+    damage, says = DAMAGE[kind]
+    source = config(write(rows, tmp_path / "m.csv")).source()
+    damage(tmp_path / "left" / "04.png")
+    with pytest.raises(ValueError, match=rf"first row 5: .*04\.png .*{says}") as caught:
+        build(source, tmp_path / "pack", size=16, quiet=True)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "pack").exists()
+    pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
+    assert pack.num == NUM - 1
+    assert pack.meta["damaged"][0][0] == "row 5"
+
+
+# -- splits -----------------------------------------------------------------------------------------------------------
+
+
+def test_dealt_splits_never_share_a_group() -> None:
+    rng = np.random.default_rng(0)
+    for trial in range(300):
+        num_groups, num_classes = int(rng.integers(2, 60)), int(rng.integers(1, 8))
+        groups = [f"g{g}" for g in rng.integers(0, num_groups, int(rng.integers(num_groups, 400)))]
+        target = rng.integers(-1, num_classes, len(groups)).tolist()
+        test, val = rng.uniform(0.1, 0.4), rng.uniform(0, 0.4)
+        splits = assign_splits(groups, [target], test, val, trial)
+        home = dict(zip(groups, splits, strict=True))
+        assert all(home[group] == split for group, split in zip(groups, splits, strict=True))
+        order = rng.permutation(len(groups))
+        again = assign_splits([groups[i] for i in order], [[target[i] for i in order]], test, val, trial)
+        assert again == [splits[i] for i in order]  # rows may come in any order
+        unlabelled = {g for g in home if all(t < 0 for t, h in zip(target, groups, strict=True) if h == g)}
+        assert {g for g, split in home.items() if split == "unlabelled"} == unlabelled
+        num = len(home) - len(unlabelled)
+        dealt = [split for split in home.values() if split != "unlabelled"]
+        assert dealt.count("test") <= np.ceil(num * test)
+        assert dealt.count("val") <= np.ceil(num * val)
+
+
+def test_dealing_is_stratified_and_the_shares_are_kept() -> None:
+    groups = [f"{g:03d}" for g in range(200)]
+    target = [g % 4 for g in range(200)]
+    for seed in range(5):
+        splits = np.array(assign_splits(groups, [target], 0.25, 0.15, seed))
+        assert (splits == "test").sum() in range(48, 53)
+        assert (splits == "val").sum() in range(28, 33)
+        for kind in range(4):
+            assert (splits[np.array(target) == kind] == "test").sum() in range(11, 15)
+    assert assign_splits(groups, [target], 0.25, 0.15, 0) != assign_splits(groups, [target], 0.25, 0.15, 1)
+
+
+def test_a_leaking_split_is_refused_unless_allowed(tmp_path: Path, rows: Table) -> None:
+    rows[0]["side"] = "test"
+    file = write(rows, tmp_path / "m.csv")
+    with pytest.raises(ValueError, match=r"leaks: 1 of 8 groups \(object\).*'000' in test and train.*by-group"):
+        config(file, split="side").source()
+    assert config(file, split="side", allow_leak=True).source().items()
+    assert config(file).source().items()
+
+
+def test_another_way_to_write_a_path_hides_no_leak(tmp_path: Path, rows: Table) -> None:
+    other = next(row for row in rows if row["side"] == "test")
+    first = next(row for row in rows if row["side"] == "train")
+    other["left"] = f"./left/../{first['left']}"
+    with pytest.raises(ValueError, match="leaks: 1 of 23 left images are on two sides"):
+        config(write(rows, tmp_path / "m.csv"), split="side").source()
+
+
+def test_train_and_unlabelled_are_one_side(tmp_path: Path, rows: Table) -> None:
+    rows[0]["side"] = "unlabelled"
+    assert config(write(rows, tmp_path / "m.csv"), split="side").source().items()
+
+
+# -- every mistake is named before work begins ------------------------------------------------------------------------
+
+Change = Callable[[Table], object]
+
+
+def each(**cells: Any) -> Change:
+    return lambda rows: [row.update(cells) for row in rows]
+
+
+def one(number: int, **cells: Any) -> Change:
+    return lambda rows: rows[number - 1].update(cells)
+
+
+def without(*columns: str) -> Change:
+    return lambda rows: [row.pop(column) for row in rows for column in columns]
+
+
+def numbered(**patterns: str) -> Change:
+    return lambda rows: [row.update({k: v.format(i) for k, v in patterns.items()}) for i, row in enumerate(rows)]
+
+
+def many_names(rows: Table) -> None:
+    rows[:] = [{**rows[i % NUM], "side": f"s{i}"} for i in range(3 * NUM)]
+
+
+BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
+    "unknown label": (None, {"labels": ("materials",)}, r"unknown column 'materials'.*did you mean 'material'"),
+    "unknown group": (None, {"group": "objekt"}, r"'objekt'.*did you mean 'object'"),
+    "unknown touch group": (None, {"touch_group": "grasp"}, r"unknown column 'grasp': choose from vision, left"),
+    "unknown split": (None, {"split": "fold"}, r"unknown column 'fold'"),
+    "unknown vision": (None, {"vision": "visoin"}, r"'visoin'.*did you mean 'vision'"),
+    "unknown touch": (None, {"touch": ("lefft",)}, r"'lefft'.*did you mean 'left'"),
+    "unknown control": (None, {"controls": ("w=wide",)}, r"'wide'"),
+    "unknown filter": (None, {"only": ("seqq<=1",)}, r"'seqq'.*did you mean 'seq'"),
+    "unknown label filter": (None, {"label_only": ("sek=1",)}, r"'sek'"),
+    "no image column": (without("vision", "left", "right"), {}, r"has no column vision, touch, or left"),
+    "one gel only": (without("vision", "right"), {}, r"name the image columns"),
+    "empty manifest": (lambda rows: rows.clear(), {}, r"m\.csv is empty"),
+    "missing file": (one(7, left="left/none.png"), {}, r"1 of 72 image files .*row 7 left left/none\.png"),
+    "many missing files": (numbered(vision="no/{}.png"), {}, r"24 of 72 .*row 1 vision .*row 3"),
+    "folder for a file": (one(2, vision="vision"), {}, r"row 2 vision vision"),
+    "empty path": (one(3, right=""), {}, r"row 3 has no right path"),
+    "one class": (each(material="wood"), {}, r"'material' has only the class 'wood' in 24 rows"),
+    "no labels": (each(material=""), {}, r"'material' has no labels"),
+    "NaN labels": (each(material=float("nan")), {}, r"'material' has no labels"),
+    "label like a name": (numbered(material="m{}"), {}, r"'material' has another value in each of its 24 rows"),
+    "empty group": (one(9, object=""), {}, r"column 'object' \(group\) is empty in 1 rows, first row 9"),
+    "empty split": (
+        one(5, side=""),
+        {"split": "side"},
+        r"'side' \(split\) is empty in 1 rows, first row 5; write one of train",
+    ),
+    "validation": (
+        one(13, side="validation"),
+        {"split": "side"},
+        r"row 13: unknown split in column 'side' 'validation': choose from train, val, test, unlabelled.*write 'val'",
+    ),
+    "unseen": (one(24, side="unseen"), {"split": "side"}, r"row 24: .*'unseen'.*write 'test'"),
+    "Train": (one(1, side="Train"), {"split": "side"}, r"row 1: .*write 'train'"),
+    "strange split": (one(1, side="fold1"), {"split": "side"}, r"row 1: .*'fold1'.*by-group"),
+    "leak of a group": (
+        one(1, side="test"),
+        {"split": "side"},
+        r"1 of 8 groups \(object\) are on two sides, e\.g\. '000' in test and train",
+    ),
+    "leak of a touch": (each(seq=0), {"touch_group": "seq"}, r"1 of 1 touch groups \(seq\).*give the group"),
+    "leak of an image": (each(vision="vision/00.png"), {}, r"1 of 1 vision images are on two sides"),
+    "nothing to train on": (each(side="test"), {"split": "side"}, r"'side' gives no rows of train"),
+    "nothing to test": (
+        each(side="train"),
+        {"split": "side"},
+        r"'side' gives label 'material' no labelled rows in test",
+    ),
+    "one group": (each(object="a"), {}, r"dealing 1 groups gives label 'material' no labelled rows in test"),
+    "filter leaves nothing": (None, {"only": ("seq>=9",)}, r"none of 24 rows meets seq>=9"),
+    "control with gaps": (
+        one(4, width=""),
+        {"controls": ("w=width",)},
+        r"'width' is empty in 1 labelled rows, first row 4",
+    ),
+    "control of names": (many_names, {"controls": ("w=side",)}, r"'side' has 72 values that are not numbers"),
+    "id twice": (each(id="a"), {}, r"id 'a' stands in several rows"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_manifests_are_named_before_anything_is_written(tmp_path: Path, rows: Table, name: str) -> None:
+    change, options, says = BAD[name]
+    if change:
+        change(rows)
+    file = write(rows, tmp_path / "m.csv")
+    before = set(cache_dir().glob("packs/*"))
+    with pytest.raises(ValueError, match=says) as caught:
+        config(file, **options).open(quiet=True)
+    assert "\n" not in str(caught.value)
+    assert set(cache_dir().glob("packs/*")) == before
+
+
+BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
+    "three sensors": ({"touch": ("a", "b", "c")}, "touch a b c: give one column, or two"),
+    "same column twice": ({"touch": ("a", "a")}, "'a' is named twice"),
+    "vision is touch": ({"vision": "a", "touch": ("a",)}, "'a' is named twice"),
+    "label twice": ({"labels": ("a", "a")}, "labels a a"),
+    "shares": ({"test_share": 0.6, "val_share": 0.4}, "leave nothing to train on"),
+    "negative share": ({"val_share": -0.1}, "val_share -0.1"),
+    "NaN share": ({"test_share": float("nan")}, "test_share nan"),
+    "seed": ({"split_seed": -1}, "split_seed -1"),
+    "control without column": ({"controls": ("width",)}, "'width': write it as name=column"),
+    "control without name": ({"controls": ("=width",)}, "write it as name=column"),
+    "control named like ours": ({"controls": ("border=width",)}, "'border' is made anyway"),
+    "control twice": ({"controls": ("a=b", "a=c")}, "a name of its own"),
+    "condition": ({"only": ("seq",)}, "condition 'seq': write column=value"),
+    "condition <": ({"only": ("seq<4",)}, "condition 'seq<4'"),
+    "condition on text": ({"label_only": ("seq<=few",)}, "needs a number, not 'few'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_OPTIONS)
+def test_bad_options_are_named_at_once(name: str) -> None:
+    options, says = BAD_OPTIONS[name]
+    with pytest.raises(ValueError, match=says):
+        FolderConfig(**options)
+
+
+BAD_FILES: dict[str, tuple[str, bytes, str]] = {
+    "semicolons": ("m.csv", b"vision;touch\na;b\n", "separate columns by commas"),
+    "ragged": ("m.csv", b"vision,touch\na,b\na,b,c\n", "row 2 has 3 cells for 2 columns"),
+    "header twice": ("m.csv", b"vision,vision\na,b\n", "column 'vision' twice"),
+    "nameless column": ("m.csv", b"vision,\na,b\n", "a column without a name"),
+    "latin-1": ("m.csv", "vision,touch\nMöbel,b\n".encode("latin-1"), "is not UTF-8 text"),
+    "only a header": ("m.csv", b"vision,touch\n", "is empty"),
+    "nothing": ("m.csv", b"", "is empty"),
+    "broken json": ("m.jsonl", b'{"vision": "a"}\n{"vision":\n', "line 2 is not JSON"),
+    "json list": ("m.jsonl", b"[1]\n", "line 1 is not an object"),
+    "no parquet": ("m.parquet", b"PAR1 not really", "is not a parquet file"),
+    "spreadsheet": ("m.xlsx", b"PK", r"must end in .csv, .parquet, .jsonl"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
+    file, content, says = BAD_FILES[name]
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(ValueError, match=says) as caught:
+        FolderConfig(path=tmp_path / file).source()
+    assert "\n" not in str(caught.value)
+    assert file in str(caught.value)
+
+
+def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
+    def refused(path: Path, says: str) -> None:
+        with pytest.raises(ValueError, match=says):
+            FolderConfig(path=path).source()
+
+    refused(tmp_path / "nowhere", "does not exist: give a manifest")
+    for suffix in ("csv", "jsonl"):
+        write(rows, tmp_path / f"manifest.{suffix}")
+    refused(tmp_path, "manifest.csv and manifest.jsonl")
+    (tmp_path / "bare").mkdir()
+    refused(tmp_path / "bare", "no folder vision, touch, left or right")
+    (tmp_path / "empty/vision").mkdir(parents=True)
+    refused(tmp_path / "empty", "holds no images")
+    lonely = tmp_path / "lonely"
+    picture(lonely / "vision/a/1.png")
+    picture(lonely / "touch/b/1.png")
+    refused(lonely, r"vision/a/1\.png has no counterpart .*touch/a/1")
+    picture(tmp_path / "flat/touch/1.png")
+    refused(tmp_path / "flat", "not in a class folder")
+    for suffix in ("png", "bmp"):
+        picture(tmp_path / f"twins/touch/a/1.{suffix}")
+    refused(tmp_path / "twins", "differ in their suffix only")
+    for name in ("train/vision/a/1", "train/touch/a/1", "test/touch/a/2"):
+        picture(tmp_path / f"half/{name}.png")
+    refused(tmp_path / "half", r"vision images in some splits only \(row")
+    for side, says in (("validation", "write 'val' instead"), ("other", "take it away")):
+        for name in ("train/a/1", "test/b/2", f"{side}/a/3"):
+            picture(tmp_path / f"{side} beside/{name}.png")
+        refused(tmp_path / f"{side} beside", rf"images in folder '{side}' beside train and test: {says}")
+
+
+def test_the_command_says_it_in_one_line(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write(rows, tmp_path / "m.csv")
+    common = ["data", "pack", "--data", "folder", "--path", str(file), "--quiet"]
+    assert main([*common, "--labels", "materiel", "--out", str(tmp_path / "bad")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("mvitac: error: ")
+    assert error.count("\n") == 1
+    assert "did you mean 'material'" in error
+    assert not list(tmp_path.glob("bad*"))
+    good = [
+        "--labels",
+        "material",
+        "--group",
+        "object",
+        "--size",
+        "16",
+        "--only",
+        "seq<=1",
+        "--out",
+        str(tmp_path / "good"),
+    ]
+    assert main([*common, *good]) == 0
+    assert Pack(tmp_path / "good").num == 16
+
+
+# -- the real sets, where they are ------------------------------------------------------------------------------------
+
+SETS = {
+    "slip_grasp": (
+        1092,
+        {"labels": ("success",), "group": "object", "touch_group": "grasp", "controls": ("width=width_mm",)},
+    ),
+    "slip_gsmini": (1812, {"labels": ("slip",), "group": "object", "only": ("label_conflict!=1",)}),
+    "physiclear": (
+        3797,
+        {"labels": ("material", "hardness", "roughness", "bumpiness"), "group": "object", "split": "by-group"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_real_sets_read_whole(tmp_path: Path, name: str) -> None:
+    if not (REAL / name / "manifest.csv").is_file():
+        pytest.skip(f"{name} is not beside the project")
+    num, options = SETS[name]
+    options = FolderConfig(path=REAL / name, size=32, **options)
+    source = options.source()
+    assert len(source.items()) == num
+    assert source.spec().name == name
+    few = replace(options, only=(*options.only, "seq=0"))
+    pack = packed(few, tmp_path / "pack")
+    for task in pack.spec.tasks:
+        labels = pack.column(f"label_{task.name}")
+        assert all((labels[pack.rows(split)] >= 0).any() for split in ("train", "test"))
+    groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
+    assert not groups["test"] & (groups["train"] | groups["val"])
+    assert all(images.reshape(len(images), -1).std(1).min() > 1 for images in pack.images.values())

@@ -1,0 +1,142 @@
+"""Rows that lack a modality: stored and marked, never trained on as a pair, never probed on what they lack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.datasets.pack import PackConfig
+from mvitac.deploy import search
+from mvitac.deploy.export import _examples, export
+from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.publish import fit_readouts
+from mvitac.evaluation import probe as probe_module
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.probe import split_rows
+from mvitac.model import Model, load
+from mvitac.recipes import recipe
+from mvitac.report.explorer_data import ExplorerData
+from mvitac.training import views as batches_module
+from mvitac.training.loop import train
+from mvitac.training.sampler import partners
+from support.toy import Toy
+
+
+@dataclass
+class Holes(Toy):
+    """Every fifth item without touch, every seventh without vision."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        has = {"vision": item % 7 != 3, "touch": item % 5 != 1}
+        columns = {**sample.columns, **{f"has_{m}": present for m, present in has.items()}}
+        images = {m: getattr(sample, m) if has[m] else None for m in has}
+        return [Sample(columns=columns, **images)]
+
+
+@pytest.fixture(scope="module")
+def holes(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Holes(), tmp_path_factory.mktemp("holes") / "pack", size=32, quiet=True)
+
+
+def test_holes_are_zeros_and_marked(holes: Pack) -> None:
+    items = np.arange(120)
+    for modality, lacking in (("vision", items % 7 == 3), ("touch", items % 5 == 1)):
+        assert (holes.has(modality) == ~lacking).all()
+        assert ((holes.images[modality].reshape(120, -1) == 0).all(1) == lacking).all()
+    both = set(holes.rows("train", having=("vision", "touch")))
+    assert both < set(holes.rows("train", having=("touch",))) < set(holes.rows("train"))
+
+
+def test_a_pack_without_holes_has_everything(pack: Pack) -> None:
+    assert pack.has("vision").all() and pack.has("touch").all()
+    assert "has_touch" not in pack.table.column_names
+
+
+@pytest.mark.parametrize("column", [True, None])
+def test_an_image_must_agree_with_its_mark(tmp_path: Path, column: bool | None) -> None:
+    class Lying(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            mark = {} if column is None else {"has_touch": column}
+            return [replace(sample, touch=None if item == 3 else sample.touch, columns={**sample.columns, **mark})]
+
+    with pytest.raises(ValueError, match="first item 3: no touch image, against its column has_touch"):
+        build(Lying(), tmp_path / "p", size=32, quiet=True)
+
+
+def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    real = batches_module.make_views
+    monkeypatch.setattr(
+        batches_module, "make_views", lambda run, pack, rows, *rest: seen.extend(rows) or real(run, pack, rows, *rest)
+    )
+    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=4, eval_every=4, positives="same-touch")
+    train(run, tmp_path / "run", quiet=True)
+    whole = holes.has("vision") & holes.has("touch")
+    assert whole[seen].all()
+    assert set(seen) <= set(holes.rows("train", "unlabelled"))
+
+    found = partners(holes, np.array(seen), torch.Generator().manual_seed(0))
+    assert whole[found].all()
+
+
+def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
+    train(run, tmp_path / "run", quiet=True)
+    asked: dict[str, set[int]] = {"vision": set(), "touch": set()}
+    real = probe_module.features
+
+    def features(model: object, pack: Pack, modality: str, rows: np.ndarray, **options: bool) -> np.ndarray:
+        asked[modality] |= set(rows.tolist())
+        return real(model, pack, modality, rows, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(probe_module, "features", features)
+    result = probe_runs([tmp_path / "run"], ProbeConfig(tasks=("pattern",)), holes)
+    for modality, rows in asked.items():
+        assert rows and holes.has(modality)[sorted(rows)].all()
+    task = holes.spec.tasks[0]
+    num = {r["modality"]: r["num_test"] for r in result["records"] if r["source"] == "mvitac"}
+    assert num == {m: len(split_rows(holes, task, m).test) for m in ("vision", "touch", "both")}
+    assert num["both"] < min(num["vision"], num["touch"])
+
+
+@pytest.fixture(scope="module")
+def model(holes: Pack, tmp_path_factory: pytest.TempPathFactory) -> Model:
+    run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
+    return load(train(run, tmp_path_factory.mktemp("holes") / "run", quiet=True))
+
+
+def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> None:
+    found = fit_readouts(model, holes)
+    for task in holes.spec.tasks:
+        for modality in ("vision", "touch", "both"):
+            assert found[f"{task.name}.{modality}"].question.num_test == len(split_rows(holes, task, modality).test)
+
+
+def test_an_export_is_checked_and_calibrated_on_what_is_there(holes: Pack, model: Model, tmp_path: Path) -> None:
+    report = export(model, holes, tmp_path / "x", kind="torch", modalities=("touch",))
+    assert report["num_rows"] == len(holes.rows("test", having=("touch",))) < len(holes.rows("test"))
+    examples = _examples(ExportModule(model, ("touch",)), holes)
+    assert len(examples) == len(holes.rows("train", "unlabelled", having=("touch",)))
+    assert all(x.any() for (x,) in examples)
+
+
+def test_what_is_not_there_is_not_searched_embedded_or_shown(holes: Pack, model: Model, tmp_path: Path) -> None:
+    whole = np.flatnonzero(holes.has("vision") & holes.has("touch"))
+    index = search.build(model, holes, tmp_path / "index")
+    assert index.table.column("row").to_pylist() == whole.tolist() == ExplorerData(model, holes).rows.tolist()
+    model.save(tmp_path / "model.safetensors")
+    arguments = ["embed", str(holes.path), "--model", str(tmp_path), "--out", str(tmp_path / "e.npz")]
+    assert main(arguments) == 0
+    found = np.load(tmp_path / "e.npz")
+    for m in ("vision", "touch"):
+        assert (np.isnan(found[m]).all(1) == ~holes.has(m)).all() and (np.isnan(found[m]).any(1) == ~holes.has(m)).all()

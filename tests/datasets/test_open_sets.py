@@ -1,0 +1,394 @@
+"""Real sets as one ``git clone`` brings them: fixtures in the owners' exact layout, and the genuine samples beside us."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.images import decode, shrink
+from mvitac.data.pack import Pack
+from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.physiclear import PhysiclearConfig
+from mvitac.datasets.slip_grasp import SlipGraspConfig
+from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
+from mvitac.datasets.table.splits import folds
+from mvitac.datasets.table.video_times import num_frames, spread
+from mvitac.datasets.vt60 import VT60Config
+from support.films import film, shade
+
+
+def plain(path: Path, value: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (32, 24), (value, value, value)).save(path, quality=95)
+
+
+def level(image: np.ndarray) -> float:
+    return float(image.mean())
+
+
+# -- the owners' layouts ----------------------------------------------------------------------------------------------
+
+
+def make_slip_grasp(root: Path) -> None:
+    """4 objects, 3 to 4 grasps, 21 frames each; the words for the outcome and the infix differ as they do there."""
+    for k in range(4):
+        lines, words = [], (("fail", "ok"), ("slip", "success"))[k % 2]
+        for g in range(3 + k % 2):
+            held, folder, infix = g % 2, f"04{k}_{2 * g}0", ("_s09_", "_s010_")[k % 2]
+            key = 1000 * (g + 1) + k
+            lines.append(f"4{k}.{2 * g} {words[held]} {held} {key - 200} {key + 60} {key} {folder} {infix}")
+            for frame in range(key - 5, key + 16):
+                for kind, shift in (("external", 0), ("gelsight", 100), ("gelsight_lab", 200)):
+                    name = f"{kind}_imgw{folder}{infix}{frame:08d}.jpg"
+                    plain(root / f"data/object{k + 1:03d}/{folder}_mm" / name, shift + frame - key + 5 + 25 * (g % 2))
+        (root / f"data/object{k + 1:03d}_result.dat").write_text("\n".join(lines))  # no final newline
+
+
+def make_slip_gsmini(root: Path) -> None:
+    """9 objects x 2 recordings, most of them copied elsewhere; one copy of one recording lacks its slip.txt."""
+    base = root / "docs/franka-servo/datasets"
+    for k in range(9):
+        name = "bag_peanuts" if k == 3 else f"thing_{k}"
+        side = "base_data_for_training" if k < 6 else "base_data_for_validation"
+        for n in (1, 2):
+            folder = base / "base_data" / side / name / f"exp_num_{n}"
+            film(folder / "camera_0.avi", 30 + n, which=k)
+            film(folder / "camera_2.avi", 30 + n, which=k + n + 1)
+            slips = (k + n) % 3 == 0
+            if slips:
+                (folder / "slip.txt").touch()
+            if k < 5:
+                other = "bag_of_peanuts" if k == 3 else name
+                copy = root / "docs/base_data" / side / other / f"exp_num_{n}"
+                shutil.copytree(folder, copy)
+                if k == 2 and slips:
+                    (copy / "slip.txt").unlink()
+    lonely = base / "thing_9/exp_num_1/camera_2.avi"
+    lonely.parent.mkdir(parents=True)
+    shutil.copy(folder / "camera_2.avi", lonely)
+
+
+THINGS = [f"thing_{k}" for k in range(12)]
+
+
+def make_physiclear(root: Path) -> None:
+    """12 rated things and one unrated, 2 videos each, labels in a constants.py that would raise if it were run."""
+    for k, thing in enumerate([*THINGS, "stranger"]):
+        for video in (0, 1):
+            film(root / f"dataset/{thing}_{video}.mov", 41, which=k + video)
+
+    def ranks(shift: int, values: tuple[Any, ...]) -> dict[str, Any]:
+        return {f"physiclear_{thing}": values[(k + shift) % len(values)] for k, thing in enumerate(THINGS)}
+
+    constants = {
+        "TRAIN_OBJECTS": [f"physiclear_{t}" for t in THINGS[:8]],
+        "VAL_OBJECTS": [f"physiclear_{t}" for t in THINGS[8:10]],
+        "TEST_OBJECTS": [f"physiclear_{t}" for t in THINGS[10:]],
+        "MATERIALS": ranks(0, ("wood", "metal")),
+        "HARDNESS_RANK": ranks(0, (0, 1, 2)),
+        "ROUGHNESS_RANK": ranks(1, (0, 1, 2)),
+        "TEXTURE_RANK": ranks(2, (0, 1, 2)),
+    }
+    text = "".join(f"{name} = {value!r}\n" for name, value in constants.items())
+    (root / "utils").mkdir(parents=True)
+    (root / "utils/constants.py").write_text(f"import nothing_there\n{text}RANKS = dict(h=HARDNESS_RANK)\n1 / 0\n")
+
+
+def make_vt60(root: Path) -> None:
+    base = root / "code/data/vt60"
+    for category in ("01_stapler", "02_bottleempty", "03_ball"):
+        for i in range(1, 7):
+            for k in range(3):
+                name = f"IMG_inst_{i}_img_{9 + k}_validframeID_{62 + k}.jpg"  # 9, 10, 11: not in the order of names
+                plain(base / f"vision/{category}/0{i}" / name, 10 * k + i)
+            for k in range(5):
+                name = f"touch_{i}_img_{8 + k}_name_{category[3:]}_red_at_{42094 + k}_-{k}_25275.jpg"
+                plain(base / f"touch/{category}/0{i}" / name, 100 + 10 * k + i)
+    for k in range(2):
+        plain(base / f"vision/03_ball/07/IMG_inst_7_img_{k}_validframeID_1.jpg", k)  # photos only
+
+
+SETS: dict[str, tuple[Callable[[Path], None], type[DatasetConfig]]] = {
+    "slip_grasp": (make_slip_grasp, SlipGraspConfig),
+    "slip_gsmini": (make_slip_gsmini, SlipGSMiniConfig),
+    "physiclear": (make_physiclear, PhysiclearConfig),
+    "vt60": (make_vt60, VT60Config),
+}
+
+
+@pytest.fixture(scope="module")
+def clones(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("clones")
+    for name, (make, _) in SETS.items():
+        make(root / name)
+    return root
+
+
+@pytest.fixture(scope="module")
+def packs(clones: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pack]:
+    out = tmp_path_factory.mktemp("packs")
+    configs = {name: kind(path=clones / name, size=16) for name, (_, kind) in SETS.items()}  # type: ignore[call-arg]
+    return {name: build(c.source(), out / name, size=16, quiet=True) for name, c in configs.items()}
+
+
+# -- what every reader owes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_contract(packs: dict[str, Pack], clones: Path, name: str) -> None:
+    pack = packs[name]
+    assert pack.spec.name == name
+    assert pack.spec.source.startswith("https://github.com/")
+    assert pack.spec.licence and pack.spec.licence != "unknown"
+    groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
+    assert groups["train"] and groups["test"]
+    assert not groups["test"] & (groups["train"] | groups["val"])
+    for task in pack.spec.tasks:
+        labels = pack.column(f"label_{task.name}")
+        assert all((labels[pack.rows(split)] >= 0).any() for split in ("train", "test"))
+    _, kind = SETS[name]
+    config = kind(path=clones / name, size=16)  # type: ignore[call-arg]
+    assert config.source().fingerprint() == kind(path=clones / name, size=16).source().fingerprint()  # type: ignore[call-arg]
+    assert str(clones) not in str(config.source().fingerprint())
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_something_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    for path, says in ((tmp_path / "nowhere", "does not exist"), (tmp_path, "holds no ")):
+        assert main(["data", "pack", "--data", name, "--path", str(path), "--out", str(tmp_path / "p")]) == 2
+        error = capsys.readouterr().err
+        assert says in error and "git clone https://github.com/" in error and error.count("\n") == 1
+
+
+def test_the_command(clones: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    common = [
+        "data",
+        "pack",
+        "--data",
+        "slip_grasp",
+        "--path",
+        str(clones / "slip_grasp"),
+        "--quiet",
+        "--size",
+        "16",
+        "--workers",
+        "1",
+    ]
+    assert main([*common, "--split", "fold3", "--only", "seq<=4", "--out", str(tmp_path / "p")]) == 0
+    pack = Pack(tmp_path / "p")
+    assert pack.num == 14 * 5
+    assert set(pack.column("fold3")[pack.rows("test")]) == {"test"}
+    assert len(set(pack.column("group")[pack.rows("test")])) == 1
+
+
+def test_every_group_is_tested_once() -> None:
+    groups = [f"g{i % 17}" for i in range(100)]
+    strata = [f"s{i % 17 % 3}" for i in range(100)]
+    columns = folds(groups, strata, 4)
+    tested = np.array([[side == "test" for side in column] for column in columns.values()])
+    assert (tested.sum(0) == 1).all()
+    for column in columns.values():
+        assert len({*zip(groups, column, strict=True)}) == 17
+        for stratum in set(strata):
+            inside = {g for g, s, side in zip(groups, strata, column, strict=True) if s == stratum and side == "test"}
+            assert len(inside) in (1, 2)
+    order = np.random.default_rng(0).permutation(100)
+    again = folds([groups[i] for i in order], [strata[i] for i in order], 4)
+    assert again["fold2"] == [columns["fold2"][i] for i in order]
+
+
+def test_frames_are_counted_and_spread(tmp_path: Path) -> None:
+    assert num_frames(film(tmp_path / "a.mov", 37)) == 37
+    assert spread(12, 450)[:3] == [0, 41, 82]
+    assert spread(12, 450)[-1] == 449
+    assert spread(8, 3) == [0, 1, 2]
+    assert spread(3, 101, 0.25, 0.75) == [25, 50, 75]
+    (tmp_path / "b.mov").write_text("nothing")
+    with pytest.raises(ValueError, match=r"b\.mov cannot be read as a video"):
+        num_frames(tmp_path / "b.mov")
+
+
+# -- what each of them says -------------------------------------------------------------------------------------------
+
+
+def test_slip_grasp_labels_no_late_frame_where_early_ones_are_lost(tmp_path: Path) -> None:
+    make_slip_grasp(tmp_path)
+    for path in (tmp_path / "data/object001").glob("*_mm/*.jpg"):
+        if int(path.stem[-8:]) % 1000 in (*range(995, 1000), 0):  # up to the key frame
+            path.unlink()
+    rows = [row for row in SlipGraspConfig(path=tmp_path).manifest().rows if row["object"] == "001"]
+    assert len(rows) == 3 * 15 and {int(row["seq"]) for row in rows} == {*range(6, 21)}
+
+
+def test_slip_grasp_pairs_by_frame(packs: dict[str, Pack]) -> None:
+    pack = packs["slip_grasp"]
+    assert pack.num == (3 + 4 + 3 + 4) * 21
+    seq, success = pack.column("seq").astype(int), pack.column("label_success")
+    late = pack.column("success").astype(int)
+    assert ((success == -1) == (seq > 4)).all()  # late frames show the outcome
+    assert (pack.column("frame_rel_key").astype(int) == seq - 5).all()
+    for i in range(0, pack.num, 7):
+        expected = seq[i] + 25 * late[i]
+        assert abs(level(pack.images["vision"][i]) - expected) < 3
+        assert abs(level(pack.images["touch"][i]) - expected - 100) < 3
+    assert set(pack.column("touch_group")) == {
+        f"{k + 1:03d}_04{k}_{2 * g}0" for k in range(4) for g in range(3 + k % 2)
+    }
+    first = pack.column("group") == "001"
+    assert np.isclose(np.unique(pack.column("width_in_sweep")[first]), [-0.2, 0.0, 0.2]).all()
+    assert pack.spec.controls["width"] == ("width_mm",)
+
+
+@pytest.mark.parametrize("line", ["68 fail 0 160", "68 fail ? 160 450 398 068_00 _s09_"])
+def test_slip_grasp_names_a_bad_line(tmp_path: Path, line: str) -> None:
+    make_slip_grasp(tmp_path)
+    (tmp_path / "data/object002_result.dat").write_text(f"\n{line}\n")
+    with pytest.raises(ValueError, match=r"object002_result\.dat line 2: .* is not a grasp"):
+        SlipGraspConfig(path=tmp_path).source()
+    (tmp_path / "data/object002_result.dat").write_text("9 ok 1 1 3 2 009_00 _s09_")
+    with pytest.raises(ValueError, match=r"no images in object002/009_00_mm"):
+        SlipGraspConfig(path=tmp_path).source()
+
+
+def test_slip_gsmini_counts_copies_once(packs: dict[str, Pack]) -> None:
+    pack = packs["slip_gsmini"]
+    assert pack.num == 9 * 2 * 12
+    assert pack.spec.touch_channels == 6
+    assert set(pack.column("group")) == {"bag_peanuts", *(f"thing_{k}" for k in range(9) if k != 3)}
+    for i in range(0, pack.num, 5):
+        thing, n = pack.column("group")[i], int(pack.column("experiment")[i][-1])
+        k, frame = 3 if thing == "bag_peanuts" else int(thing[-1]), int(pack.column("frame")[i])
+        assert abs(level(pack.images["touch"][i][..., :3]) - shade(frame, k)) < 6
+        assert abs(level(pack.images["touch"][i][..., 3:]) - shade(frame, k + n + 1)) < 6
+        conflict = k == 2 and (k + n) % 3 == 0
+        assert pack.column("label_slip")[i] == (-1 if conflict else int((k + n) % 3 == 0))
+        assert pack.column("label_conflict")[i] == str(int(conflict))
+        assert pack.column("author_split")[i] == ("train" if k < 6 else "val")
+        assert pack.column("n_frames")[i] == 30 + n
+    assert (pack.column("label_conflict") == "1").sum() == 12
+
+
+def test_physiclear_labels_are_read_not_run(packs: dict[str, Pack], clones: Path) -> None:
+    pack = packs["physiclear"]
+    assert pack.num == 13 * 2 * 8
+    assert [task.name for task in pack.spec.tasks] == ["material", "hardness", "roughness", "bumpiness"]
+    for i in range(pack.num):
+        thing, video = pack.column("video")[i].rsplit("_", 1)
+        k = 12 if thing == "stranger" else int(thing.split("_")[1])
+        frame = int(pack.column("frame")[i])
+        assert 12 <= frame <= 24
+        assert abs(level(pack.images["touch"][i]) - shade(frame, k + int(video))) < 6
+        expected = [-1] * 4 if k == 12 else [(k + 1) % 2, k % 3, (k + 1) % 3, (k + 2) % 3]
+        assert [pack.column(f"label_{task.name}")[i] for task in pack.spec.tasks] == expected
+    assert set(pack.column("split")[pack.column("group") == "stranger"]) == {"unlabelled"}
+    owners = PhysiclearConfig(path=clones / "physiclear", size=16, split="owners_split").source()
+    sides = {s.columns["object"]: s.columns["split"] for i in range(len(owners.items())) for s in owners.read(i)}
+    assert sides["stranger"] == "unlabelled"
+    assert [sides[thing] for thing in THINGS] == ["train"] * 8 + ["val"] * 2 + ["test"] * 2
+
+
+def test_physiclear_differences(clones: Path, tmp_path: Path) -> None:
+    config = PhysiclearConfig(path=clones / "physiclear", size=16, difference=True, frames=2)
+    pack = build(config.source(), tmp_path / "p", size=16, quiet=True)
+    k = 5
+    row = np.flatnonzero(pack.column("video") == f"thing_{k}_0")[0]
+    frame = int(pack.column("frame")[row])
+    assert abs(level(pack.images["touch"][row]) - (shade(frame, k) - shade(0, k) + 256) / 2) < 6
+
+
+def test_physiclear_newer_layout_and_missing_labels(clones: Path, tmp_path: Path) -> None:
+    shutil.copytree(clones / "physiclear", tmp_path / "new")
+    (tmp_path / "new/src").mkdir()
+    (tmp_path / "new/utils").rename(tmp_path / "new/src/utils")
+    assert PhysiclearConfig(path=tmp_path / "new").source().items()
+    file = tmp_path / "new/src/utils/constants.py"
+    file.write_text(file.read_text().replace("TEXTURE_RANK", "OTHER"))
+    with pytest.raises(ValueError, match="says nothing of TEXTURE_RANK"):
+        PhysiclearConfig(path=tmp_path / "new").source()
+    file.unlink()
+    with pytest.raises(ValueError, match=r"has no utils/constants\.py"):
+        PhysiclearConfig(path=tmp_path / "new").source()
+
+
+def test_vt60_pairs_are_weak_but_right(packs: dict[str, Pack]) -> None:
+    pack = packs["vt60"]
+    assert pack.num == 18 * 5
+    for row in range(pack.num):
+        i, k = int(pack.column("group")[row][-1]), int(pack.column("seq")[row])
+        assert abs(level(pack.images["vision"][row]) - (10 * (k % 3) + i)) < 3
+        assert abs(level(pack.images["touch"][row]) - (100 + 10 * k + i)) < 3
+        assert [pack.column(axis)[row] for axis in "xyz"] == [str(42094 + k), f"-{k}", "25275"]
+    assert pack.spec.tasks[0].classes == ("01_stapler", "02_bottleempty", "03_ball")
+
+
+# -- genuine images, put back where their owners keep them ------------------------------------------------------------
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def genuine(name: str) -> list[dict[str, str]]:
+    if not (REAL / name / "manifest.csv").is_file():
+        pytest.skip(f"{name} is not beside the project")
+    with (REAL / name / "manifest.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def link(target: Path, source: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.symlink_to(source)
+
+
+def test_genuine_slip_grasp(tmp_path: Path) -> None:
+    rows = genuine("slip_grasp")
+    lines: dict[str, dict[str, str]] = {}
+    for row in rows:
+        folder = row["grasp"].split("_", 1)[1]
+        for kind, column in (("external", "vision"), ("gelsight", "touch")):
+            name = f"{kind}_imgw{folder}_s09_{int(row['frame']):08d}.jpg"
+            link(tmp_path / f"data/object{row['object']}/{folder}_mm" / name, REAL / "slip_grasp" / row[column])
+        word = ("fail", "ok")[int(row["success"])]
+        line = f"{row['width_mm']} {word} {row['success']} 0 0 {row['key_frame']} {folder} _s09_"
+        lines.setdefault(row["object"], {})[folder] = line
+    for name, found in lines.items():
+        (tmp_path / f"data/object{name}_result.dat").write_text("\n".join(found.values()))
+    source = SlipGraspConfig(path=tmp_path, size=32).source()
+    assert len(source.items()) == len(rows) == 1092
+    expected = {(row["grasp"], row["seq"]): row for row in rows}
+    for item in range(0, 1092, 50):
+        (sample,) = source.read(item)
+        row = expected[sample.columns["grasp"], sample.columns["seq"]]
+        assert {k: sample.columns[k] for k in ("success", "frame", "frame_rel_key", "object")} == {
+            k: row[k] for k in ("success", "frame", "frame_rel_key", "object")
+        }
+        assert sample.columns["width_mm"] == float(row["width_mm"])
+        for modality in ("vision", "touch"):
+            assert (getattr(sample, modality) == shrink(decode(REAL / "slip_grasp" / row[modality]), 32)).all()
+
+
+def test_genuine_vt60(tmp_path: Path) -> None:
+    rows = genuine("vt60")
+    numbers: dict[str, int] = {}
+    for row in rows:
+        numbers[row["modality"] + row["object"]] = n = numbers.get(row["modality"] + row["object"], -1) + 1
+        at = f"at_{row['x']}_{row['y']}_{row['z']}"
+        touch = f"touch_{row['touch_group']}_img_{n}_name_{row['name']}_{at}.jpg"
+        vision = f"IMG_inst_{int(row['instance'])}_img_{n}_validframeID_{n}.jpg"
+        name = touch if row["modality"] == "touch" else vision
+        link(tmp_path / "code/data/vt60" / row["modality"] / row["object"] / name, REAL / "vt60" / row["image"])
+    source = VT60Config(path=tmp_path, size=32).source()
+    assert len(source.items()) == 2880
+    assert source.spec().tasks[0].classes == tuple(sorted({row["category"] for row in rows}))
+    (sample,) = source.read(1000)
+    touches = [row for row in rows if row["modality"] == "touch" and row["object"] == sample.columns["object"]]
+    row = touches[int(sample.columns["seq"])]
+    assert [sample.columns[axis] for axis in "xyz"] == [row[axis] for axis in "xyz"]
+    assert (sample.touch == shrink(decode(REAL / "vt60" / row["image"]), 32)).all()

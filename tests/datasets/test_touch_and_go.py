@@ -1,0 +1,505 @@
+"""Touch and Go as published: the lists to their counts, the tree to its pairs, the splits to what they share."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.data.video import frames
+from mvitac.datasets.table.splits import stratify
+from mvitac.datasets.touch_and_go.lists import (
+    CLASSES,
+    SOFT,
+    assign_by_recording,
+    assign_official,
+    find_touches,
+    leaks,
+    read_list,
+    read_lists,
+)
+from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig
+from mvitac.datasets.touch_and_go.recordings import Recording
+from mvitac.evaluation.probe import split_rows
+from support.videos import numbered, read_number, write_video
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+LISTS, SAMPLE = SHARED / "touch_and_go_lists", SHARED / "touch_and_go_sample"
+published = pytest.mark.skipif(not LISTS.is_dir(), reason="the published lists are not here")
+
+NAMES = [f"202205{day:02d}_120000" for day in range(1, 9)]
+NUM_FRAMES = 160
+TOUCHES = {"train": (range(20, 30), range(130, 145)), "test": (range(70, 78),)}
+"""Listed runs of frames of every recording but the last, which no list of categories names."""
+
+
+def write_tree(root: Path, *, jpegs: bool = False) -> Path:
+    """Eight recordings in the owners' layout. Recording r is of category 2 r and 2 r + 1; four are in the rough lists,
+    two of them on the other side than in the category lists."""
+    rows: dict[str, list[str]] = defaultdict(list)
+    for place, name in enumerate(NAMES):
+        folder = root / "dataset" / name
+        for stem, stream in (("video", "vision"), ("gelsight", "touch")):
+            if jpegs:
+                (folder / f"{stem}_frame").mkdir(parents=True)
+                for number in range(NUM_FRAMES):
+                    image = Image.fromarray(numbered(number, stream))
+                    image.save(folder / f"{stem}_frame" / f"{number:010d}.jpg", quality=95)
+            else:
+                write_video(folder / f"{stem}.mp4", NUM_FRAMES, lambda i, s=stream: numbered(i, s))
+        for side, runs in TOUCHES.items():
+            for touch, run in enumerate(runs):
+                label = (2 * place + touch) % 20
+                rows[side] += [f"{name}/{i:010d}.jpg,{label}" for i in run if place < 7]
+        rough = "train" if place < 2 or place == 7 else "test" if place < 4 else ""
+        for number in (*range(70, 74), *range(130, 134)) if rough else ():
+            rows[f"{rough}_rough"].append(f"{name}/{number:010d}.jpg,{int(number < 100)}")
+    rng = np.random.default_rng(0)
+    for name, lines in rows.items():  # the owners' are shuffled and end without a newline
+        (root / f"{name}.txt").write_text("\n".join(lines[i] for i in rng.permutation(len(lines))))
+    return root
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tree(tmp_path_factory.mktemp("tag"))
+
+
+def packed(root: Path, out: Path, *, workers: int = 1, max_damaged: float = 0.0, **options: Any) -> Pack:
+    config = TouchAndGoConfig(root=root, size=32, **options)
+    return build(config.source(), out, size=32, workers=workers, max_damaged=max_damaged, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def official(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return packed(tree, tmp_path_factory.mktemp("official") / "pack", split="official")
+
+
+# -- the published lists ----------------------------------------------------------------------------------------------
+
+
+@published
+def test_the_published_lists_parse_to_the_published_counts() -> None:
+    counts = {}
+    for name, num_classes in (("train", 20), ("test", 20), ("train_rough", 2), ("test_rough", 2)):
+        rows = read_list(LISTS / f"{name}.txt", num_classes)
+        counts[name] = (len(rows), len({recording for recording, _, _ in rows}))
+        assert min(label for _, _, label in rows) >= 0
+    assert counts == {
+        "train": (91_982, 120),
+        "test": (29_879, 106),
+        "train_rough": (35_119, 19),
+        "test_rough": (8_085, 4),
+    }
+    test = Counter(label for _, _, label in read_list(LISTS / "test.txt", 20))
+    assert round(1 - sum(test[label] for label in SOFT) / test.total(), 3) == 0.680  # hard
+    assert round(max(test.values()) / test.total(), 3) == 0.240
+    assert 10 not in test
+
+
+@published
+def test_the_published_lists_make_one_index_and_its_leaks_are_said() -> None:
+    listed = read_lists(LISTS)
+    assert len(listed) == 142_596 and len({frame.recording for frame in listed}) == 126
+    assert leaks(listed) == [
+        "official split: 100 of 106 test recordings are also in train (other touches)",
+        "official split: 3289 of 8085 rough/smooth test frames are in the pre-training list",
+    ]
+    find_touches(listed)
+    sides = defaultdict(set)
+    for frame in listed:
+        sides[frame.recording, frame.touch].add(frame.listed)
+    assert not any({"train", "test"} <= side for side in sides.values())  # the owners divide by touch
+    assign_official(listed, 0, 0)
+    assert Counter(frame.split for frame in listed)["train"] == 91_982
+    assert Counter(frame.split_rough for frame in listed if frame.rough >= 0) == {"train": 35_119, "test": 8_085}
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 4e6  # kB, of the whole test process
+
+
+@published
+def test_by_recording_gives_every_side_its_share_of_every_category() -> None:
+    listed = read_lists(LISTS)
+    assign_by_recording(listed, 0.25, 0.15, 0)
+    dealt = {frame.recording: frame.split for frame in listed}
+    assert all(dealt[frame.recording] == frame.split == frame.split_rough for frame in listed)
+    total, rows, places = Counter(), Counter(), defaultdict(set)
+    for frame in listed:
+        for task in [f"c{frame.category}"] * (frame.category >= 0) + [f"r{frame.rough}"] * (frame.rough >= 0):
+            total[task] += 1
+            rows[task, frame.split] += 1
+            places[task].add(frame.recording)
+    assert len(total) == 19 + 2
+    for task in total:
+        for side, share in (("train", 0.6), ("val", 0.15), ("test", 0.25)):
+            assert rows[task, side] > 0, (task, side)
+            if len(places[task]) >= 10:
+                assert abs(rows[task, side] / total[task] - share) < 0.13, (task, side)
+    before = [frame.split for frame in listed]
+    assign_by_recording(listed, 0.25, 0.15, 0)
+    assert [frame.split for frame in listed] == before
+    assign_by_recording(listed, 0.25, 0.15, 1)
+    assert [frame.split for frame in listed] != before
+
+
+# -- stratify ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stratify_reaches_the_best_where_it_can_be_counted(seed: int) -> None:
+    kinds = np.repeat(np.array([[10, 0, 0], [0, 20, 0], [5, 5, 0]]), 8, axis=0)  # 8 alike groups of each of 3 kinds
+    side = stratify(kinds, (0.5, 0.25, 0.25), seed)
+    dealt = np.stack([np.bincount(side[8 * k : 8 * k + 8], minlength=3) for k in range(3)])
+    assert dealt.tolist() == [[4, 2, 2]] * 3
+
+
+def test_stratify_of_little_or_nothing() -> None:
+    assert len(stratify(np.zeros((0, 3)), (0.5, 0.5), 0)) == 0
+    assert stratify(np.zeros((4, 3)), (0.5, 0.5), 0).sum() == 2
+    assert stratify(np.array([[5], [5]]), (0.5, 0.5), 3).sum() == 1
+
+
+# -- pairs ------------------------------------------------------------------------------------------------------------
+
+
+def check_pairs(pack: Pack) -> None:
+    """Both images of every row say the number in its id, and are of the modality they stand under."""
+    for row, name in enumerate(pack.column("id")):
+        number = int(name.split("/")[1])
+        assert number == pack.column("frame")[row]
+        for modality in pack.spec.modalities:
+            assert read_number(pack.images[modality][row]) == (number, modality)
+
+
+def test_frame_137_pairs_with_frame_137(official: Pack) -> None:
+    row = official.column("id").tolist().index(f"{NAMES[3]}/0000000137")
+    assert read_number(official.images["vision"][row]) == (137, "vision")
+    assert read_number(official.images["touch"][row]) == (137, "touch")
+    check_pairs(official)
+    assert official.num == 7 * (10 + 15 + 8) + 8  # the last recording: eight frames of the rough lists alone
+
+
+def test_jpegs_and_videos_give_the_same_pairs(official: Pack, tmp_path: Path) -> None:
+    pack = packed(write_tree(tmp_path, jpegs=True), tmp_path / "pack", split="official")
+    check_pairs(pack)
+    pixels = ["crc_vision", "crc_touch"]  # which two codecs do not leave alike
+    assert pack.table.drop_columns(pixels).equals(official.table.drop_columns(pixels))
+
+
+def test_a_video_is_preferred_and_the_choice_can_be_forced(tree: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tree, tmp_path / "both")
+    for name in NAMES:
+        for stem, stream in (("video", "vision"), ("gelsight", "touch")):
+            folder = root / "dataset" / name / f"{stem}_frame"
+            folder.mkdir()
+            for number in range(NUM_FRAMES):  # one more than the video's, to tell the two apart
+                Image.fromarray(numbered(number + 1, stream)).save(folder / f"{number:010d}.jpg", quality=95)
+    sources = {kind: TouchAndGoConfig(root=root, size=32, frames=kind).source() for kind in ("auto", "video", "jpeg")}
+    first = {kind: source.read(0)[0] for kind, source in sources.items()}
+    assert [read_number(first[kind].touch)[0] for kind in ("auto", "video", "jpeg")] == [20, 20, 21]  # type: ignore
+    assert len({json.dumps(source.fingerprint()) for source in sources.values()}) == 3
+
+
+def test_a_recording_is_read_in_bounded_pieces(tree: Path, tmp_path: Path) -> None:
+    (tmp_path / "dataset").symlink_to(tree / "dataset")
+    (tmp_path / "label.txt").write_text("\n".join(f"{n}/{i:010d}.jpg,{i % 3}" for n in NAMES[:2] for i in range(160)))
+    source = TouchAndGoConfig(root=tmp_path, size=32).source()
+    assert sum(source.samples_per_item()) == 320 and len(source.items()) == 2
+    assert all(sample.touch.nbytes == 32 * 32 * 3 for sample in source.read(0))  # type: ignore[union-attr]
+    assert CHUNK * 2 * 256 * 256 * 3 < 128e6
+
+
+def test_two_workers_give_the_pack_of_one(official: Pack, tree: Path, tmp_path: Path) -> None:
+    assert packed(tree, tmp_path / "two", split="official", workers=2).digest == official.digest
+
+
+# -- labels, splits, touches ------------------------------------------------------------------------------------------
+
+
+def test_three_tasks_share_the_rows(official: Pack) -> None:
+    category, soft, rough = (official.column(f"label_{task}") for task in ("category", "soft", "rough"))
+    assert [task.classes for task in official.spec.tasks[1:]] == [("hard", "soft"), ("smooth", "rough")]
+    assert official.spec.tasks[0].classes == CLASSES and len(CLASSES) == 20
+    assert ((category < 0) == (soft < 0)).all()
+    assert (soft[category >= 0] == np.isin(category[category >= 0], SOFT)).all()
+    last = official.column("group") == NAMES[7]
+    assert (category[last] == -1).all() and (rough[last] >= 0).all()
+    frame = official.column("frame")
+    assert (rough[rough >= 0] == (frame[rough >= 0] < 100)).all()
+
+
+def test_the_official_split_is_the_lists(official: Pack) -> None:
+    category, rough = official.spec.tasks[0], official.spec.tasks[2]
+    frame, place = official.column("frame"), np.array([NAMES.index(name) for name in official.column("group")])
+    found = split_rows(official, category)
+    assert set(frame[found.test]) == {*range(70, 78)}
+    assert {*found.train, *found.val} == {*np.flatnonzero(((frame < 70) | (frame >= 130)) & (place < 7))}
+    found = split_rows(official, rough)
+    assert set(place[found.test]) == {2, 3} and set(place[[*found.train, *found.val]]) == {0, 1, 7}
+    # Pre-training sees the owners' list and nothing else.
+    seen = official.rows("train", "unlabelled")
+    assert len(seen) == 7 * 25 and set(frame[seen]) == {*range(20, 30), *range(130, 145)}
+    # A method that learns from labels is not told those of the rough test list, whose frames it sees.
+    assert (official.labels(rough.name, "train")[np.isin(place, (2, 3))] == -1).all()
+    assert (official.column("label_rough")[seen][np.isin(place[seen], (2, 3))] >= 0).any()
+    assert official.spec.notes[0] == "official split: 7 of 7 test recordings are also in train (other touches)"
+    assert official.spec.notes[1] == "official split: 8 of 16 rough/smooth test frames are in the pre-training list"
+
+
+def test_val_is_carved_from_train_by_recording(tree: Path, tmp_path: Path) -> None:
+    pack = packed(tree, tmp_path / "pack", split="official", val_share=0.3, modalities="touch")
+    group = pack.column("group")
+    held, kept = set(group[pack.rows("val")]), set(group[pack.rows("train")])
+    assert held and kept and not held & kept
+    assert set(pack.column("frame")[pack.rows("val")]) == {*range(20, 30), *range(130, 145)}
+
+
+def test_by_recording_shares_no_recording(tree: Path, tmp_path: Path) -> None:
+    pack = packed(tree, tmp_path / "pack", unlabelled=10, modalities="touch")
+    group = pack.column("group")
+    sides = [set(group[pack.rows(*names)]) for names in (("train", "unlabelled"), ("val",), ("test",))]
+    assert all(sides) and sum(map(len, sides)) == len(set().union(*sides)) == 8
+    assert not pack.spec.notes and pack.spec.name == "touch-and-go (by-recording)"
+    for task in pack.spec.tasks:
+        assert task.split == "split"
+
+
+def test_runs_of_frames_are_touches(official: Pack) -> None:
+    runs = defaultdict(list)
+    for touch, frame in zip(official.column("touch_group"), official.column("frame"), strict=True):
+        runs[touch].append(int(frame))
+    assert len(runs) == 7 * 3 + 2
+    for touch, members in runs.items():
+        assert members == list(range(members[0], members[-1] + 1))
+        assert touch.endswith(f"/{members[0]:010d}")
+
+
+def test_frames_without_a_label_serve_pre_training(tree: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tree, tmp_path / "tree")
+    lines = (root / "train.txt").read_text().splitlines()
+    lines[0] = lines[0].split(",")[0] + ",-1"  # inconclusive
+    (root / "train.txt").write_text("\n".join(lines))
+    (root / "dataset" / "20220601_120000").mkdir()
+    shutil.copy(root / "dataset" / NAMES[0] / "gelsight.mp4", root / "dataset" / "20220601_120000" / "gelsight.mp4")
+    with_none = packed(root, tmp_path / "none", modalities="touch")
+    assert with_none.num == 7 * 33 + 8 - 1 and not len(with_none.rows("unlabelled"))
+    pack = packed(root, tmp_path / "some", modalities="touch", unlabelled=7)
+    rows = pack.rows("unlabelled")
+    assert set(pack.column("group")[rows]) - {"20220601_120000"} == set(pack.column("group")[pack.rows("train")])
+    assert (pack.column("label_category")[rows] == -1).all() and (pack.column("frame")[rows] % 7 == 0).all()
+    assert (pack.column("group")[rows] == "20220601_120000").sum() == len(range(0, NUM_FRAMES, 7))
+    check_pairs(pack)
+    between = [t for t, f in zip(pack.column("touch_group")[rows], pack.column("frame")[rows], strict=True) if f == 35]
+    assert all(touch.endswith(("/0000000030", "/0000000000")) for touch in between)
+
+
+def test_the_cache_knows_changed_jpegs(tmp_path: Path) -> None:
+    """Another frame in place of a listed one, of whatever size; more frames, of which some are taken without a label."""
+    for name, side in zip(NAMES[:2], ("train", "test"), strict=True):
+        (tmp_path / f"{side}.txt").write_text("\n".join(f"{name}/{i:010d}.jpg,{i % 2}" for i in range(6)))
+    config = TouchAndGoConfig(root=tmp_path, size=16, workers=1, split="official", frames="jpeg", unlabelled=2)
+    packs = []
+    for level, num, when in ((40, 8, 10), (200, 8, 20), (200, 12, 20)):
+        for name in NAMES[:2]:
+            for stem in ("video", "gelsight"):
+                folder = tmp_path / "dataset" / name / f"{stem}_frame"
+                folder.mkdir(parents=True, exist_ok=True)
+                for number in range(num):
+                    file = folder / f"{number:010d}.jpg"
+                    Image.new("RGB", (16, 16), (level, level, level)).save(file)
+                    os.utime(file, (when, when))
+        packs.append(config.open(quiet=True))
+    assert [(pack.num, int(pack.images["touch"][0, 0, 0, 0])) for pack in packs] == [(13, 40), (13, 200), (15, 200)]
+    assert packs[0].meta["fingerprint"] == packs[2].meta["fingerprint"]
+
+
+def test_frames_without_a_label_that_are_nowhere(tree: Path) -> None:
+    """The official split tests nearly every recording: an option that would do nothing is refused, not ignored."""
+    with pytest.raises(ValueError, match="unlabelled 7 adds no frame: recordings with test or val frames give none"):
+        TouchAndGoConfig(root=tree, split="official", unlabelled=7).source()
+
+
+@pytest.mark.parametrize("jpegs", [False, True])
+def test_a_sample_says_how_large_its_images_were(tmp_path: Path, jpegs: bool) -> None:
+    source = TouchAndGoConfig(root=write_tree(tmp_path, jpegs=jpegs), size=32).source()
+    sample = source.read(0)[0]
+    assert isinstance(sample, Sample) and sample.touch is not None and sample.touch.shape == (32, 32, 3)
+    assert sample.sizes == {"vision": (120, 160), "touch": (120, 160)}
+
+
+# -- what is missing or damaged ---------------------------------------------------------------------------------------
+
+
+def test_missing_recordings_are_named_and_may_be_left_out(tree: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tree, tmp_path / "tree")
+    shutil.rmtree(root / "dataset" / NAMES[1])
+    (root / "dataset" / NAMES[4] / "video.mp4").unlink()
+    (root / "dataset" / NAMES[5] / "video.mp4").write_bytes(b"")
+    (root / "dataset" / NAMES[6]).rename(root / "dataset" / f"{NAMES[6]}_rock")
+    with pytest.raises(
+        ValueError, match=r"3 of 8 listed recordings cannot be packed: no folder \(1\): 20220502"
+    ) as told:
+        TouchAndGoConfig(root=root).source()
+    assert f"no video.mp4 (2): {NAMES[4]}, {NAMES[5]}" in str(told.value)
+    pack = packed(root, tmp_path / "pack", partial=True)
+    assert set(pack.column("group")) == set(NAMES) - {NAMES[1], NAMES[4], NAMES[5]}
+    assert "3 of 8 listed recordings cannot be packed" in pack.spec.notes[-1]
+    assert sorted(pack.meta["fingerprint"]["missing"]) == [NAMES[1], NAMES[4], NAMES[5]]
+    touch = packed(root, tmp_path / "touch", partial=True, modalities="touch")
+    assert set(touch.column("group")) == set(NAMES) - {NAMES[1]} and touch.spec.modalities == ("touch",)
+
+
+def test_the_doctor_is_told_what_the_lists_name_and_the_download_lacks(tree: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tree, tmp_path / "tree")
+    whole = {count.what: count for count in TouchAndGoConfig(root=root).source().expected()}
+    assert (whole["rows of train.txt"].published, whole["rows of train.txt"].found) == (91_982, 7 * 25)
+    assert (whole["rows of test_rough.txt"].published, whole["rows of test_rough.txt"].found) == (8_085, 2 * 8)
+    for what, num in (("listed recordings", 8), ("listed frames in their recordings", 239)):
+        assert (whole[what].published, whole[what].found, whole[what].detail) == (num, num, "")
+
+    shutil.rmtree(root / "dataset" / NAMES[1])
+    write_video(root / "dataset" / NAMES[2] / "gelsight.mp4", 135, lambda i: numbered(i, "touch"))
+    (root / "dataset" / NAMES[3] / "video.mp4").write_bytes(b"no film")
+    part = {count.what: count for count in TouchAndGoConfig(root=root, partial=True).source().expected()}
+    assert part["listed recordings"].found == 7 and NAMES[1] in part["listed recordings"].detail
+    inside = part["listed frames in their recordings"]
+    own = {name: sum(name in row for row in _listed(root)) for name in NAMES}
+    assert inside.found == 239 - own[NAMES[1]] - own[NAMES[3]] - 10
+    assert f"{NAMES[2]} has 135 frames, listed up to 144" in inside.detail
+    assert f"{NAMES[3]} has 0 frames" in inside.detail and "video.mp4" in inside.detail
+
+
+def test_a_folder_of_jpegs_has_the_frames_up_to_its_last(tmp_path: Path) -> None:
+    recording = Recording("r", {"touch": tmp_path})
+    assert recording.num_frames() == 0
+    for name in ("0000000006.jpg", "0000000002.jpg", "thumbs.db"):
+        (tmp_path / name).touch()
+    assert recording.num_frames() == 7
+
+
+def _listed(root: Path) -> set[str]:
+    return {row.split(",")[0] for file in root.glob("*.txt") for row in file.read_text().split()}
+
+
+def test_a_damaged_stretch_is_left_out_and_listed(tree: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(tree, tmp_path / "tree")
+    path = root / "dataset" / NAMES[2] / "gelsight.mp4"
+    import av
+
+    with av.open(str(path)) as container:
+        at, size = next((p.pos, p.size) for i, p in enumerate(container.demux(video=0)) if i == 134)
+    whole = bytearray(path.read_bytes())
+    whole[at : at + size] = bytes(size)
+    path.write_bytes(whole)
+    with pytest.raises(
+        ValueError, match=rf"10 of 239 samples cannot be read, first {NAMES[2]}/0000000134: gelsight\.mp4"
+    ):
+        packed(root, tmp_path / "strict")
+    pack = packed(root, tmp_path / "pack", max_damaged=0.05)
+    gone = [f"{NAMES[2]}/{number:010d}" for number in range(134, 144)]  # to the next key frame
+    assert [name for name, _ in pack.meta["damaged"]] == gone
+    assert not {*gone} & {*pack.column("id")} and pack.num == 239 - 10
+    check_pairs(pack)
+
+
+def test_jpegs_that_are_missing_or_cut_are_listed(tmp_path: Path) -> None:
+    root = write_tree(tmp_path / "tree", jpegs=True)
+    folder = root / "dataset" / NAMES[0] / "video_frame"
+    (folder / "0000000021.jpg").unlink()
+    (folder / "0000000025.jpg").write_bytes((folder / "0000000025.jpg").read_bytes()[:300])
+    pack = packed(root, tmp_path / "pack", max_damaged=0.05)
+    assert [name for name, _ in pack.meta["damaged"]] == [f"{NAMES[0]}/0000000021", f"{NAMES[0]}/0000000025"]
+    assert "does not exist" in pack.meta["damaged"][0][1] and "cannot be read" in pack.meta["damaged"][1][1]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("train.txt", "nonsense", "train.txt line 1 is 'nonsense': expected <recording>/<10 digits>.jpg,<label>"),
+        ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is none of -1 to 19"),
+        ("test_rough.txt", "a/0000000001.jpg,2", "label 2 is none of -1 to 1"),
+        ("test.txt", "", "test.txt is empty"),
+        ("test.txt", f"{NAMES[0]}/0000000020.jpg,1", "0000000020.jpg is listed twice"),
+        ("test.txt", None, "has no train.txt and test.txt: they are in https://github.com"),
+        ("train_rough.txt", None, "has test_rough.txt without its counterpart"),
+    ],
+)
+def test_bad_lists_are_told(tree: Path, tmp_path: Path, name: str, text: str | None, expected: str) -> None:
+    for file in tree.glob("*.txt"):
+        shutil.copy(file, tmp_path)
+    (tmp_path / name).unlink() if text is None else (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=r"\.txt") as told:
+        TouchAndGoConfig(root=tree, lists=tmp_path).source()
+    assert expected in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"unlabelled": -1},
+        {"test_share": 0.0},
+        {"val_share": 1.0},
+        {"test_share": 0.6, "val_share": 0.5},
+        {"split_seed": -1},
+    ],
+)
+def test_impossible_options_are_told(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        TouchAndGoConfig(**options)
+
+
+def test_label_txt_alone_serves_and_knows_no_official_split(tree: Path, tmp_path: Path) -> None:
+    (tmp_path / "label.txt").write_text("".join(f"{n}/{i:010d}.jpg,{i % 3 - 1}\n" for n in NAMES for i in range(9)))
+    spec = TouchAndGoConfig(root=tree, lists=tmp_path).source().spec()
+    assert [task.name for task in spec.tasks] == ["category", "soft"]
+    with pytest.raises(ValueError, match="which the official split is"):
+        TouchAndGoConfig(root=tree, lists=tmp_path, split="official").source()
+
+
+def test_nothing_there_is_told(tmp_path: Path, tree: Path) -> None:
+    with pytest.raises(ValueError, match="is no folder: give the one with the lists"):
+        TouchAndGoConfig(root=tmp_path / "nowhere").source()
+    with pytest.raises(ValueError, match=r"is no folder: give the download .* https://touch-and-go\.github\.io"):
+        TouchAndGoConfig(root=tmp_path / "nowhere", lists=tree).source()
+    with pytest.raises(ValueError, match="8 of 8 listed recordings cannot be packed"):
+        TouchAndGoConfig(root=tmp_path, lists=tree, partial=True).source()
+
+
+# -- the whole road ---------------------------------------------------------------------------------------------------
+
+
+def test_from_the_download_to_a_trained_model(tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, run = tmp_path / "pack", tmp_path / "run"
+    choice = ["--data", "touch-and-go", "--data.root", str(tree), "--data.split", "official"]
+    assert main(["data", "pack", *choice, "--data.size", "32", "--out", str(out), "--quiet"]) == 0
+    told = capsys.readouterr().out
+    assert "239 samples at 32 px" in told and "note: official split: 7 of 7 test recordings are also in train" in told
+    assert main(["data", "info", str(out)]) == 0
+    assert "note: official split" in capsys.readouterr().out
+    steps = ["--recipe", "smoke", "--steps", "2", "--batch-size", "8", "--device", "cpu", "--quiet", "--out", str(run)]
+    assert main(["pretrain", "--data", "pack", "--data.path", str(out), *steps]) == 0
+    assert (run / "model.safetensors").is_file()
+    assert main(["probe", str(run), "--no-controls"]) == 0
+    assert "note: official split" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.skipif(not SAMPLE.is_dir(), reason="the real recordings are not here")
+def test_a_real_recording_without_its_camera_video(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"lists": LISTS, "split": "official", "partial": True}
+    with pytest.raises(ValueError, match=r"no video\.mp4 \(1\): 20220319_002026"):
+        TouchAndGoConfig(root=SAMPLE, **options).source()
+    pack = packed(SAMPLE, tmp_path / "pack", modalities="touch", **options)
+    assert pack.num == 76 and set(pack.column("label_category")) == {15}  # the folder's name ends in _rock
+    shown = dict(frames(SAMPLE / "20220319_002026_rock" / "gelsight.mp4", pack.column("frame"), 32))
+    assert all(np.array_equal(shown[n], pack.images["touch"][i]) for i, n in enumerate(pack.column("frame")))

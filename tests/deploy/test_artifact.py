@@ -1,0 +1,354 @@
+"""What is published is what is loaded; anything else in its place is refused before it can do harm."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from copy import copy as copied
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+import mvitac
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.deploy.artifact import preprocessing, read_manifest, seal
+from mvitac.deploy.publish import card, fit_readouts, push
+from mvitac.deploy.search import check_pack
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.probe import split_rows
+from mvitac.model import subtracted
+from mvitac.system.files import digest_file
+
+
+@pytest.fixture
+def copy(artifact: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(artifact, tmp_path / "artifact")
+
+
+def reseal(folder: Path, change: Callable[[dict[str, Any]], object] = lambda m: None) -> None:
+    """Make every digest fit again, as an attacker would."""
+    manifest = json.loads((folder / "artifact.json").read_text())
+    for name in manifest["files"]:
+        if (folder / name).is_file():
+            manifest["files"][name] = digest_file(folder / name)
+    change(manifest)
+    manifest["digest"] = seal(manifest)
+    (folder / "artifact.json").write_text(json.dumps(manifest))
+
+
+class Payload:
+    """Unpickling this writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.path,))
+
+
+def test_embeds_as_the_run_does_and_is_in_eval_mode(smoke_run: Path, artifact: Path, pack: Pack) -> None:
+    model = mvitac.load(artifact)
+    images = pack.images["touch"][:5]
+    assert torch.equal(model.embed(touch=images)["touch"], mvitac.load(smoke_run).embed(touch=images)["touch"])
+    assert not any(module.training for module in model.modules())
+
+
+def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: Pack) -> None:
+    """Each stored probe has the accuracy `mvitac probe` prints, and predict() on raw images has it again."""
+    model = mvitac.load(artifact)
+    summary = probe_runs([smoke_run], ProbeConfig(controls=False))["summary"]
+    for task in pack.spec.tasks:
+        rows = split_rows(pack, task).test
+        labels = pack.column(f"label_{task.name}")[rows]
+        for modality, names in (("touch", ["touch"]), ("vision", ["vision"]), ("both", ["vision", "touch"])):
+            found = model.predict(**{m: pack.images[m][rows] for m in names})[task.name]
+            accuracy = float((found.argmax(1).numpy() == labels).mean())
+            assert accuracy == pytest.approx(summary[task.name][modality]["mvitac"]["mean"])
+            assert accuracy == pytest.approx(model.readouts[f"{task.name}.{modality}"].question.accuracy)
+            torch.testing.assert_close(found.sum(1), torch.ones(len(rows)))
+        assert model.classes[task.name] == task.classes
+
+
+def test_a_probe_gives_scikit_learns_probabilities(smoke_run: Path, pack: Pack) -> None:
+    from mvitac.evaluation.classifiers import fit_linear
+
+    model = mvitac.load(smoke_run)
+    for task in pack.spec.tasks:  # one of three classes, one of two
+        rows = split_rows(pack, task)
+        labels = pack.column(f"label_{task.name}").astype(int)
+        x = {r: pack_features(model, pack, "touch", getattr(rows, r)).numpy() for r in ("train", "val", "test")}
+        fitted, _ = fit_linear(x["train"], labels[rows.train], x["val"], labels[rows.val])
+        readout = fit_readouts(model, pack)[f"{task.name}.touch"]
+        np.testing.assert_allclose(readout(torch.from_numpy(x["test"])).numpy(), fitted(x["test"]), atol=1e-4)
+
+
+def test_publish_command_and_card(smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a"
+    assert main(["publish", str(smoke_run), str(out)]) == 0
+    assert "pattern" in capsys.readouterr().out
+    text = (out / "README.md").read_text()
+    assert text.startswith("---\nlibrary_name: mvitac")
+    assert "columns, rows, checks" in text and "majority %" in text and "tests/support/toy.py" in text
+    assert main(["publish", str(smoke_run), str(out)]) == 2
+    assert "already exists" in capsys.readouterr().err
+
+
+def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:
+    model, manifest = mvitac.load(artifact), read_manifest(artifact)
+    assert "Encoders and probes: toy, by tests/support/toy.py. Licence: none." in card(model, manifest)
+    assert "pre-trained without labels" in card(model, manifest)
+    manifest["data"] = {"name": "other", "licence": "CC-BY", "source": "others"}
+    model.tasks = ("pattern",)  # as a supervised method leaves behind
+    text = card(model, manifest)
+    assert "# mvitac on toy" in text and "with linear probes on other." in text
+    assert (
+        "Encoders: toy, by tests/support/toy.py. Licence: none." in text
+        and "Probes: other, by others. Licence: CC-BY." in text
+    )
+    assert "under: none, and CC-BY" in text and "without labels" not in text
+
+
+def test_difference_images_are_told(smoke_run: Path, pack: Pack, tmp_path: Path) -> None:
+    """By model and card, also of a model whose file is from before its header said so; raw packs are not taken for them."""
+    model = mvitac.load(smoke_run)
+    assert preprocessing(model)["background"].startswith("none is subtracted") and check_pack(model, pack)
+    for data, spec in (
+        (MaterialsConfig(difference=True), model.spec),
+        (model.run.data, replace(model.spec, difference=True)),
+    ):
+        other = mvitac.load(smoke_run)
+        other.run, other.spec = replace(model.run, data=data), spec
+        other.save(tmp_path / "model.safetensors")
+        found = mvitac.load(tmp_path / "model.safetensors")
+        given = preprocessing(found)
+        assert found.spec.difference and given["difference"] and given["background"].startswith("subtracted: touch is")
+        with pytest.raises(ValueError, match="the model was trained on difference images"):
+            check_pack(found, pack)
+        old = copied(pack)
+        old.meta = {**pack.meta, "fingerprint": {"options": {"difference": True}}}
+        assert check_pack(found, old) == ("vision", "touch")
+
+
+def test_predict_subtracts_the_background(copy: Path, pack: Pack) -> None:
+    model = mvitac.load(copy)
+    model.spec = replace(model.spec, difference=True)
+    press, free = pack.images["touch"][3], pack.images["touch"][4]
+    expected = model.predict(touch=subtracted([press], [free]))["pattern"]
+    assert torch.equal(model.predict(touch=press, background=free)["pattern"], expected)
+    assert not torch.equal(model.predict(touch=press)["pattern"], expected)
+
+
+def test_a_pickle_is_never_opened(copy: Path, tmp_path: Path) -> None:
+    for name in ("model.safetensors", "probes.safetensors"):
+        (copy / name).write_bytes(pickle.dumps(Payload(tmp_path / "owned")))
+        reseal(copy)
+        with pytest.raises(ValueError, match=r"no safetensors file|announces a header"):
+            mvitac.load(copy)
+    assert not (tmp_path / "owned").exists()
+
+
+def test_a_pickle_beside_the_weights_is_refused(copy: Path, tmp_path: Path) -> None:
+    (copy / "pytorch_model.bin").write_bytes(pickle.dumps(Payload(tmp_path / "owned")))
+    with pytest.raises(ValueError, match="unpickle"):
+        mvitac.load(copy)
+    assert not (tmp_path / "owned").exists()
+
+
+@pytest.mark.parametrize("name", ["../secret", "/etc/passwd", "sub/model.safetensors", "..\\secret", "code.py"])
+def test_names_outside_an_artifacts_own_are_refused(copy: Path, name: str) -> None:
+    (copy.parent / "secret").write_text("secret")
+    reseal(copy, lambda m: m["files"].update({name: "0" * 64}))
+    with pytest.raises(ValueError, match=r"names a file .* refused"):
+        mvitac.load(copy)
+
+
+def test_a_huge_header_is_refused_before_it_is_read(copy: Path) -> None:
+    with (copy / "model.safetensors").open("wb") as file:
+        file.write((1 << 40).to_bytes(8, "little") + b"{")
+    reseal(copy)
+    with pytest.raises(ValueError, match="announces a header of 1099511627776 bytes"):
+        mvitac.load(copy)
+
+
+def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A header of a few kilobytes may name one, with every digest in order."""
+    path = copy / "model.safetensors"
+    tensors, model = safetensors.torch.load_file(path), mvitac.load(copy)
+    monkeypatch.setattr(
+        model, "run", replace(model.run, encoder=replace(model.run.encoder, trunk="resnetv2_152x4_bit"))
+    )
+    monkeypatch.setattr(model, "state_dict", lambda: tensors)
+    model.save(path)
+    reseal(copy)
+    made: list[str] = []
+    parameter = torch.nn.Parameter.__new__
+    monkeypatch.setattr(
+        torch.nn.Parameter,
+        "__new__",
+        lambda cls, data=None, requires_grad=True: made.append(data.device.type) or parameter(cls, data, requires_grad),
+    )
+    with pytest.raises(ValueError, match="holds other weights than its run describes"):
+        mvitac.load(copy)
+    assert set(made) == {"meta"}
+
+
+def test_a_huge_description_is_refused(copy: Path) -> None:
+    (copy / "artifact.json").write_text("[" * (2 << 20))
+    with pytest.raises(ValueError, match="no artifact needs more"):
+        mvitac.load(copy)
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "probes.safetensors", "run.json", "README.md"])
+def test_a_changed_byte_is_found(copy: Path, name: str) -> None:
+    data = bytearray((copy / name).read_bytes())
+    data[-2] ^= 1
+    (copy / name).write_bytes(data)
+    with pytest.raises(ValueError, match="does not match its digest"):
+        mvitac.load(copy)
+
+
+def test_a_changed_description_is_found(copy: Path) -> None:
+    text = (copy / "artifact.json").read_text()
+    (copy / "artifact.json").write_text(text.replace("columns", "walls"))
+    with pytest.raises(ValueError, match="does not match its digest"):
+        mvitac.load(copy)
+
+
+def test_another_normalisation_or_colour_order_is_refused(copy: Path) -> None:
+    """Even with every digest in order, an artifact must ask for the preprocessing its model was trained with."""
+    for name, value in (("mean", [0.5, 0.5, 0.5]), ("colour_order", "BGR"), ("size", 31)):
+        before = json.loads((copy / "artifact.json").read_text())["preprocessing"][name]
+        reseal(copy, lambda m, n=name, v=value: m["preprocessing"].update({n: v}))
+        with pytest.raises(ValueError, match=f"says {name} .* predictions would be wrong"):
+            mvitac.load(copy)
+        reseal(copy, lambda m, n=name, v=before: m["preprocessing"].update({n: v}))
+    mvitac.load(copy)
+
+
+def test_probes_of_another_shape_are_refused(copy: Path) -> None:
+    tensors = safetensors.torch.load_file(copy / "probes.safetensors")
+    for name, wrong, message in (
+        ("pattern.touch.weight", torch.zeros(3, 9), "reads 9 features"),
+        ("pattern.touch.bias", torch.zeros(2), "do not belong to 3 classes"),
+        ("pattern.touch.weight", torch.full((3, 64), torch.nan), "not all numbers"),
+    ):
+        safetensors.torch.save_file({**tensors, name: wrong}, copy / "probes.safetensors")
+        reseal(copy)
+        with pytest.raises(ValueError, match=message):
+            mvitac.load(copy)
+
+
+def test_the_hub_offline_is_one_clear_line(artifact: Path) -> None:
+    with pytest.raises(ValueError, match=r"no folder someone/touch here.*Hugging Face Hub"):
+        mvitac.load("someone/touch")
+    with pytest.raises(ValueError, match="could not be written on the Hugging Face Hub"):
+        push(artifact, "someone/touch")
+    with pytest.raises(ValueError, match="give owner/name"):
+        push(artifact, "touch")
+
+
+def test_a_slip_in_a_local_path_does_not_ask_the_hub(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, artifact: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    with pytest.raises(ValueError, match="no trained model at"):
+        mvitac.load("runs/frist")
+
+
+def test_the_hub_mixin_takes_the_artifact_there_and_back(
+    artifact: Path, tmp_path: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import huggingface_hub
+    from huggingface_hub import hub_mixin
+
+    hub, asked = tmp_path / "hub", {}
+
+    class Api:
+        def __init__(self, token: str | None = None) -> None:
+            pass
+
+        def create_repo(self, repo_id: str, *, private: bool, exist_ok: bool) -> Any:
+            asked.update(private=private)
+            return SimpleNamespace(repo_id=repo_id)
+
+        def upload_folder(self, *, repo_id: str, folder_path: Path, **options: Any) -> str:
+            shutil.copytree(folder_path, hub / repo_id)
+            return f"somewhere/{repo_id}"
+
+    def download(repo: str, **options: Any) -> str:
+        asked.update(options)
+        return str(hub / repo)
+
+    monkeypatch.setattr(hub_mixin, "HfApi", Api)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    assert push(artifact, "someone/touch", private=True) == "somewhere/someone/touch" and asked["private"]
+    files = {path.name: digest_file(path) for path in (hub / "someone/touch").iterdir()}
+    assert files == {path.name: digest_file(path) for path in artifact.iterdir()}
+
+    model = mvitac.PublishedModel.from_pretrained("someone/touch", revision="v2", local_files_only=True)
+    assert asked["revision"] == "v2" and asked["local_files_only"]
+    images = pack.images["touch"][:5]
+    assert torch.equal(model.embed(touch=images)["touch"], mvitac.load(artifact).embed(touch=images)["touch"])
+    model.save_pretrained(tmp_path / "again")
+    assert mvitac.PublishedModel.from_pretrained(tmp_path / "again").classes == model.classes
+    (hub / "someone/touch/run.json").write_text("{}")
+    with pytest.raises(ValueError, match="does not match its digest"):
+        model.from_pretrained("someone/touch")
+
+
+def test_what_the_hub_gives_is_checked_too(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import huggingface_hub
+
+    asked: dict[str, Any] = {}
+
+    def download(repo: str, **options: Any) -> str:
+        asked.update(options, repo=repo)
+        return str(copy)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    assert mvitac.load("someone/touch@v2").classes["pattern"] == ("columns", "rows", "checks")
+    assert asked["repo"] == "someone/touch" and asked["revision"] == "v2"
+    assert set(asked["allow_patterns"]) == {"artifact.json", *read_manifest(copy)["files"]}
+    (copy / "run.json").write_text("{}")
+    with pytest.raises(ValueError, match="does not match its digest"):
+        mvitac.load("someone/touch")
+
+
+@pytest.mark.parametrize(
+    ("command", "advice"),
+    [("export {} --out x", "--on PACK"), ("explore {}", "--on PACK"), ("live {}", "give that folder")],
+)
+def test_without_its_data_a_command_says_what_to_do(
+    command: str,
+    advice: str,
+    artifact: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As on a robot, to which the artifact was copied."""
+
+    def gone(self: PackConfig) -> Pack:
+        raise ValueError("no pack at /somewhere/else")
+
+    monkeypatch.setattr(PackConfig, "open", gone)
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(command.format(artifact).split()) == 2
+    said = capsys.readouterr().err
+    assert "trained on is not here (no pack at /somewhere/else)" in said and advice in said

@@ -1,0 +1,204 @@
+"""The encoders inside a policy, and the ROS 2 node on a fake publisher."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import mvitac
+from mvitac.data.pack import Pack
+from mvitac.deploy.engine import Engine
+from mvitac.deploy.policy import ObservationEncoder
+from mvitac.model import Model
+from support.examples import load_example
+from support.faults import Clock, Rig
+
+KEYS = {"observation.images.wrist": "vision", "observation.images.gel": "touch"}
+
+
+@pytest.fixture
+def model(artifact: Path) -> Model:
+    return mvitac.load(artifact)
+
+
+def observe(pack: Pack, rows: list[int]) -> dict[str, torch.Tensor]:
+    return {k: torch.from_numpy(pack.images[m][rows]).permute(0, 3, 1, 2) for k, m in KEYS.items()}
+
+
+def test_features_are_the_models(model: Model, pack: Pack) -> None:
+    """uint8 or float, single steps or a history: what embed() gives."""
+    encoder, seen = ObservationEncoder(model, KEYS), observe(pack, [3, 50])
+    expected = model.embed(vision=pack.images["vision"][[3, 50]], touch=pack.images["touch"][[3, 50]])
+    wanted = torch.cat([expected["vision"], expected["touch"]], dim=1)
+    torch.testing.assert_close(encoder(seen), wanted, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(encoder({k: v / 255 for k, v in seen.items()}), wanted, atol=1e-4, rtol=1e-4)
+    history = {k: v[None].expand(4, -1, -1, -1, -1) for k, v in seen.items()}
+    torch.testing.assert_close(encoder(history), wanted[None].expand(4, -1, -1), atol=1e-4, rtol=1e-4)
+    assert encoder.out_features == wanted.shape[1]
+
+
+def test_images_are_seen_at_the_side_the_model_predicts_at(model: Model, pack: Pack) -> None:
+    """Which may be larger than that of the views it was trained on."""
+    model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
+    expected = model.embed(touch=pack.images["touch"][:4])["touch"]
+    found = ObservationEncoder(model, {"gel": "touch"})({"gel": observe(pack, [0, 1, 2, 3])["observation.images.gel"]})
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_a_policy_trains_its_head_and_leaves_the_encoders_alone(model: Model, pack: Pack) -> None:
+    encoder = ObservationEncoder(model, KEYS, state=2)
+    policy = torch.nn.Sequential(encoder, torch.nn.Linear(encoder.out_features, 3))
+    before = {k: v.clone() for k, v in encoder.state_dict().items()}
+    policy.train()
+    optimiser = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], lr=0.01)
+    seen = {**observe(pack, list(range(12))), "observation.state": torch.zeros(12, 2)}
+    target = torch.from_numpy(pack.column("label_pattern")[:12].astype(int))
+    losses = []
+    for _ in range(30):
+        loss = torch.nn.functional.cross_entropy(policy(seen), target)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.5 * losses[0]
+    assert all(torch.equal(before[k], v) for k, v in encoder.state_dict().items())
+
+
+def test_tuned_encoders_get_gradients_but_keep_their_batchnorm(model: Model, pack: Pack) -> None:
+    encoder = ObservationEncoder(model, KEYS, tune=True).train()
+    before = {k: v.clone() for k, v in encoder.named_buffers()}
+    encoder(observe(pack, [0, 1])).sum().backward()
+    assert all(p.grad is not None for p in encoder.encoders.parameters())
+    assert all(torch.equal(before[k], v) for k, v in encoder.named_buffers())
+
+
+def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
+    with pytest.raises(ValueError, match="no smell encoder"):
+        ObservationEncoder(model, {"a": "smell"})
+    with pytest.raises(ValueError, match=r"takes 1 image\(s\), 2 given: left, right"):
+        ObservationEncoder(model, {"left": "touch", "right": "touch"})
+    encoder = ObservationEncoder(model, KEYS, state=2)
+    seen = observe(pack, [0])
+    with pytest.raises(ValueError, match=r"observation has no 'observation\.state'"):
+        encoder(seen)
+    with pytest.raises(ValueError, match=r"expected images \[B, 3, H, W\]"):
+        encoder({k: v[:, :1] for k, v in seen.items()})
+    for wrong in (
+        lambda x: x.float(),
+        lambda x: (x / 255 - 0.45) / 0.22,
+    ):  # not divided; normalised by the policy already
+        with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] or uint8"):
+            ObservationEncoder(model, KEYS)({k: wrong(v) for k, v in observe(pack, [0]).items()})
+    with pytest.raises(ValueError, match=r"observation.state: expected \(1, 2\)"):
+        encoder({**seen, "observation.state": torch.zeros(1, 3)})
+
+
+def message(image: np.ndarray, encoding: str, pad: int = 5) -> SimpleNamespace:
+    """A sensor_msgs/Image with padded rows."""
+    height, width, _ = image.shape
+    pixels = image[..., ::-1] if encoding == "bgr8" else image
+    rows = np.concatenate([pixels.reshape(height, -1), np.full((height, pad), 99, np.uint8)], axis=1)
+    return SimpleNamespace(height=height, width=width, step=3 * width + pad, encoding=encoding, data=rows.tobytes())
+
+
+def test_the_ros_node_on_a_fake_publisher(onnx: Path) -> None:
+    ros2_node = load_example("ros2_node")
+    clock, sent, warned = Clock(), [], []
+    rigs = {"vision": Rig(clock, 1), "touch": Rig(clock, 2)}
+    engine = Engine(onnx, threads=1)
+    node = ros2_node.Node(engine, lambda kind, value: sent.append((kind, value)), warn=warned.append, clock=clock)
+    for tick in range(80):  # 50 frames a second: calibrates in 0.6 s, touched from 1.0 s on
+        clock.now = 99 + tick / 50
+        for modality, encoding in (("vision", "rgb8"), ("touch", "bgr8")):
+            node.image(modality, message(rigs[modality].read(), encoding))
+    assert warned == ["touch 0 is calibrated without contact"]
+    kinds = [kind for kind, _ in sent]
+    assert kinds.count("prediction") == kinds.count("embedding") == pytest.approx(30, abs=2)
+    said = json.loads(sent[0][1])
+    assert said["touch"] == 1 and said["contact"] and said["pattern"]["class"] in engine.classes["pattern"]
+    assert said["age_ms"] == 0  # the fake clock stands still meanwhile
+    assert len(sent[1][1]) == 128
+    clock.now += 5
+    node.tick()
+    assert sorted(warned[1:]) == ["touch 0 gives no frames since 5.0 s", "vision 0 gives no frames since 5.0 s"]
+    assert json.loads(sent[-1][1]) == {"touch": 1, "contact": False} and sent[-1][0] == "prediction"
+    node.image("touch", SimpleNamespace(encoding="mono8"))
+    assert "publish rgb8 or bgr8" in warned[-1]
+
+
+class FakeRos:
+    """rclpy and its messages, as far as the node uses them; ``spin`` sends what a camera and a gel would."""
+
+    def __init__(self, topics: dict[str, Rig], clock: Clock) -> None:
+        self.rigs, self.clock, self.sent, self.said = topics, clock, [], []
+        self.callbacks: dict[str, Any] = {}
+        self.timers: list[Any] = []
+
+    def modules(self) -> dict[str, Any]:
+        message = type("Message", (SimpleNamespace,), {})
+        return {
+            "rclpy": SimpleNamespace(
+                init=lambda args: None, create_node=lambda name: self, spin=self.spin, shutdown=lambda: None
+            ),
+            "rclpy.qos": SimpleNamespace(
+                QoSProfile=lambda **given: given, ReliabilityPolicy=SimpleNamespace(BEST_EFFORT="best effort")
+            ),
+            "sensor_msgs.msg": SimpleNamespace(Image=message),
+            "std_msgs.msg": SimpleNamespace(Float32MultiArray=message, String=message),
+        }
+
+    def create_publisher(self, kind: Any, topic: str, depth: int) -> Any:
+        return SimpleNamespace(publish=lambda m: self.sent.append((topic, m.data)))
+
+    def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
+        assert qos == {"depth": 1, "reliability": "best effort"}  # a queue would hand over old frames as new ones
+        self.callbacks[topic] = callback
+
+    def create_timer(self, period: float, callback: Any) -> None:
+        self.timers.append(callback)
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(warning=self.said.append)
+
+    def destroy_node(self) -> None: ...
+
+    def spin(self, node: Any) -> None:
+        for tick in range(80):
+            self.clock.now = 99 + tick / 50
+            for topic, rig in self.rigs.items():
+                self.callbacks[topic](message(rig.read(), "bgr8"))
+            for timer in self.timers:
+                timer()
+
+
+def test_the_ros_node_itself(onnx: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its topics, messages and log, on a fake rclpy."""
+    ros2_node = load_example("ros2_node")
+    clock = Clock()
+    ros = FakeRos({"/camera": Rig(clock, 1), "/gel": Rig(clock, 2)}, clock)
+    for name, module in ros.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(ros2_node.Node.__init__, "__kwdefaults__", {"warn": print, "clock": clock})
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera", "--touch", "/gel"])
+    ros2_node.main()
+    assert {topic for topic, _ in ros.sent} == {"~/prediction", "~/embedding"} and len(ros.sent) >= 50
+    assert ros.said == ["touch 0 is calibrated without contact"]
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera"])
+    with pytest.raises(SystemExit):
+        ros2_node.main()
+    assert "the model takes 1 touch topic(s): give --touch TOPIC" in capsys.readouterr().err
+
+
+def test_a_message_is_read_as_rgb() -> None:
+    image = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    to_rgb = load_example("ros2_node").to_rgb
+    for encoding in ("rgb8", "bgr8"):
+        assert np.array_equal(to_rgb(message(image, encoding)), image)

@@ -1,0 +1,95 @@
+"""The parts that controls and probes are made of, against arithmetic."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mvitac.data.spec import DataSpec
+from mvitac.evaluation.classifiers import fit_knn, spread_out
+from mvitac.evaluation.controls import borders, controls_of, start_weights, starts_of, thumbnails
+from mvitac.methods.moco import MoCoConfig
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.recipes import recipe, with_method
+from mvitac.run import Run
+from support.toy import Toy, toy_pack
+
+
+def pictures(*images: np.ndarray) -> Any:
+    return SimpleNamespace(images={"touch": np.stack(images)})
+
+
+def test_a_thumbnail_is_the_mean_of_its_pixels() -> None:
+    image = np.random.default_rng(0).integers(0, 255, (32, 32, 6), np.uint8)
+    found = thumbnails(pictures(image), "touch", np.array([0]), side=8)
+    blocks = image.reshape(8, 4, 8, 4, 6).mean((1, 3)) / 255
+    assert np.allclose(found[0], blocks.transpose(2, 0, 1).ravel(), atol=1e-6)
+
+
+def test_the_border_sees_nothing_of_the_middle() -> None:
+    """Two of sixteen thumbnails deep: the outer four of 32 pixels."""
+    plain = np.full((32, 32, 3), 7, np.uint8)
+    middle, edge = plain.copy(), plain.copy()
+    middle[4:-4, 4:-4] = 200
+    edge[16, 3] = 200
+    found = borders(pictures(plain, middle, edge), "touch", np.arange(3))
+    assert found.shape == (3, 3 * (16 * 16 - 12 * 12))
+    assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
+
+
+def test_start_weights_are_named_once_and_scratch_is_none() -> None:
+    run = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
+    trained = replace(run, encoder=replace(run.encoder, weights="b.pth"))
+    assert start_weights([run, run], None) == []
+    assert start_weights([trained, run, trained], Path("a.pth")) == ["a.pth", "b.pth"]
+    assert start_weights([trained], Path("b.pth")) == ["b.pth"]
+
+
+def test_neighbours_are_by_cosine_and_vote_in_shares() -> None:
+    x, y = np.array([[1.0, 0.0], [0.0, 10.0]]), np.array([0, 2])
+    nearest = fit_knn(x, y, 3, k=1)(np.array([[3.0, 4.0]]))  # nearer to the first, but turned towards the second
+    assert nearest.tolist() == [[0, 0, 1]]
+    shares = fit_knn(x, y, 3)(np.array([[3.0, 4.0]]))[0]  # more neighbours asked for than there are
+    assert shares[2] / shares[0] == pytest.approx(np.exp((0.8 - 0.6) / 0.07), rel=1e-4)
+    assert shares.sum() == pytest.approx(1) and shares[1] == 0
+
+
+def test_classes_never_seen_get_probability_zero() -> None:
+    assert spread_out(np.array([[0.2, 0.8]]), np.array([0, 2]), 4).tolist() == [[0.2, 0, 0.8, 0]]
+
+
+@pytest.mark.parametrize(("num_rows", "size"), [(30, 10), (12, 6), (1, 1)])
+def test_a_queue_is_never_more_than_half_the_rows(num_rows: int, size: int) -> None:
+    assert MoCoConfig(queue=10).queue_size(num_rows) == size
+
+
+def modalities_of(runs: list[Run], spec: DataSpec) -> list[tuple[str, int]]:
+    return [(run.method.name, run.seed) for run, _ in starts_of(runs, [spec] * len(runs))]
+
+
+def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
+    """Whatever the order of the runs, the control is of one that has all the others have."""
+    base = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
+    spec, again = Toy().spec(), replace(base, seed=1)
+    touch, vision = (replace(base, method=SupervisedConfig(modalities=(m,))) for m in ("touch", "vision"))
+    apart = with_method(base, "simclr")  # both modalities, no space that they share
+    for runs in ([touch, apart, base], [base, apart, touch], [apart, touch, base]):
+        assert modalities_of(runs, spec) == [("mvitac", 0)]
+    assert modalities_of([base, again, touch], spec) == [("mvitac", 0), ("mvitac", 1)]
+    assert [run for run, _ in starts_of([touch, vision, touch], [spec] * 3)] == [touch, vision]
+
+
+def test_the_untrained_trunk_is_of_the_runs_own_data(tmp_path: Path) -> None:
+    """A classifier of ``bright`` and a method of pairs, probed on touch alone without that label."""
+    pack = toy_pack(tmp_path / "p", num=60, vision_channels=0)
+    base = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
+    runs = [replace(base, method=SupervisedConfig(tasks=("bright",))), with_method(replace(base, seed=1), "ssvtp")]
+    pack.spec, own = replace(pack.spec, tasks=pack.spec.tasks[:1]), Toy().spec()
+    records, retrieval = controls_of(runs, pack, pack.spec.tasks, ["touch"], ["knn"], specs=[own, own])
+    assert {r["seed"] for r in records if r["source"] == "untrained"} == {0, 1} and not retrieval

@@ -1,0 +1,827 @@
+"""A plan becomes a table: finished runs are skipped, killed ones resumed to the same bits, p is what it says."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.pack import PackConfig
+from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.evaluation.evaluate import ProbeConfig
+from mvitac.evaluation.scores import interval, paired_difference
+from mvitac.experiments import collect, jobs
+from mvitac.experiments.collect import cost, gather, lay_out, leaks, pairs_of
+from mvitac.experiments.cross_validation import lay_out_folds
+from mvitac.experiments.jobs import do, do_all, seconds_of
+from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
+from mvitac.experiments.plan import Plan, Row, changed, setting, slug
+from mvitac.experiments.table import lines_of
+from mvitac.experiments.table_formats import comma, latex, markdown, write_tables
+from mvitac.recipes import RECIPES, recipe
+from mvitac.system.files import write_json
+from mvitac.system.locks import Busy, hold_lock
+from mvitac.training.loop import Interrupted, train
+from mvitac.training.step import Step
+from support.processes import begin, finish
+from support.small_plans import ROWS, small
+from support.toy import Toy, toy_pack
+
+
+@pytest.fixture(scope="module")
+def done(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """Six runs, straight through, and their result."""
+    out = tmp_path_factory.mktemp("compare") / "out"
+    work = lay_out(small(pack), pack, out, ProbeConfig())
+    do_all(work, 1, lambda line: None)
+    result = gather(work, out, ProbeConfig())
+    write_tables(result, out)
+    return out, result
+
+
+# -- plans ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PLANS)
+@pytest.mark.parametrize("recipe_name", RECIPES)
+def test_every_row_of_every_plan_is_a_run(name: str, recipe_name: str) -> None:
+    plan = replace(PLANS[name], recipe=recipe_name)
+    for row in plan.rows:
+        run = plan.run(row, MaterialsConfig(), 7)
+        assert run.seed == 7 and run.method.name == row.method
+        for field, value in row.set.items():
+            found: object = run
+            for part in field.split("."):
+                found = getattr(found, part)
+            assert found == (tuple(value) if isinstance(value, list) else value), (row.label, field)
+
+
+def test_the_plans_hold_the_papers_tables() -> None:
+    """Tables I and II as printed (tactile / tactile + visual)."""
+    printed = {row.label: row.printed for row in TABLE1.rows}
+    assert list(printed["MViTac"]["touch"].values()) == [57.6, 86.2, 82.1]
+    assert list(printed["MViTac"]["both"].values()) == [74.9, 91.8, 84.1]
+    assert list(printed["TAG (CMC)"]["touch"].values()) == [54.7, 77.3, 79.4]
+    assert list(printed["TAG (CMC)"]["both"].values()) == [68.6, 87.1, 82.4]
+    assert list(printed["SSVTP"]["touch"].values()) == [46.1, 79.7, 75.8]
+    assert list(printed["SSVTP"]["both"].values()) == [70.7, 88.6, 83.6]
+    assert list(printed["supervised, touch only"]["touch"].values()) == [57.4, 89.1, 79.3]
+    assert list(printed["supervised, both"]["both"].values()) == [48.0, 85.9, 80.0]
+    assert list(TABLE1.printed_majority.values()) == [18.6, 66.1, 56.3]
+    second = {row.label: row.printed["both"]["success"] for row in TABLE2.rows if row.printed}
+    assert second == {"TAG (CMC)": 56.3, "MViTac": 60.3, "Calandra et al., supervised": 73.1}
+    run = TABLE2.run(TABLE2.rows[3], PackConfig(), 0)
+    assert run.augment.touch.grayscale == run.augment.vision.grayscale == 0
+
+
+def test_table1_has_one_budget(pack: Pack, tmp_path: Path) -> None:
+    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path, ProbeConfig())
+    assert set(work.left_out) == {"TAG (CMC), its own tau .07"} and len(work.jobs) == 32  # smoke changes no tau
+    assert {(job.run.steps, job.run.batch_size, job.run.optim.lr) for job in work.jobs} == {(4, 16, 2e-3)}
+    assert [job.run.seed for job in work.jobs] == [0] * 16 + [1] * 16
+
+
+def test_ablation_leaves_out_what_changes_nothing(pack: Pack, tmp_path: Path) -> None:
+    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path, ProbeConfig())
+    assert "no grayscale" in work.left_out and "the same run as 'MViTac'" in work.left_out["no grayscale"]
+    assert "grayscale .2" not in work.left_out
+    assert "plain touch flips" in work.left_out  # these are the recipe's
+    assert "do not follow slopes" in work.left_out["touch flips with their colours"]  # stripes are no touches
+    assert "'pack' has no data.difference" in work.left_out["difference images of touch"]
+    digests = [job.run.digest() for job in work.jobs]
+    assert len(set(digests)) == len(digests)
+
+
+def test_rows_the_data_does_not_allow_are_told(tmp_path: Path) -> None:
+    pack = toy_pack(tmp_path / "touch-only", vision_channels=0)
+    work = lay_out(small(pack, rows=TABLE1.rows), pack, tmp_path / "out", ProbeConfig())
+    assert "learns from pairs" in work.left_out["TAG (CMC)"]
+    assert "unknown modality" in work.left_out["supervised, vision only"]
+    assert "the same run as 'supervised, touch only'" in work.left_out["supervised, both"]
+    assert "the same run as 'MViTac, end-to-end'" in work.left_out["MViTac, end-to-end, all pairs"]
+    assert "MViTac, end-to-end, all pairs, no touch flips" not in work.left_out
+    assert {job.label for job in work.jobs} >= {"MViTac", "MoCo per modality", "supervised, touch only"}
+    work = lay_out(small(pack, rows=ABLATION.rows), pack, tmp_path / "out", ProbeConfig())
+    for label in ("lambda_inter 2.0", "losses tt", "losses vv + tt"):
+        assert "the same run as 'MViTac'" in work.left_out[label]
+    assert "the same run as 'no flips'" in work.left_out["no touch flips"]
+    assert "another modality" in work.left_out["losses vv"]
+    with pytest.raises(ValueError, match="no row that this data allows"):
+        lay_out(small(pack, rows=(Row(label="MViTac", method="cmc"),)), pack, tmp_path / "out", ProbeConfig())
+
+
+def test_a_row_may_read_the_same_samples_in_another_way(pack: Pack, tmp_path: Path) -> None:
+    """As difference images are: trained and scored on its own pack, beside the others; other samples are refused."""
+
+    class Darker(Toy):
+        def read(self, item: int) -> list[Sample]:
+            return [replace(sample, touch=sample.touch // 2) for sample in super().read(item)]  # type: ignore[operator]
+
+    darker = build(Darker(), tmp_path / "darker", size=32, quiet=True)
+    fewer = toy_pack(tmp_path / "fewer", num=90)
+    rows = (
+        Row(label="MViTac"),
+        Row(label="darker", set={"data.path": str(darker.path)}),
+        Row(label="fewer", set={"data.path": str(fewer.path)}),
+    )
+    session = ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False)
+    work = lay_out(small(pack, rows=rows, seeds=1), pack, tmp_path / "out", session)
+    assert list(work.left_out) == ["fewer"] and "another column id" in work.left_out["fewer"]
+    do_all(work, 1, lambda line: None)
+    packs = {job.label: json.loads((job.out / "run.json").read_text())["pack"] for job in work.jobs}
+    assert packs == {"MViTac": pack.digest, "darker": darker.digest}
+    sources = {record["source"] for record in gather(work, tmp_path / "out", session)["records"]}
+    assert {"MViTac", "darker"} <= sources
+
+
+def test_a_plan_from_a_file(tmp_path: Path) -> None:
+    text = """
+    seeds = 2
+    reference = "a"
+    set = { steps = 5 }
+    data = { name = "pack", path = "packs/x" }
+    [[rows]]
+    label = "a"
+    [[rows]]
+    label = "b"
+    method = "cmc"
+    set = { "method.num_negatives" = 9, "augment.touch.scale" = [0.3, 1.0] }
+    """
+    (tmp_path / "mine.toml").write_text(text)
+    plan = find_plan(str(tmp_path / "mine.toml"))
+    assert plan.name == "mine" and plan.data == PackConfig(path=Path("packs/x"))
+    run = plan.run(plan.rows[1], plan.data, 1)
+    assert (run.steps, run.method.num_negatives, run.augment.touch.scale) == (5, 9, (0.3, 1.0))  # type: ignore
+    as_json = {"rows": [{"label": "a"}], "reference": "a"}
+    (tmp_path / "other.json").write_text(json.dumps(as_json))
+    assert find_plan(str(tmp_path / "other.json")).rows == (Row(label="a"),)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("rows = []", "has no rows"),
+        ("rows = [", "not valid TOML"),
+        ('[[rows]]\nlabel = "a"', "unknown reference row 'MViTac'"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "a"', "is there twice"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "differ only in signs"),
+        ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
+        ('reference = "a"\nseeds = 0\n[[rows]]\nlabel = "a"', "seeds 0"),
+    ],
+)
+def test_damaged_plans_are_one_line(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "p.toml").write_text(text)
+    with pytest.raises(ValueError, match=says):
+        find_plan(str(tmp_path / "p.toml"))
+
+
+@pytest.mark.parametrize("given", ["tabel1", "nowhere.toml"])
+def test_unknown_plans(given: str) -> None:
+    with pytest.raises(ValueError, match="table1"):
+        find_plan(given)
+
+
+def test_some_rows_of_a_plan_stand_beside_its_reference() -> None:
+    assert [row.label for row in TABLE1.only(["SSVTP", "TAG (CMC)"]).rows] == ["TAG (CMC)", "SSVTP", "MViTac"]
+    assert TABLE1.only([]) == TABLE1
+    with pytest.raises(ValueError, match="unknown row 'ssvtp': choose from"):
+        TABLE1.only(["ssvtp"])
+
+
+def test_changed_fields_are_checked() -> None:
+    run = recipe("smoke")
+    assert changed(run, {"optim.lr": 1, "steps": 7}).optim.lr == 1.0
+    for name in ("optim.lrr", "steps.more", "nothing", "method.name", "optim"):
+        with pytest.raises(ValueError, match=r"optim|steps|nothing|method"):
+            changed(run, {name: 3})
+    with pytest.raises(ValueError, match="expected int"):
+        changed(run, {"steps": "many"})
+    with pytest.raises(ValueError, match="row 'MViTac': temperature"):
+        Plan(name="x", rows=(Row(label="MViTac", set={"method.temperature": -1.0}),)).run(
+            Row(label="MViTac", set={"method.temperature": -1.0}), PackConfig(), 0
+        )
+    assert setting("optim.lr=1e-3") == ("optim.lr", 1e-3)
+    assert setting("encoder.weights=scratch") == ("encoder.weights", "scratch")
+    with pytest.raises(ValueError, match="field=value"):
+        setting("steps")
+    assert slug("Calandra et al., supervised") == "calandra-et-al.-supervised"
+
+
+# -- runs and tables --------------------------------------------------------------------------------------------------
+
+
+def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
+    out, result = done
+    assert {p.name for p in out.glob("table.*")} == {"table.md", "table.tex", "table.csv", "table.png"}
+    lines = {(line.source, line.modality): line for line in lines_of(result)}
+    touch = lines["MViTac", "touch"].cells["pattern"]
+    own = [
+        r
+        for r in result["records"]
+        if (r["source"], r["modality"], r["task"]) == ("MViTac", "touch", "pattern") and r["probe"] == "linear"
+    ]
+    assert len(own) == 2 and touch.mean == pytest.approx(np.mean([r["accuracy"] for r in own]))
+    assert touch.printed == pytest.approx(0.576) and touch.difference is None
+    assert ("supervised, touch", "vision") not in lines and ("supervised, touch", "touch") in lines
+    assert lines["supervised, touch, end to end", "touch"].cells["pattern"].difference is not None
+    assert {"majority", "untrained", "pixels", "border", "noise only"} <= {line.source for line in lines.values()}
+    text = (out / "table.md").read_text()
+    assert f"| MViTac | touch | {100 * touch.mean:.1f} [" in text
+    assert "equal budget: every run saw 64 pairs in 4 steps" in text and "LEAK" not in text
+    rows = list(csv.DictReader((out / "table.csv").read_text().splitlines()))
+    assert len(rows) == sum(len(line.cells) for line in lines.values())
+    found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
+    assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"].mean
+    tex = (out / "table.tex").read_text()
+    assert tex.count(r"\\") == len(lines) + 1 and "[57.6]" in tex
+    assert json.loads((out / "result.json").read_text())["rows"] == ["MViTac", "colder", "supervised, touch"]
+
+
+def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, result = done
+    assert len(list(out.rglob("model.safetensors"))) == 6 and not list(out.rglob("checkpoint.pt"))
+    monkeypatch.setattr(jobs, "train", None)  # calling it would raise
+    monkeypatch.setattr(collect, "controls_of", None)
+    work = lay_out(small(pack), pack, out, ProbeConfig())
+    do_all(work, 1, lambda line: None)
+    assert gather(work, out, ProbeConfig()) == json.loads(json.dumps(result))
+
+
+def test_controls_are_made_again_where_the_data_names_others(
+    done: tuple[Path, dict], pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the same pixels and columns: the pack's digest is the same."""
+    out = shutil.copytree(done[0], tmp_path / "out")
+    other = Pack(pack.path)
+    other.spec = replace(pack.spec, controls={"noise": ("noise",)})
+    monkeypatch.setattr(collect, "controls_of", lambda *_: ([], []))
+    for data, kept in ((pack, True), (other, False)):
+        result = gather(lay_out(small(pack), data, out, ProbeConfig()), out, ProbeConfig())
+        assert any(record["source"] == "noise only" for record in result["records"]) == kept
+
+
+def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: Path) -> None:
+    wild = Row(label="wild", set={"optim.name": "sgd", "optim.lr": 1e30, "log_every": 1})
+    work = lay_out(small(pack, rows=(ROWS[0], wild), seeds=1), pack, tmp_path, ProbeConfig(controls=False))
+    do_all(work, 1, lambda line: None)
+    result = gather(work, tmp_path, ProbeConfig(controls=False))
+    assert "not finite" in result["failed"]["wild, seed 0"]
+    assert "Diverged: wild, seed 0" in write_tables(result, tmp_path)[0].read_text()
+    assert {record["source"] for record in result["records"]} == {"MViTac"}
+    lost = replace(work, jobs=[job for job in work.jobs if job.label == "wild"])
+    with pytest.raises(ValueError, match=r"no run of .* is finished: .*\(wild, seed 0: the loss is not finite"):
+        gather(lost, tmp_path, ProbeConfig(controls=False))
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_path: Path) -> None:
+    work = lay_out(
+        small(pack, seeds=3, set={"steps": 30000, "eval_every": 0}), pack, tmp_path, ProbeConfig(controls=False)
+    )
+    terminal = Console(force_terminal=True, file=(screen := io.StringIO()), width=80)
+
+    def press() -> None:
+        shown = ("all runs", "MViTac, seed 0", "colder, seed 0", "loss")
+        deadline = time.monotonic() + 300
+        while not all(words in screen.getvalue() for words in shown) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=press, daemon=True).start()
+    with pytest.raises(Interrupted, match="stopped; the same command continues from here"):
+        do_all(work, 2, lambda line: None, terminal)
+    assert not any((job.out / "model.safetensors").exists() for job in work.jobs)
+    steps = [torch.load(path, weights_only=True)["step"] for path in tmp_path.rglob("checkpoint.pt")]
+    assert 2 <= len(steps) <= 4 and 0 < min(steps) <= max(steps) < 30000
+
+
+@pytest.mark.parametrize("num_jobs", [1, 2])
+def test_a_run_that_fails_is_told_and_the_others_go_on(
+    done: tuple[Path, dict], pack: Pack, tmp_path: Path, num_jobs: int
+) -> None:
+    work = lay_out(small(pack, rows=ROWS[:2], seeds=1, set={"steps": 3}), pack, tmp_path, ProbeConfig(controls=False))
+    shutil.copytree(done[0] / "runs/mvitac/seed0", work.jobs[0].out)
+    (work.jobs[0].out / "scores.json").unlink()
+    said: list[str] = []
+    with pytest.raises(ValueError, match="holds a different run"):
+        do_all(work, num_jobs, said.append)
+    assert any(re.fullmatch(r"\[\d/2\] MViTac, seed 0: failed: .* holds a different run .*", line) for line in said)
+    assert [job.done for job in work.jobs] == [False, True]
+
+
+def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) -> None:
+    """As when the same command runs on two machines; here a thread is the other one."""
+    work = lay_out(small(pack, rows=ROWS[:2], seeds=1), pack, tmp_path, ProbeConfig(controls=False))
+    begun, go, said = threading.Event(), threading.Event(), []
+
+    def other() -> None:
+        with hold_lock(work.jobs[0].out, "", wait=False):
+            begun.set()
+            go.wait(60)
+
+    with ThreadPoolExecutor(1) as threads:
+        held = threads.submit(other)
+        assert begun.wait(60)
+        with pytest.raises(Busy, match="is being trained by another process"):
+            train(work.jobs[0].run, work.jobs[0].out, pack=pack)
+        do_all(work, 1, said.append)
+        assert (
+            "[0/2] MViTac, seed 0: another process runs it; this command makes the whole table once it is done" in said
+        )
+        assert [job.done for job in work.jobs] == [False, True] and not work.jobs[0].out.exists()
+        go.set()
+        held.result()
+    text = write_tables(gather(work, tmp_path, ProbeConfig(controls=False)), tmp_path)[0].read_text()
+    assert "**Not finished: MViTac, seed 0.**" in text
+    do_all(work, 1, lambda line: None)
+    assert [job.done for job in work.jobs] == [True, True] and not list(tmp_path.rglob("*.lock"))
+
+
+def test_a_run_killed_once_scored_loses_its_checkpoint_later(done: tuple[Path, dict], pack: Pack) -> None:
+    work = lay_out(small(pack), pack, done[0], ProbeConfig())
+    (work.jobs[0].out / "checkpoint.pt").touch()
+    do_all(work, 1, lambda line: None)
+    assert not (work.jobs[0].out / "checkpoint.pt").exists()
+
+
+def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], pack: Pack, tmp_path: Path) -> None:
+    """Before anything is trained or told, though all runs are finished."""
+    out, _ = done
+    with pytest.raises(ValueError, match="mvitac/seed0 holds a different run"):
+        lay_out(small(pack, set={"steps": 5, "eval_every": 0}), pack, out, ProbeConfig())
+    other = toy_pack(tmp_path / "other", num=90)
+    with pytest.raises(ValueError, match="mvitac/seed0 holds a different run"):
+        lay_out(small(other), other, out, ProbeConfig())
+
+
+def test_other_probes_score_finished_runs_again(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (ProbeConfig(controls=False, probes=probes) for probes in (("linear",), ("knn", "linear")))
+    plan = small(pack, rows=ROWS[:1], seeds=1)
+    work = lay_out(plan, pack, tmp_path, first)
+    do_all(work, 1, lambda line: None)
+    linear = gather(work, tmp_path, first)["records"]
+    monkeypatch.setattr(Step, "__call__", None)  # nothing is trained again
+    work = lay_out(plan, pack, tmp_path, second)
+    assert not work.jobs[0].done
+    do_all(work, 1, lambda line: None)
+    both = gather(work, tmp_path, second)["records"]
+    assert work.jobs[0].done and {record["probe"] for record in both} == {"knn", "linear"}
+    assert [record for record in both if record["probe"] == "linear"] == linear
+
+
+def test_scores_that_do_not_say_what_they_are_of_are_of_linear_probes(pack: Pack, tmp_path: Path) -> None:
+    """As they were written before there was a choice of probes in a plan."""
+    work = lay_out(small(pack, rows=ROWS[:1], seeds=1), pack, tmp_path, ProbeConfig(controls=False))
+    write_json(work.jobs[0].out / "scores.json", {"records": [], "retrieval": []})
+    assert work.jobs[0].done
+    asked = replace(work.jobs[0], session=ProbeConfig(tasks=("pattern",), controls=False))
+    assert not asked.done and not replace(work.jobs[0], stress=True).done
+
+
+def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) -> None:
+    said = {
+        (positives, views): pairs_of(replace(recipe("smoke", PackConfig()), positives=positives), views, pack)
+        for positives in ("same-image", "same-touch", "same-touch-pairs")
+        for views in (1, 2)
+    }
+    two = {key for key, words in said.items() if words == "two rows of a touch"}
+    assert two == {("same-touch", 2), ("same-touch-pairs", 1), ("same-touch-pairs", 2)}
+    assert set(said.values()) == {"two rows of a touch", "one row"}
+    for other in ("one row", "two rows of a touch"):
+        costs = [{**c, "pairs_of": other if c["row"] == "MViTac" else "one row"} for c in done[1]["cost"]]
+        text = markdown({**done[1], "cost": costs}, lines_of(done[1]))
+        assert ("**pairs are not from the same rows (see cost)**" in text) == (other != "one row")
+        assert f"| {other} |" in text
+
+
+def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> None:
+    out, result = done
+    by_row = {c["row"]: c for c in result["cost"]}
+    assert by_row["MViTac"]["images"] == 4 * 16 * 2 * 2 and by_row["supervised, touch"]["images"] == 4 * 16
+    assert by_row["MViTac"]["pairs"] == by_row["supervised, touch"]["pairs"] == 64
+    assert all(0 < c["seconds"] < 60 for c in result["cost"])
+    fake = out.parent / "fake"
+    fake.mkdir()
+    (fake / "run.json").write_text(json.dumps({"run": {"batch_size": 16}}))
+    steps = [{"step": 10, "pairs_per_s": 80.0}, {"step": 10, "eval": {}}, {"step": 30, "pairs_per_s": 160.0}]
+    (fake / "log.jsonl").write_text("\n".join(map(json.dumps, steps)))
+    assert seconds_of(fake) == pytest.approx(10 * 16 / 80 + 20 * 16 / 160)
+    work = lay_out(small(pack), pack, out, ProbeConfig())
+    assert cost("MViTac", work.jobs[:1], pack)["trained_parameters"] > 100_000
+
+
+def test_leaking_splits_are_flagged(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert leaks(pack, pack.spec.tasks) == ""
+    real = Pack.column
+
+    def column(self: Pack, name: str) -> np.ndarray:
+        values = real(self, name)
+        if name == "split":
+            rows = np.flatnonzero(values == "test")
+            values[rows[::2]] = "train"
+        return values
+
+    monkeypatch.setattr(Pack, "column", column)
+    assert "test instances are also in train" in leaks(pack, pack.spec.tasks)
+
+
+def test_a_leak_of_a_tasks_own_split_is_flagged(pack: Pack) -> None:
+    """Every fourth row is tested: its group's other row is learned from, and half of them were pre-trained on."""
+    pattern, bright = pack.spec.tasks
+    own = copy(pack)
+    sides = np.where(np.arange(pack.num) % 4 == 0, "test", "train")
+    own.table = pack.table.append_column("split_bright", pa.array(sides))
+    task = replace(bright, split="split_bright")
+    seen = np.isin(np.flatnonzero(sides == "test"), pack.rows("train")).sum()
+    said = leaks(own, [pattern, task])
+    assert said.startswith("30 of 30 test instances of bright are also in train: this split leaks; ")
+    assert said.endswith(f"; {seen} of 30 test rows of bright were pre-trained on") and 0 < seen < 30
+    assert leaks(own, [pattern]) == ""  # nothing that is scored
+
+
+def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack: Pack) -> None:
+    out, result = done
+    work = lay_out(small(pack), pack, out, ProbeConfig())
+    noted = copy(pack)
+    noted.spec = replace(pack.spec, notes=("half of it\nis the same",))
+    result = gather(replace(work, pack=noted), out, ProbeConfig())
+    lines = lines_of(result)
+    assert "\nNote: half of it is the same.\n" in markdown(result, lines)
+    assert latex(result, lines).splitlines()[1] == "% Note: half of it is the same."
+    older = {key: value for key, value in result.items() if key not in ("notes", "run_commits", "run_devices")}
+    assert "Note" not in markdown(older, lines) + latex(older, lines)
+
+
+def test_tables_name_the_code_of_runs_and_tables(done: tuple[Path, dict]) -> None:
+    out, result = done
+    commits = {json.loads(file.read_text())["commit"] for file in out.rglob("run.json")}
+    assert set(result["run_commits"]) == commits and len(result["run_devices"]) == 1
+    at = {"commit": "c" * 40 + "+", "device": "here", "run_devices": ["there", "elsewhere"]}
+    lines = lines_of(result)
+    text = markdown({**result, **at, "run_commits": ["a" * 40, "b" * 40]}, lines)
+    assert f"runs at commits {'a' * 12}, {'b' * 12}; tables at {'c' * 12}+, there, elsewhere." in text
+    assert f"code {'c' * 12}+, there" in markdown({**result, **at, "run_commits": [at["commit"]]}, lines)
+    assert f"code {'c' * 12}+, here." in markdown({**result, **at, "run_commits": [], "run_devices": []}, lines)
+
+
+def test_a_control_of_one_probe_is_one_line_of_the_csv(done: tuple[Path, dict]) -> None:
+    """Pixels, border and majority are scored linearly, whatever else trunks are probed by."""
+    _, result = done
+    plan = {**result["plan"], "probes": ["linear", "knn"]}
+    near = [{**r, "probe": "knn"} for r in result["records"] if r["source"] in ("MViTac", "colder", "untrained")]
+    rows = list(csv.DictReader(comma({**result, "plan": plan, "records": result["records"] + near}).splitlines()))
+    found = [(r["row"], r["probe"], r["modality"], r["task"]) for r in rows]
+    assert len(set(found)) == len(found)
+    probes = {name: {r["probe"] for r in rows if r["row"] == name} for name in {r["row"] for r in rows}}
+    assert probes["pixels"] == probes["majority"] == probes["noise only"] == {"linear"}
+    assert probes["MViTac"] == {"linear", "knn"} and probes["supervised, touch, end to end"] == {"own"}
+
+
+def test_peak_memory_is_of_training_on_its_own_gpu(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scoring a finished run once more leaves what its training took."""
+    common = {"seeds": 1, "tasks": ("pattern",), "set": {"steps": 1, "eval_every": 0}}
+    session = ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False)
+    work = lay_out(small(pack, rows=ROWS[:1], **common), pack, tmp_path, session)
+    (job,) = work.jobs
+    peak, asked = [777], []
+    cuda = SimpleNamespace(
+        reset_peak_memory_stats=asked.append, max_memory_allocated=lambda device: asked.append(device) or peak[0]
+    )
+    monkeypatch.setattr(jobs, "torch", SimpleNamespace(cuda=cuda))
+    monkeypatch.setattr(jobs, "pick_device", lambda name: torch.device("cuda:1"))
+    for peak[0] in (777, 0):
+        (job.out / "scores.json").unlink(missing_ok=True)
+        do(job, pack)
+        assert json.loads((job.out / "memory.json").read_text()) == {"peak_bytes": 777}
+    assert asked == [torch.device("cuda:1")] * 2
+
+
+def test_a_row_is_not_named_as_a_control_of_the_data(pack: Pack, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="row 'noise only' has the name of a control of this data"):
+        lay_out(small(pack, rows=(*ROWS, Row(label="noise only"))), pack, tmp_path, ProbeConfig())
+
+
+# -- significance -----------------------------------------------------------------------------------------------------
+
+
+def record(correct: list[int], seed: int, sizes: int = 10) -> dict:
+    return {"group_sizes": [sizes] * len(correct), "group_correct": correct, "seed": seed}
+
+
+def test_paired_difference_sees_a_small_steady_gain() -> None:
+    """Groups differ wildly, but ours has one more right in each: paired, that is certain."""
+    rng = np.random.default_rng(0)
+    theirs = rng.integers(0, 9, 40)
+    a, b = [record((theirs + 1).tolist(), 0)], [record(theirs.tolist(), 0)]
+    mean, low, high, p = paired_difference(a, b)
+    assert (mean, low, high) == pytest.approx((0.1, 0.1, 0.1)) and p < 0.002
+    assert paired_difference(b, a)[0] == pytest.approx(-0.1)
+
+
+def test_paired_difference_of_equals_is_not_significant() -> None:
+    """Of 100 pairs of equally good guessers, about 5 differ at p < .05."""
+    rng = np.random.default_rng(1)
+    significant = 0
+    for _ in range(100):
+        a, b = ([record(rng.binomial(10, 0.5, 30).tolist(), s) for s in range(1)] for _ in range(2))
+        significant += paired_difference(a, b)[3] < 0.05
+    assert significant <= 12
+    assert paired_difference(a, a) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_what_is_drawn_varies_as_much_as_what_it_stands_for() -> None:
+    """Of two things with .5 and .6 the mean has a standard error of .05, that of two drawn from them .05 / sqrt(2)."""
+    of_seeds = [record([5] * 40, 0), record([6] * 40, 1)]
+    of_groups = [record([5, 6], 0)]
+    for records in (of_seeds, of_groups):
+        assert interval(records) == pytest.approx((0.55, 0.55 - 0.05 * 2**0.5, 0.55 + 0.05 * 2**0.5))
+    shifted = [record([3] * 40, 0), record([3] * 40, 1)]
+    assert paired_difference(of_seeds, shifted)[1:3] == pytest.approx((0.25 - 0.05 * 2**0.5, 0.25 + 0.05 * 2**0.5))
+
+
+def test_few_seeds_that_scatter_are_no_certainty() -> None:
+    """Of 200 pairs of equally good methods whose seeds scatter more than groups, about 10 differ at p < .05; 18 do by a
+    bootstrap that is not stretched."""
+    rng = np.random.default_rng(2)
+    significant = 0
+    for _ in range(200):
+        rates = rng.normal(0.6, 0.15, 100)
+        ours, theirs = (
+            [
+                record(rng.binomial(10, np.clip(rates + mine + rng.normal(0, 0.03), 0, 1)).tolist(), seed)
+                for seed in range(3)
+            ]
+            for mine in (rng.normal(0, 0.07, 100) for _ in range(2))
+        )
+        significant += paired_difference(ours, theirs)[3] < 0.05
+    assert significant <= 13
+
+
+def test_p_is_no_less_than_a_sign_test_can_say() -> None:
+    ours, theirs = [record([6] * 4, 0)], [record([5] * 4, 0)]
+    assert paired_difference(ours, theirs)[3] == 2 / 2**4
+
+
+def test_intervals_end_where_accuracies_do() -> None:
+    assert interval([record([10] * 5 + [9], seed) for seed in range(2)])[2] == 1
+
+
+def test_equal_seeds_are_paired() -> None:
+    """Seeds differ by 50 points, but ours has one more right under each: certain where seeds are the same, not where not."""
+    theirs = [record([2] * 30, 0), record([7] * 30, 1)]
+    ours = [record([3] * 30, 0), record([8] * 30, 1)]
+    assert paired_difference(ours, theirs)[1:3] == pytest.approx((0.1, 0.1))
+    others = [{**r, "seed": r["seed"] + 5} for r in ours]
+    assert paired_difference(others, theirs)[1] < 0
+
+
+def test_paired_difference_doubts_seeds_too() -> None:
+    """Better by chance of one seed of two: the interval over seeds reaches below zero."""
+    a = [record([9] * 30, 0), record([3] * 30, 1)]
+    b = [record([5] * 30, 0), record([5] * 30, 1)]
+    mean, low, high, p = paired_difference(a, b)
+    assert mean == pytest.approx(0.1) and low < 0 < high and p > 0.05
+    assert paired_difference([record([3], 0)], [record([9], 0)])[1:] == (-1.0, 1.0, 1.0)  # one group
+
+
+# -- the command: killed and resumed, several at once -----------------------------------------------------------------
+
+
+def command(pack: Pack, plan: Path, out: Path, *more: str) -> list[str]:
+    choice = ["--plan", str(plan), "--data", "pack", "--data.path", str(pack.path), "--out", str(out)]
+    return ["compare", *choice, *more]
+
+
+def write_plan(path: Path, num_rows: int, seeds: int, steps: int) -> Path:
+    rows = [{"label": f"tau {i}", "set": {"method.temperature": 0.1 + 0.1 * i}} for i in range(num_rows)]
+    common = {"steps": steps, "eval_every": 0, "checkpoint_every": 1, "log_every": 1}
+    plan = {"rows": rows, "reference": "tau 0", "recipe": "smoke", "seeds": seeds, "set": common, "tasks": ["pattern"]}
+    path.write_text(json.dumps({**plan, "modalities": ["touch"]}))
+    return path
+
+
+def table(out: Path) -> tuple[str, str]:
+    """The whole CSV, and the Markdown without the times it took and the commit, which may be made meanwhile."""
+    text = re.sub(r"; (code|runs at) .*", "", (out / "table.md").read_text())
+    return (out / "table.csv").read_text(), text[: text.index("| cost of one run")]
+
+
+def kill_and_resume(pack: Pack, base: Path, num_rows: int, seeds: int, steps: int, goals: tuple[int, ...]) -> None:
+    """SIGKILL the command whenever ``goals`` log lines are written in all, then let it end, and compare the tables."""
+    plan = write_plan(base / "plan.json", num_rows, seeds, steps)
+    finish(begin(main, command(pack, plan, base / "straight")))
+    out = base / "killed"
+    for goal in goals:
+        process = begin(main, command(pack, plan, out))
+        while process.is_alive():
+            if sum(len(log.read_text().splitlines()) for log in out.glob("runs/*/*/log.jsonl")) >= goal:
+                process.kill()
+                process.join()
+                assert process.exitcode == -signal.SIGKILL
+            time.sleep(0.005)
+        assert not (out / "table.md").exists()
+    shown = base / "shown.txt"
+    finish(begin(main, command(pack, plan, out), output=shown), shown)
+    assert f"[{num_rows * seeds}/{num_rows * seeds}]" in shown.read_text()
+    assert table(out) == table(base / "straight")
+
+
+@pytest.mark.slow
+def test_killed_twice_and_resumed_gives_the_same_table(pack: Pack, tmp_path: Path) -> None:
+    kill_and_resume(pack, tmp_path, num_rows=3, seeds=2, steps=6, goals=(9, 23))
+
+
+def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = write_plan(tmp_path / "plan.json", 2, 1, 2)
+    words = command(pack, plan, tmp_path / "out")
+    assert main([*words, "--dry-run"]) == 0
+    assert "2 rows x 1 seeds = 2 runs" in capsys.readouterr().out and not (tmp_path / "out").exists()
+    assert main([*words, "--tables-only"]) == 2
+    assert "no run of" in capsys.readouterr().err
+    assert main([*words, "--set", "steps=1", "--seeds", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert "[2/2] tau 1, seed 0" in shown and "| tau 0 | touch |" in shown
+    assert main([*words, "--set", "steps=1", "--tables-only"]) == 0
+    assert "all runs are finished" in capsys.readouterr().out
+    assert main([*words, "--set", "steps=1", "--tables-only", "--rows", "tau 0"]) == 0
+    shown = capsys.readouterr().out
+    assert "| tau 0 | touch |" in shown and "tau 1" not in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--plan", "tabel1"], "did you mean 'table1'"),
+        (["--recipe", "dmeo"], "did you mean 'demo'"),
+        (["--set", "steps"], "field=value"),
+        (["--set", "stepz=3"], "unknown field of a run 'stepz'"),
+        (["--jobs", "0"], "jobs 0"),
+        (["--rows", "SVTP"], "unknown row 'SVTP'"),
+        (["--seeds", "0"], "seeds 0"),
+    ],
+)
+def test_slips_are_one_line(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    start = ["compare", "--data", "pack", "--data.path", str(pack.path), "--out", str(tmp_path / "out")]
+    assert main([*start, *words]) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_slurm_without_submitit_is_one_line(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "submitit", None)  # as if it were not installed
+    plan = write_plan(tmp_path / "plan.json", 1, 1, 2)
+    assert main([*command(pack, plan, tmp_path / "out"), "--slurm", "slurm_partition=gpu"]) == 2
+    assert "pip install 'mvitac[slurm]'" in capsys.readouterr().err
+
+
+# -- folds ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A plan over 40 pairs of 8 objects: fold1 tests objects 0 to 3, fold2 the rest, in ``same`` fold1 again, and ``few``
+    one of the rest."""
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
+    lines = ["vision,touch,label,object,fold1,fold2,same,few"]
+    rng = np.random.default_rng(0)
+    for i in range(40):
+        thing = i % 8
+        for name in ("v", "t"):
+            pixels = np.full((32, 32, 3), 60 + 90 * (thing % 2), np.uint8) + rng.integers(0, 40, (32, 32, 3), np.uint8)
+            Image.fromarray(pixels).save(tmp_path / f"{name}{i}.png")
+        first = "test" if thing < 4 else "train"
+        second = {"test": "train", "train": "test"}[first]
+        lines.append(
+            f"v{i}.png,t{i}.png,{'ab'[thing % 2]},{thing},{first},{second},{first},{'test' if thing == 7 else 'train'}"
+        )
+    (tmp_path / "pairs.csv").write_text("\n".join(lines))
+    (tmp_path / "plan.toml").write_text(
+        f"""
+        recipe = "smoke"
+        seeds = 2
+        set = {{ steps = 2, eval_every = 0 }}
+        data = {{ name = "folder", path = "{tmp_path / "pairs.csv"}", labels = ["label"], group = "object", size = 32 }}
+        folds = ["split=fold1", "split=fold2"]
+        [[rows]]
+        label = "MViTac"
+        [[rows]]
+        label = "SimCLR"
+        method = "simclr"
+        """
+    )
+    return tmp_path / "plan.toml"
+
+
+def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    main(["compare", "--plan", str(two_folds), "--out", str(out)])
+    assert "2 rows x 2 seeds x 2 folds = 8 runs" in capsys.readouterr().out
+    assert "2 folds: every test object is scored once" in (out / "table.md").read_text()
+    result = json.loads((out / "result.json").read_text())
+    keys = ("source", "seed", "task", "modality", "probe")
+    assert len({tuple(r[k] for k in keys) for r in result["records"]}) == len(result["records"])
+    one = next(r for r in result["records"] if (r["source"], r["seed"], r["modality"]) == ("SimCLR", 1, "both"))
+    apart = [
+        next(
+            r
+            for r in json.loads((out / fold / "runs/simclr/seed1/scores.json").read_text())["records"]
+            if r["modality"] == "both"
+        )
+        for fold in ("fold1", "fold2")
+    ]
+    assert one["group_sizes"] == [5] * 8 and one["num_test"] == 40
+    assert one["group_correct"] == apart[0]["group_correct"] + apart[1]["group_correct"]
+    assert one["accuracy"] == pytest.approx((apart[0]["accuracy"] + apart[1]["accuracy"]) / 2)
+    assert one["auroc"] == pytest.approx((apart[0]["auroc"] + apart[1]["auroc"]) / 2)
+    assert "| AUROC | modality | label |" in (out / "table.md").read_text()
+    (out / "fold2/runs/simclr/seed1/scores.json").unlink()
+    (out / "fold2/runs/simclr/seed1/model.safetensors").unlink()
+    main(["compare", "--plan", str(two_folds), "--out", str(out), "--tables-only"])
+    assert "**Not finished: SimCLR, fold2, seed 1.**" in (out / "table.md").read_text()
+    left = json.loads((out / "result.json").read_text())["records"]
+    assert {r["seed"] for r in left if r["source"] == "SimCLR"} == {0}
+
+
+@pytest.mark.parametrize(
+    ("folds", "message"),
+    [
+        (["split=fold1", "split=same"], "folds 'fold1' and 'same' both test object '0'"),
+        (["split=fold1", "split=fold1"], "fold 'split=fold1' is there twice"),
+        (["split=my_fold", "split=my-fold"], "do not tell them apart"),
+        (["split=fold1", "split=Fold1"], "do not tell them apart"),
+        (["split=_"], "do not tell them apart"),
+        (["fold1"], "fold fold1: give field=value, e.g. split=fold1"),
+        (["splits=fold1"], "unknown field of a run 'data.splits'"),
+    ],
+)
+def test_folds_that_cannot_be(
+    two_folds: Path, tmp_path: Path, folds: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compare", "--plan", str(two_folds), "--folds", *folds, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_folds_test_a_group_once_in_a_tasks_own_split(
+    two_folds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = find_plan(str(two_folds))
+    real = type(plan.data).open
+
+    def with_own_split(self: DatasetConfig, *, quiet: bool = False) -> Pack:
+        pack = real(self, quiet=quiet)
+        pack.table = pack.table.append_column("mine", pa.array(["train", "test"] * 20))
+        pack.spec = replace(pack.spec, tasks=(replace(pack.spec.tasks[0], split="mine"),))
+        return pack
+
+    monkeypatch.setattr(type(plan.data), "open", with_own_split)
+    with pytest.raises(ValueError, match=r"both test object '1' \(column mine\): each group must be tested once"):
+        lay_out_folds(plan, tmp_path / "out", ProbeConfig())
+
+
+def test_a_row_that_one_fold_does_not_allow_runs_on_none(two_folds: Path, tmp_path: Path) -> None:
+    plan = find_plan(str(two_folds))
+    big = Row(label="big", set={"batch_size": 32})  # few has 35 rows to train on, fold1 has 20
+    plan = replace(plan, rows=(*plan.rows, big), folds=("split=few", "split=fold1"))
+    works = lay_out_folds(plan, tmp_path / "out", ProbeConfig())
+    assert [sorted({job.label for job in work.jobs}) for work in works] == [["MViTac", "SimCLR"]] * 2
+    assert all("20 rows to train on" in work.left_out["big"] for work in works)
+
+
+def test_what_the_first_row_changes_in_its_data_is_no_other_rows(two_folds: Path) -> None:
+    plan = find_plan(str(two_folds))
+    first = Row(label="difference images", set={"data.difference": True})
+    plan = replace(plan, rows=(first, *plan.rows))
+    assert [(name, vars(part.data)["difference"]) for name, part in plan.in_folds()] == [
+        ("fold1", False),
+        ("fold2", False),
+    ]

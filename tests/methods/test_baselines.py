@@ -1,0 +1,459 @@
+"""The baselines against their owners' formulas, written out one element at a time."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from mvitac.data.pack import Pack
+from mvitac.evaluation.diagnostics import spread
+from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.probe import probe_model
+from mvitac.methods.byol import BYOLConfig, regression
+from mvitac.methods.calandra import CalandraConfig
+from mvitac.methods.cmc import CMC, CMCConfig, nce
+from mvitac.methods.dino import DINO, DINOConfig
+from mvitac.methods.mct import MCTConfig, hinge
+from mvitac.methods.moco import MoCo, MoCoConfig
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.methods.simclr import SimCLRConfig, nt_xent
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.methods.vicreg import VICReg, VICRegConfig, covariance, variance
+from mvitac.model import load
+from mvitac.nn.losses import queue_nce
+from mvitac.nn.memory_bank import Bank, Queue, shard_banks
+from mvitac.recipes import with_method
+from mvitac.run import Optim
+from mvitac.system.distributed import World
+from mvitac.training.loop import train
+from support.slow_losses import slow_info_nce
+from support.small_methods import ROWS, TINY, build, outcome, small, views
+from support.toy import Toy
+from support.training_runs import smoke
+
+
+def unit(x: torch.Tensor) -> list[list[float]]:
+    """Rows of ``x`` L2-normalised, as plain numbers."""
+    rows = []
+    for row in x.tolist():
+        length = math.sqrt(sum(v * v for v in row))
+        rows.append([v / length for v in row])
+    return rows
+
+
+def dot(a: list[float], b: list[float]) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+# -- memory -----------------------------------------------------------------------------------------------------------
+
+
+def test_queue_holds_the_last_keys_and_wraps() -> None:
+    queue = Queue(5, 2)
+    keys = torch.randn(9, 2)
+    for start in (0, 3, 6):
+        queue.push(keys[start : start + 3])
+    held = {tuple(round(v, 5) for v in row) for row in queue.keys.tolist()}
+    assert held == {tuple(round(v, 5) for v in row) for row in unit(keys[4:])}
+    queue.push(torch.randn(11, 2))  # more than it holds
+    assert torch.allclose(queue.keys.norm(dim=1), torch.ones(5))
+
+
+def test_bank_moves_exactly_the_batchs_rows() -> None:
+    bank, at = Bank(7, 3), torch.tensor([5, 2])
+    before, z = bank.values.clone(), F.normalize(torch.randn(2, 3), dim=1)
+    bank.follow(at, z, 0.5)
+    for row in range(7):
+        if row in (5, 2):
+            expected = unit((0.5 * before[row] + 0.5 * z[[5, 2].index(row)])[None])[0]
+            assert bank.values[row].tolist() == pytest.approx(expected, rel=1e-5)
+        else:
+            assert torch.equal(bank.values[row], before[row])
+
+
+@pytest.mark.parametrize(("size", "held"), [(1, [7]), (2, [4, 3]), (3, [3, 2, 2]), (9, [1] * 7 + [0, 0])])
+def test_a_sharded_bank_finds_scores_and_moves_its_own_rows(size: int, held: list[int]) -> None:
+    """Any number of rows over any number of processes: each row on one of them, and only there told, moved and restored."""
+    whole, at, z = Bank(7, 3), torch.tensor([6, 2, 3]), F.normalize(torch.randn(3, 3), dim=1)
+    shards = [copy.deepcopy(whole) for _ in range(size)]
+    drawn = torch.randint(7, (3, 20))
+    dots, all_held = whole.dots(z, whole.find_drawn(drawn))
+    assert all_held.all()
+    counted, state = torch.zeros(3, 20), copy.deepcopy(whole.state_dict())
+    whole.follow(at, z, 0.5)
+    moved = torch.full((7, 3), torch.nan)
+    for rank, shard in enumerate(shards):
+        shard_banks(shard, World(rank, size))
+        shard.values.zero_()
+        shard.load_state_dict(state)
+        assert shard.num_own == held[rank] and len(shard.values) == held[rank] + (size > 1)
+        own, mine = shard.dots(z, shard.find(drawn))
+        torch.testing.assert_close(own[mine], dots[mine])
+        counted += mine
+        shard.follow(at, z, 0.5)
+        moved[rank::size] = shard.values[: held[rank]]
+    assert torch.equal(counted, torch.ones(3, 20)) and torch.equal(moved, whole.values)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_a_process_looks_at_little_more_than_the_drawn_rows_it_holds(size: int) -> None:
+    bank, drawn, found = Bank(53, 3), torch.randint(53, (4, 3000)), []
+    for rank in range(size):
+        shard = copy.deepcopy(bank)
+        shard_banks(shard, World(rank, size))
+        place = shard.find_drawn(drawn)
+        assert place.shape[1] <= 3000 / size * 1.7
+        found += [(q, int(p) * size + rank) for q in range(4) for p in place[q] if p < shard.num_own]
+    assert sorted(found) == sorted((q, int(row)) for q in range(4) for row in drawn[q])
+
+
+def test_a_bank_of_other_rows_is_refused_by_every_process() -> None:
+    state = Bank(8, 3).state_dict()
+    for rank in (0, 1):
+        shard = Bank(7, 3)
+        shard_banks(shard, World(rank, 2))
+        with pytest.raises(RuntimeError, match="size mismatch"):
+            shard.load_state_dict(state)
+
+
+# -- CMC --------------------------------------------------------------------------------------------------------------
+
+
+def slow_nce(scores: list[list[float]], num_rows: int) -> float:
+    """NCECriterion of HobbitLong/CMC: P_pos / (P_pos + m Pn + eps), m Pn / (P_neg + m Pn + eps)."""
+    total, m = 0.0, len(scores[0]) - 1
+    noise = m * (1.0 / num_rows)
+    for row in scores:
+        total += math.log(row[0] / (row[0] + noise + 1e-7))
+        for p in row[1:]:
+            total += math.log(noise / (p + noise + 1e-7))
+    return -total / len(scores)
+
+
+def test_nce_is_the_owners() -> None:
+    scores = torch.rand(6, 12) * 0.1
+    held = torch.rand(6, 12) < 0.5
+    whole, *parts = (float(nce(scores, 11 / 50, own)) for own in (held | True, held, ~held))
+    assert whole == pytest.approx(slow_nce(scores.tolist(), 50), rel=1e-5)
+    assert sum(parts) == pytest.approx(whole, rel=1e-5)
+
+
+@pytest.mark.parametrize("softmax", [False, True])
+def test_cmc_equals_a_direct_transcription(softmax: bool) -> None:
+    """Fetch the drawn bank rows, exponentiate, divide by Z of the first batch; a second batch keeps that Z."""
+    config = replace(small("cmc"), softmax=softmax)
+    method = build("cmc", config=config)
+    assert isinstance(method, CMC) and isinstance(config, CMCConfig)
+    fixed: dict[str, float] = {}
+    for seed in (5, 6):
+        batch = views(method, seed=seed)
+        banks = {m: bank.values.clone() for m, bank in method.banks.items()}
+        found = outcome(method, batch)
+        torch.manual_seed(9)
+        at = [ROWS.tolist().index(row) for row in batch.rows.tolist()]
+        drawn = torch.randint(len(ROWS), (8, 10))
+        drawn[:, 0] = torch.tensor(at)
+        z = {m: unit(tower(batch.images[m][0])) for m, tower in method.towers.items()}
+        total = 0.0
+        for name, query, bank in (("vt", "vision", "touch"), ("tv", "touch", "vision")):
+            memory = banks[bank].tolist()
+            logits = [[dot(z[query][i], memory[j]) / 0.07 for j in row] for i, row in enumerate(drawn.tolist())]
+            if softmax:
+                loss = sum(math.log(sum(math.exp(v) for v in row)) - row[0] for row in logits) / 8
+            else:
+                scores = [[math.exp(v) for v in row] for row in logits]
+                fixed.setdefault(name, sum(map(sum, scores)) / 80 * len(ROWS))
+                loss = slow_nce([[s / fixed[name] for s in row] for row in scores], len(ROWS))
+            assert float(found[name].detach()) == pytest.approx(loss, rel=1e-4), (name, seed)
+            total += loss
+        assert float(found["loss"].detach()) == pytest.approx(total, rel=1e-4)
+        method.after_step(0.5)
+        for modality, bank in method.banks.items():
+            moved = (bank.values != banks[modality]).any(dim=1).nonzero().flatten().tolist()
+            assert moved == sorted(at)
+            new = [
+                unit((0.5 * banks[modality][j] + 0.5 * torch.tensor(z[modality][i]))[None])[0] for i, j in enumerate(at)
+            ]
+            torch.testing.assert_close(bank.values[at], torch.tensor(new), rtol=1e-4, atol=1e-5)
+
+
+# -- SSVTP, SimCLR, MoCo, MCT -----------------------------------------------------------------------------------------
+
+
+def test_ssvtp_is_the_mean_of_both_directions() -> None:
+    method = build("ssvtp")
+    batch = views(method)
+    z = {m: tower(batch.images[m][0]).detach() for m, tower in method.towers.items()}  # type: ignore[union-attr]
+    both = slow_info_nce(z["vision"], z["touch"], 0.07) + slow_info_nce(z["touch"], z["vision"], 0.07)
+    assert float(outcome(method, batch)["loss"].detach()) == pytest.approx(both / 2, rel=1e-4)
+
+
+def test_nt_xent_written_out() -> None:
+    a, b = torch.randn(4, 5), torch.randn(4, 5)
+    z, total = unit(torch.cat([a, b])), 0.0
+    for i in range(8):
+        j = (i + 4) % 8
+        below = sum(math.exp(dot(z[i], z[k]) / 0.3) for k in range(8) if k != i)
+        total -= math.log(math.exp(dot(z[i], z[j]) / 0.3) / below)
+    assert float(nt_xent(a, b, 0.3)) == pytest.approx(total / 8, rel=1e-5)
+
+
+def test_queue_nce_written_out() -> None:
+    q, k, queue = torch.randn(4, 5), torch.randn(4, 5), F.normalize(torch.randn(7, 5), dim=1)
+    total = 0.0
+    for a, b in zip(unit(q), unit(k), strict=True):
+        positive = math.exp(dot(a, b) / 0.2)
+        total -= math.log(positive / (positive + sum(math.exp(dot(a, n) / 0.2) for n in queue.tolist())))
+    assert float(queue_nce(q, k, queue, 0.2)) == pytest.approx(total / 4, rel=1e-5)
+
+
+def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
+    method = build("moco")
+    assert isinstance(method, MoCo)
+    batch = views(method)
+    keys = {m: method.key[m](batch.images[m][1]) for m in batch.images}
+    queues = {m: queue.keys.clone() for m, queue in method.queues.items()}
+    found = outcome(method, batch)
+    for modality in ("vision", "touch"):
+        q = method.query[modality](batch.images[modality][0])
+        expected = queue_nce(q, keys[modality], queues[modality], 0.2)
+        torch.testing.assert_close(found[modality], expected)
+    before = copy.deepcopy(method.key.state_dict())
+    method.after_step(0.5)
+    for modality, queue in method.queues.items():
+        torch.testing.assert_close(queue.keys[:8], F.normalize(keys[modality], dim=1))
+        assert torch.equal(queue.keys[8:], queues[modality][8:]) and int(queue.place) == 8
+    query = method.query.state_dict()
+    for name, value in method.key.state_dict().items():
+        q = query[name.replace(".module.", ".")]
+        expected = 0.999 * before[name] + 0.001 * q if value.is_floating_point() else q
+        torch.testing.assert_close(value, expected, msg=name)
+
+
+def test_a_queue_is_at_most_half_the_data() -> None:
+    method = MoCoConfig(hidden=8, out=4).build(Toy().spec(), TINY)
+    method.prepare(ROWS)
+    assert all(len(queue.keys) == 40 for queue in method.queues.values())
+
+
+def test_hinge_written_out() -> None:
+    q, k, queue = torch.randn(4, 5), torch.randn(4, 5), F.normalize(torch.randn(7, 5), dim=1)
+    total = 0.0
+    for a, b in zip(unit(q), unit(k), strict=True):
+        total += sum(max(0.0, 0.2 - dot(a, b) + dot(a, n)) for n in queue.tolist())
+    assert float(hinge(q, k, queue, 0.2)) == pytest.approx(total / 28, rel=1e-5)
+
+
+def test_mct_crosses_modalities_through_the_inter_heads() -> None:
+    method = build("mct")
+    batch = views(method)
+    towers, queues = method.towers, {n: q.keys.clone() for n, q in method.queues.items()}  # type: ignore[union-attr]
+    query = {m: towers.query[m](v[0]) for m, v in batch.images.items()}
+    key = {m: towers.key[m](v[1]) for m, v in batch.images.items()}
+    found = outcome(method, batch)
+    torch.testing.assert_close(found["vt"], hinge(query["vision"][1], key["touch"][1], queues["touch_inter"], 0.2))
+    torch.testing.assert_close(found["tt"], queue_nce(query["touch"][0], key["touch"][0], queues["touch_intra"], 0.07))
+    method.after_step(0.1)
+    torch.testing.assert_close(
+        method.queues["vision_inter"].keys[:8],  # type: ignore[union-attr]
+        F.normalize(key["vision"][1], dim=1),
+    )
+
+
+# -- BYOL, DINO, VICReg -----------------------------------------------------------------------------------------------------
+
+
+def test_regression_is_the_distance_of_unit_vectors() -> None:
+    p, t = torch.randn(4, 6), torch.randn(4, 6)
+    slow = sum(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)) for a, b in zip(unit(p), unit(t), strict=True)) / 4
+    assert float(regression(p, t)) == pytest.approx(slow, rel=1e-5)
+
+
+def test_byol_both_ways_round() -> None:
+    method = build("byol")
+    batch = views(method)
+    found = outcome(method, batch)
+    a, b = batch.images["touch"]
+    online, predict, target = method.online["touch"], method.predictor["touch"], method.target["touch"]  # type: ignore
+    with torch.no_grad():
+        expected = regression(predict(online(a)), target(b)) + regression(predict(online(b)), target(a))
+    assert float(found["touch"].detach()) == pytest.approx(float(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize("method", ["byol", "dino"])
+def test_without_negatives_nothing_collapses(pack: Pack, tmp_path: Path, method: str) -> None:
+    """60 steps of the tiny trunk: unseen touches stay apart (a collapsed trunk has spread 0)."""
+    run = with_method(smoke(pack, steps=60, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=2e-3)), method)
+    run = replace(run, method=replace(run.method, momentum=0.95, hidden=64))
+    model = load(train(run, tmp_path / "r", quiet=True))
+    z = pack_features(model, pack, "touch", pack.rows("test", "val"))
+    assert spread(z - z.mean(0)) > 0.3
+
+
+def test_dino_equals_a_direct_transcription() -> None:
+    """Two steps: cross-entropy of centred, sharpened teacher scores of the other view; the centre follows their mean."""
+    method = build("dino", config=replace(small("dino"), centre_momentum=0.75))
+    assert isinstance(method, DINO)
+    centre = [[0.0] * 12 for _ in range(2)]
+    for seed in (5, 6):
+        batch = views(method, seed=seed)
+        found = outcome(method, batch)
+        for place, modality in enumerate(("vision", "touch")):
+            with torch.no_grad():
+                s, t = (
+                    [tower[modality](view).tolist() for view in batch.images[modality]]
+                    for tower in (method.student, method.teacher)
+                )
+            total = 0.0
+            for mine, other in ((0, 1), (1, 0)):
+                for a, b in zip(s[mine], t[other], strict=True):
+                    p = [math.exp((x - c) / 0.04) for x, c in zip(b, centre[place], strict=True)]
+                    q = [math.exp(x / 0.1) for x in a]
+                    total -= sum(x / sum(p) * math.log(y / sum(q)) for x, y in zip(p, q, strict=True)) / 16
+            assert float(found[modality].detach()) == pytest.approx(total, rel=1e-3)
+            mean = [sum(column) / 16 for column in zip(*t[0], *t[1], strict=True)]
+            centre[place] = [0.75 * c + 0.25 * m for c, m in zip(centre[place], mean, strict=True)]
+        method.after_step(0.5)
+        torch.testing.assert_close(method.centre, torch.tensor(centre), rtol=1e-4, atol=1e-6)
+    assert all(float(row.norm()) > 0 for row in method.centre)
+
+
+def test_vicreg_terms_are_their_definitions() -> None:
+    z = torch.randn(6, 4) * torch.tensor([0.1, 0.5, 1.0, 2.0])
+    rows = z.tolist()
+    mean = [sum(r[j] for r in rows) / 6 for j in range(4)]
+    cov = [[sum((r[j] - mean[j]) * (r[k] - mean[k]) for r in rows) / 5 for k in range(4)] for j in range(4)]
+    v = sum(max(0.0, 1 - math.sqrt(cov[j][j] + 1e-4)) for j in range(4)) / 4
+    c = sum(cov[j][k] ** 2 for j in range(4) for k in range(4) if j != k) / 4
+    assert float(variance(z)) == pytest.approx(v, rel=1e-4)
+    assert float(covariance(z)) == pytest.approx(c, rel=1e-4)
+
+
+def test_vicreg_weighs_its_terms() -> None:
+    method = build("vicreg", config=replace(small("vicreg"), invariance=3.0, variance=5.0, covariance=7.0))
+    assert isinstance(method, VICReg)
+    batch = views(method)
+    found = outcome(method, batch)
+    a, b = (method.towers["touch"](view) for view in batch.images["touch"])
+    s = (a - b).square().mean()
+    expected = 3 * s + 5 * (variance(a) + variance(b)) / 2 + 7 * (covariance(a) + covariance(b))
+    torch.testing.assert_close(found["touch"], expected, rtol=1e-4, atol=1e-4)
+
+
+# -- supervised references --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("modality", ["touch", "vision"])
+def test_supervised_on_one_modality(pack: Pack, modality: str) -> None:
+    method = SupervisedConfig(modalities=(modality,)).build(pack.spec, TINY)  # type: ignore[arg-type]
+    assert set(method.encoders()) == {modality}
+    with pytest.raises(ValueError, match="unknown modality"):
+        SupervisedConfig(modalities=("vision",)).build(Toy(vision_channels=0).spec(), TINY)
+
+
+def test_calandra_has_a_trunk_per_stream() -> None:
+    method = CalandraConfig().build(Toy(touch_channels=6).spec(), TINY)
+    touch = method.encoders()["touch"]
+    assert len(touch.trunks) == 2 and touch.num_features == 128  # type: ignore[union-attr, arg-type]
+    head = method.classifiers()["bright"]
+    sizes = [(layer.in_features, layer.out_features) for layer in head if hasattr(layer, "in_features")]  # type: ignore
+    assert sizes == [(192, 512), (512, 256), (256, 2)]
+    touch.eval()
+    left, right = torch.randn(2, 3, 32, 32), torch.randn(2, 3, 32, 32)
+    z = touch(torch.cat([left, right], dim=1))
+    torch.testing.assert_close(z[:, :64], touch.trunks[0](left))  # type: ignore[index]
+    torch.testing.assert_close(z[:, 64:], touch.trunks[1](right))  # type: ignore[index]
+
+
+def test_own_classifier_outlives_training(pack: Pack, tmp_path: Path) -> None:
+    run = with_method(
+        smoke(pack, steps=60, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=3e-3)), "supervised"
+    )
+    model = load(train(run, tmp_path / "r", quiet=True))
+    rows = pack.rows("test")
+    z = {m: pack_features(model, pack, m, rows) for m in ("vision", "touch")}
+    guess = model.classify("pattern", z).argmax(1).numpy()
+    assert (guess == pack.column("label_pattern")[rows]).mean() > 0.9
+    with pytest.raises(ValueError, match="unknown task"):
+        model.classify("weight", z)
+    # It is scored on views of the side it learned from, whatever side serves a probe best.
+    model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
+    task = next(t for t in pack.spec.tasks if t.name == "pattern")
+    own = next(r for r in probe_model(model, pack, [task], ["both"], ["linear"]) if r["probe"] == "own")
+    z = {m: pack_features(model, pack, m, rows, for_heads=True) for m in ("vision", "touch")}
+    right = model.classify("pattern", z).argmax(1).numpy() == pack.column("label_pattern")[rows]
+    assert own["accuracy"] == pytest.approx(right.mean()) and not torch.equal(
+        z["touch"], pack_features(model, pack, "touch", rows)
+    )
+
+
+# -- MViTac's ablations -----------------------------------------------------------------------------------------------
+
+
+def test_left_out_losses_are_told_but_not_minimised() -> None:
+    small_config = MViTacConfig(hidden=24, out=12)
+    full = build("mvitac", config=small_config)
+    batch = views(full)
+    parts = outcome(full, batch)
+    for losses in (("tt",), ("vv", "tv"), ("vt", "tv")):
+        part = outcome(build("mvitac", config=replace(small_config, losses=losses, lambda_inter=0.5)), batch)
+        expected = sum(parts[name] * (0.5 if name in ("vt", "tv") else 1) for name in losses)
+        torch.testing.assert_close(part["loss"], expected)
+        assert set(part) == {"loss", "vv", "tt", "vt", "tv"}
+
+
+def test_losses_that_need_another_modality_are_refused() -> None:
+    with pytest.raises(ValueError, match="give some of tt"):
+        MViTacConfig(losses=("vv", "vt")).build(Toy(vision_channels=0).spec(), TINY)
+
+
+def test_shared_heads_are_one_module() -> None:
+    method = build("mvitac", config=MViTacConfig(hidden=24, out=12, shared_heads=True))
+    tower = method.query["touch"]  # type: ignore[union-attr]
+    assert tower.inter is tower.intra
+    key = method.key["touch"].module  # type: ignore[union-attr]
+    assert key.inter is key.intra
+    with torch.no_grad():
+        for p in method.query.parameters():  # type: ignore[union-attr]
+            p.add_(1)
+    before = key.inter[0].weight.clone()
+    method.after_step(0.0)
+    torch.testing.assert_close(key.inter[0].weight, before + 0.01)  # moved once, not twice
+
+
+def test_momentum_zero_copies_the_queries() -> None:
+    method = build("mvitac", config=MViTacConfig(hidden=24, out=12, momentum=0.0))
+    with torch.no_grad():
+        for p in method.query.parameters():  # type: ignore[union-attr]
+            p.add_(torch.randn_like(p))
+    method.after_step(0.0)
+    key = method.key.state_dict()  # type: ignore[union-attr]
+    for name, value in method.query.state_dict().items():  # type: ignore[union-attr]
+        modality, rest = name.split(".", 1)
+        torch.testing.assert_close(key[f"{modality}.module.{rest}"], value)
+
+
+@pytest.mark.parametrize(
+    ("config", "bad"),
+    [
+        (CMCConfig, {"num_negatives": 0}),
+        (CMCConfig, {"bank_momentum": 1.5}),
+        (SimCLRConfig, {"temperature": 0.0}),
+        (MoCoConfig, {"queue": 0}),
+        (BYOLConfig, {"momentum": -0.1}),
+        (DINOConfig, {"teacher_temperature": 0.0}),
+        (VICRegConfig, {"variance": -1.0}),
+        (MCTConfig, {"margin": float("nan")}),
+        (MViTacConfig, {"losses": ()}),
+        (CalandraConfig, {"widths": (0, 2)}),
+    ],
+)
+def test_impossible_settings(config: type, bad: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        config(**bad)

@@ -1,0 +1,166 @@
+"""What every registered method owes the loop: a finite pure forward, gradients, frozen keys, a record, an exact resume."""
+
+from __future__ import annotations
+
+import copy
+import json
+import typing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from mvitac.data.pack import Pack
+from mvitac.methods.base import MethodConfig, Views
+from mvitac.model import load
+from mvitac.recipes import with_method
+from mvitac.registry import default, from_json, to_json
+from mvitac.run import Optim
+from mvitac.training.loop import train
+from mvitac.training.step import build_optimiser
+from support.small_methods import build, outcome, small, views
+from support.toy import Toy
+from support.training_runs import assert_equal_weights, power_cut, smoke
+
+NAMES = sorted(MethodConfig.choices)
+PAIRED = ("cmc", "mct", "ssvtp")
+
+
+@pytest.mark.parametrize("touch", [3, 6])
+@pytest.mark.parametrize("name", NAMES)
+def test_every_trained_weight_gets_a_gradient_and_no_other(name: str, touch: int) -> None:
+    method = build(name, Toy(touch_channels=touch).spec())
+    losses = outcome(method, views(method, touch=touch))
+    assert losses["loss"].ndim == 0 and all(torch.isfinite(value) for value in losses.values())
+    losses["loss"].backward()
+    trained = {id(p) for group in build_optimiser(Optim(), method).param_groups for p in group["params"]}
+    for parameter_name, parameter in method.named_parameters():
+        assert (parameter.grad is not None) == (id(parameter) in trained), parameter_name
+    assert {id(p) for trunk in method.encoders().values() for p in trunk.parameters()} <= trained
+
+
+@pytest.mark.skipif(not torch.backends.cuda.is_built(), reason="torch without CUDA knows no CUDA tensors")
+@pytest.mark.filterwarnings("ignore:CUDA is not available")
+@pytest.mark.parametrize("name", NAMES)
+def test_on_a_gpu_nothing_stays_behind_and_nothing_is_waited_for(name: str) -> None:
+    """Losses, update and after_step on torch's fake CUDA tensors, which have a device but no values: an operation over two
+    devices raises, and so does whatever would wait for a value."""
+    method, batch = build(name).train(), views(build(name))
+    cuda = torch.device("cuda")
+    with FakeTensorMode():
+
+        def fake(real: torch.Tensor) -> torch.Tensor:
+            return torch.empty(real.shape, dtype=real.dtype, device=cuda)
+
+        moved: dict[int, torch.nn.Parameter] = {}
+        for module in method.modules():
+            for key, weight in module._parameters.items():
+                if weight is not None:
+                    moved.setdefault(id(weight), torch.nn.Parameter(fake(weight), weight.requires_grad))
+                    module._parameters[key] = moved[id(weight)]
+            module._buffers.update({key: None if b is None else fake(b) for key, b in module._buffers.items()})
+        images = {m: [fake(view) for view in seen] for m, seen in batch.images.items()}
+        labels = {task: fake(label) for task, label in batch.labels.items()}
+        losses = method(Views(images=images, labels=labels, rows=fake(batch.rows)))
+        assert {value.device.type for value in losses.values()} == {"cuda"}
+        for parameter in method.parameters():
+            parameter.grad = fake(parameter) if parameter.requires_grad else None
+        build_optimiser(Optim(name="adamw"), method).step()
+        method.after_step(0.5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_forward_is_pure(name: str) -> None:
+    """Twice the same value and, but for BatchNorm's running statistics, no parameter or buffer moves before after_step."""
+    method = build(name)
+    batch = views(method)
+    before = copy.deepcopy(method.state_dict())
+    first, second = outcome(method, batch), outcome(method, batch)
+    for key, value in first.items():
+        assert torch.equal(value, second[key]), key
+    for key, value in method.state_dict().items():
+        if not any(part in key for part in ("running_", "num_batches")):
+            assert torch.equal(value, before[key]), key
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_encoders_and_projectors_fit(name: str) -> None:
+    method = build(name).eval()
+    batch = views(method)
+    features = {m: trunk(batch.images[m][0]) for m, trunk in method.encoders().items()}
+    assert {m: z.shape for m, z in features.items()} == {"vision": (8, 64), "touch": (8, 64)}
+    for modality, head in method.projectors().items():
+        assert head(features[modality]).shape[0] == 8
+    assert len(method.projectors()) in (0, 2)
+    for task, classifier in method.classifiers().items():
+        joined = torch.cat(list(features.values()), dim=1)
+        assert classifier(joined).shape == (8, {"pattern": 3, "bright": 2}[task])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_modality_works_or_is_refused(name: str) -> None:
+    spec = Toy(vision_channels=0).spec()
+    if name in PAIRED:
+        with pytest.raises(ValueError, match=f"'{name}' learns from pairs.*'toy' has touch only"):
+            build(name, spec)
+        return
+    method = build(name, spec)
+    assert torch.isfinite(outcome(method, views(method, vision=0))["loss"])
+    assert set(method.encoders()) == {"touch"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_survives_its_record(name: str) -> None:
+    config = small(name)
+    assert from_json(MethodConfig, json.loads(json.dumps(to_json(config)))) == config
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_resumed_equals_straight_and_loads(pack: Pack, tmp_path: Path, name: str) -> None:
+    """Cut after step 3 of 6 and resumed: queues, banks and their constants come back with the weights."""
+    run = replace(with_method(smoke(pack, steps=6, checkpoint_every=2, eval_every=0), name))
+    train(run, tmp_path / "straight", quiet=True)
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "cut", quiet=True)
+    train(run, tmp_path / "cut", resume=True, quiet=True)
+    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+    checkpoints = [torch.load(tmp_path / place / "checkpoint.pt")["method"] for place in ("straight", "cut")]
+    for key, value in checkpoints[0].items():
+        assert torch.equal(value, checkpoints[1][key]), key
+    model = load(tmp_path / "cut")
+    assert set(model.encoders) == {"vision", "touch"}
+
+
+def test_a_recipe_changes_every_method_alike(pack: Pack) -> None:
+    """smoke asks for narrow heads (32, 16): so do the methods that have them; the rest keeps its own defaults."""
+    run = smoke(pack)
+    for name in NAMES:
+        method = with_method(run, name).method
+        assert method.name == name
+        usual = default(MethodConfig, name)
+        for field, value in {"hidden": 32, "out": 16}.items():
+            assert getattr(method, field, value) == value
+        if hasattr(usual, "temperature"):
+            assert method.temperature == usual.temperature  # type: ignore[attr-defined]
+    assert with_method(run, "mvitac") is run
+
+
+def numbers() -> list[tuple[str, str, object]]:
+    """(method, field, impossible value) of every number in every method's config, found by reflection."""
+    found: list[tuple[str, str, object]] = []
+    for name in NAMES:
+        config = default(MethodConfig, name)
+        for field, kind in typing.get_type_hints(type(config)).items():
+            if kind is int:
+                found += [(name, field, value) for value in (-1, 0, 10**30)]
+            elif kind in (float, float | None):
+                found += [(name, field, value) for value in (-1.0, float("nan"), float("inf"))]
+    return found
+
+
+@pytest.mark.parametrize(("name", "field", "value"), numbers())
+def test_impossible_numbers(name: str, field: str, value: object) -> None:
+    with pytest.raises(ValueError, match=field):
+        replace(default(MethodConfig, name), **{field: value})

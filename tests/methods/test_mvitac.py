@@ -1,0 +1,231 @@
+"""The method against the paper: eq. 1-14 written out slowly, and what may and may not be trained."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Views
+from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.run import Optim
+from mvitac.training.step import build_optimiser
+from support.slow_losses import slow_info_nce
+from support.toy import Toy
+
+TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
+CONFIG = MViTacConfig(hidden=24, out=12)
+
+
+def build(config: MViTacConfig = CONFIG, spec: DataSpec | None = None) -> MViTac:
+    torch.manual_seed(0)
+    return config.build(spec or Toy().spec(), TINY)
+
+
+def views(num: int = 6, vision: int = 3, touch: int = 3) -> Views:
+    torch.manual_seed(5)
+    channels = {"vision": vision, "touch": touch}
+    images = {m: [torch.randn(num, c, 32, 32) for _ in range(2)] for m, c in channels.items() if c}
+    return Views(images=images, labels={}, rows=torch.arange(num))
+
+
+def test_equals_the_paper_written_out() -> None:
+    """Eq. 4-14 with the paper's symbols, one embedding at a time, on copies of the same weights."""
+    method, batch = build(replace(CONFIG, lambda_inter=0.7)), views()
+    with torch.no_grad():  # make keys differ from queries, or confusing them would go unseen
+        for p in method.key.parameters():
+            p.add_(0.05 * torch.randn_like(p))
+    theta, psi = copy.deepcopy(method.query["vision"]), copy.deepcopy(method.query["touch"])
+    theta_k = copy.deepcopy(method.key["vision"].module)
+    psi_k = copy.deepcopy(method.key["touch"].module)
+    phi_v_q, phi_t_q, Phi_t_q, Phi_v_q = theta.intra, theta.inter, psi.intra, psi.inter
+    phi_v_k, phi_t_k, Phi_t_k, Phi_v_k = theta_k.intra, theta_k.inter, psi_k.intra, psi_k.inter
+    (o_v_q, o_v_k), (o_t_q, o_t_k) = batch.images["vision"], batch.images["touch"]
+    f_v_q, f_t_q = theta.trunk(o_v_q), psi.trunk(o_t_q)
+    f_v_k, f_t_k = theta_k.trunk(o_v_k), psi_k.trunk(o_t_k)
+    L_vv = slow_info_nce(phi_v_q(f_v_q), phi_v_k(f_v_k), 0.07)  # eq. 4, 5, 8
+    L_tt = slow_info_nce(Phi_t_q(f_t_q), Phi_t_k(f_t_k), 0.07)  # eq. 6, 7
+    L_vt = slow_info_nce(phi_t_q(f_v_q), Phi_v_k(f_t_k), 0.07)  # eq. 9, 10, 11
+    L_tv = slow_info_nce(Phi_v_q(f_t_q), phi_t_k(f_v_k), 0.07)  # eq. 12, 13
+    with torch.no_grad():
+        out = method(batch)
+    for name, expected in {"vv": L_vv, "tt": L_tt, "vt": L_vt, "tv": L_tv}.items():
+        assert float(out[name]) == pytest.approx(expected, rel=1e-4), name
+    assert float(out["loss"]) == pytest.approx(L_vv + L_tt + 0.7 * (L_vt + L_tv), rel=1e-4)  # eq. 14
+
+
+def test_each_view_passes_each_encoder_once() -> None:
+    method = build()
+    calls: list[str] = []
+    for side in ("query", "key"):
+        for modality, tower in getattr(method, side).items():
+            trunk = tower.trunk if side == "query" else tower.module.trunk
+            trunk.register_forward_hook(lambda *_, name=f"{side} {modality}": calls.append(name))
+    method(views())
+    assert sorted(calls) == ["key touch", "key vision", "query touch", "query vision"]
+
+
+def test_keys_start_as_copies() -> None:
+    method = build()
+    for modality, tower in method.query.items():
+        key = method.key[modality].module.state_dict()
+        assert key.keys() == tower.state_dict().keys()
+        for name, value in tower.state_dict().items():
+            assert torch.equal(key[name], value), name
+
+
+def test_no_key_parameter_is_optimised_or_gets_a_gradient() -> None:
+    method = build()
+    optimiser = build_optimiser(Optim(), method)
+    optimised = {id(p) for group in optimiser.param_groups for p in group["params"]}
+    assert optimised == {id(p) for p in method.query.parameters()}
+    method(views())["loss"].backward()
+    assert all(p.grad is None for p in method.key.parameters())
+    assert all(p.grad is not None for p in method.query.parameters())
+    for tower in method.query.values():  # inside the blocks some start at zero: timm zeroes each block's last BatchNorm
+        assert all(p.grad.abs().sum() > 0 for head in (tower.intra, tower.inter) for p in head.parameters())
+        assert tower.trunk.conv1[0].weight.grad.abs().sum() > 0
+
+
+def test_every_key_parameter_and_buffer_follows() -> None:
+    """Eq. 1-3: theta_k <- m theta_k + (1 - m) theta for trunk, both heads and BatchNorm's statistics."""
+    method = build(replace(CONFIG, momentum=0.9, head_norm=True))
+    with torch.no_grad():
+        for tensor in [*method.query.parameters(), *method.query.buffers()]:
+            tensor.add_(1)
+    before = {name: value.clone() for name, value in method.key.state_dict().items()}
+    method.after_step(0.5)
+    query = method.query.state_dict()
+    for name, value in method.key.state_dict().items():
+        q = query[name.replace(".module.", ".")]
+        expected = 0.9 * before[name] + 0.1 * q if value.is_floating_point() else q
+        torch.testing.assert_close(value, expected, msg=name)
+
+
+def test_momentum_schedule_ends_at_its_end() -> None:
+    method = build(replace(CONFIG, momentum=0.5, momentum_end=1.0))
+    before = copy.deepcopy(method.key.state_dict())
+    with torch.no_grad():
+        for p in method.query.parameters():
+            p.add_(1)
+    method.after_step(1.0)
+    for name, parameter in method.key.named_parameters():
+        assert torch.equal(parameter, before[name]), "at the end m = 1: keys stand still"
+    method.after_step(0.0)
+    for name, parameter in method.key.named_parameters():
+        torch.testing.assert_close(parameter, before[name] + 0.5)
+
+
+@pytest.mark.parametrize("touch", [3, 6])
+def test_one_and_two_sensors(touch: int) -> None:
+    method = build(spec=Toy(touch_channels=touch).spec())
+    assert set(method(views(touch=touch))) == {"loss", "vv", "tt", "vt", "tv"}
+
+
+def test_touch_only_keeps_its_intra_loss() -> None:
+    method = build(spec=Toy(vision_channels=0).spec())
+    out = method(views(vision=0))
+    assert set(out) == {"loss", "tt"}
+    assert torch.equal(out["loss"], out["tt"])
+
+
+def test_forward_is_pure() -> None:
+    """But for BatchNorm's running statistics, a forward pass changes nothing."""
+    method = build().train()
+    before = copy.deepcopy(dict(method.named_parameters()))
+    method(views())
+    for name, parameter in method.named_parameters():
+        assert torch.equal(parameter, before[name]), name
+
+
+@pytest.mark.parametrize(
+    "bad", [{"temperature": 0.0}, {"momentum": 1.1}, {"lambda_inter": -1.0}, {"out": 0}, {"dropout": 1.0}]
+)
+def test_impossible_settings(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad)).split("_")[0] if "out" not in bad else "head"):
+        MViTacConfig(**bad)  # type: ignore[arg-type]
+
+
+def test_heads_are_as_printed() -> None:
+    """Appendix A: 512 -> hidden -> 128, ReLU after the first layer, nothing after the last."""
+    tower = MViTacConfig().build(Toy().spec(), EncoderConfig(trunk="resnet18", weights=SCRATCH)).query["touch"]
+    kinds = [type(layer).__name__ for layer in tower.intra]
+    assert kinds == ["Linear", "ReLU", "Linear"]
+    assert (tower.intra[0].in_features, tower.inter[-1].out_features) == (512, 128)
+    z = tower(torch.randn(2, 3, 32, 32))[0]
+    assert F.normalize(z, dim=1).shape == (2, 128)
+
+
+def swapped(batch: Views) -> Views:
+    return replace(batch, images={m: both[::-1] for m, both in batch.images.items()})
+
+
+def test_symmetric_is_the_mean_of_both_ways() -> None:
+    """Each view is query and key in turn: the mean of the loss and of the loss with the views swapped."""
+    one_way, both_ways = build(), build(replace(CONFIG, symmetric=True))
+    for method in (one_way, both_ways):
+        torch.manual_seed(3)
+        with torch.no_grad():
+            for p in method.key.parameters():
+                p.add_(0.05 * torch.randn_like(p))
+    batch = views()
+    there, back = one_way(batch), one_way(swapped(batch))
+    assert not torch.isclose(there["loss"], back["loss"], rtol=1e-3)
+    for name, value in both_ways(batch).items():
+        torch.testing.assert_close(value, (there[name] + back[name]) / 2)
+
+
+def test_end_to_end_keys_are_the_queries_and_learn() -> None:
+    """Without momentum towers: the loss of momentum 0 in both ways, and a gradient that flows through the keys as well."""
+    learned, copied = build(replace(CONFIG, keys="end-to-end")), build(replace(CONFIG, symmetric=True))
+    assert not list(learned.key.parameters())
+    batch = views()
+    mine, theirs = learned(batch), copied(batch)
+    torch.testing.assert_close(mine, theirs)
+    mine["loss"].backward()
+    theirs["loss"].backward()
+    found = [(a.grad, b.grad) for a, b in zip(learned.query.parameters(), copied.query.parameters(), strict=True)]
+    assert not all(torch.allclose(a, b, rtol=0.05) for a, b in found if a is not None and b is not None)
+    learned.after_step(0.5)  # has nothing to move
+
+
+@pytest.mark.parametrize("way", [{"keys": "end-to-end"}, {"symmetric": True}])
+def test_all_pairs_are_the_mean_over_four_pairs_of_views(way: dict[str, object]) -> None:
+    """Inter-modal losses: both queries against both keys; intra-modal ones never pair a view with itself."""
+    method = build(replace(CONFIG, **way, pairs="all"))  # type: ignore[arg-type]
+    batch = views()
+    z = method.queries(batch) | method.keys(batch)
+    key = "q" if "keys" in way else "k"
+    losses, tau = method.contrast(z), CONFIG.temperature
+    for part, (mine, other) in PARTS.items():
+        head = "intra" if mine == other else "inter"
+        pairs = [(q, k) for q in (0, 1) for k in (0, 1) if mine != other or q != k]
+        terms = [slow_info_nce(z[f"q{q}_{mine}_{head}"], z[f"{key}{k}_{other}_{head}"], tau) for q, k in pairs]
+        assert losses[part].item() == pytest.approx(sum(terms) / len(terms), rel=1e-5)
+    crossed = replace(method.config, pairs="crossed")
+    method.config = crossed
+    assert not torch.allclose(method.contrast(z)["vt"], losses["vt"])
+
+
+def test_all_pairs_need_each_view_as_query_and_key() -> None:
+    with pytest.raises(ValueError, match="give keys 'end-to-end', symmetric, or pairs 'crossed'"):
+        replace(CONFIG, pairs="all")
+
+
+def test_end_to_end_on_touch_alone() -> None:
+    method = build(replace(CONFIG, keys="end-to-end"), replace(Toy().spec(), vision_channels=0))
+    assert set(method(views(vision=0))) == {"loss", "tt"}
+
+
+def test_running_norm_makes_a_key_independent_of_its_batch() -> None:
+    batch = views()
+    first = replace(batch, images={m: [v[:3] for v in both] for m, both in batch.images.items()})
+    for kind in ("batch", "running"):
+        method = build(replace(CONFIG, key_norm=kind)).train()
+        whole, part = (method.keys(b)["k1_touch_intra"][:3] for b in (batch, first))
+        assert torch.allclose(whole, part, atol=1e-5) == (kind == "running")

@@ -1,0 +1,292 @@
+"""The explorer: its facts are arithmetic, its page works in a real browser (skipped where there is no Chromium)."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mvitac
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.report.explorer_data import COLOURS, ExplorerData
+from support.browser import CHROMIUM, Browser
+from support.toy import reordered
+
+
+@pytest.fixture(scope="module")
+def land(artifact: Path, pack: Pack) -> ExplorerData:
+    return ExplorerData(mvitac.load(artifact), pack)
+
+
+def decode(text: str) -> dict[str, Any]:
+    value = json.loads(text)
+    value["xy"] = np.frombuffer(base64.b64decode(value["xy"]), "<u2").reshape(2, -1)
+    value["row"] = np.frombuffer(base64.b64decode(value["row"]), "<i4")
+    value["colour"] = np.frombuffer(base64.b64decode(value["colour"]), "<u2")
+    return value
+
+
+def test_points_carry_place_colour_and_row(land: ExplorerData, pack: Pack) -> None:
+    value = decode(land.points("both", "label", "test", "pattern"))
+    rows = pack.rows("test")
+    assert np.array_equal(value["row"], rows)
+    names = [value["legend"][c][0] for c in value["colour"]]
+    assert names == [pack.spec.tasks[0].classes[i] for i in pack.column("label_pattern")[rows]]
+    np.testing.assert_allclose(value["xy"].T / 65535, land.plane("both")[rows], atol=1e-4)
+
+
+def test_more_classes_than_a_byte_counts(land: ExplorerData, monkeypatch: pytest.MonkeyPatch) -> None:
+    used = np.arange(300)
+    monkeypatch.setattr(land, "classes", {"pattern": [f"class {i}" for i in used]})
+    monkeypatch.setattr(land, "rows", used)
+    monkeypatch.setattr(land, "labels", {"pattern": used})
+    monkeypatch.setattr(land, "plane", lambda modality: np.zeros((300, 2)))
+    monkeypatch.setattr(land, "shown", lambda *a, **k: used)
+    value = decode(land.points("both", "label", "all", "pattern"))
+    assert [value["legend"][c][0] for c in value["colour"]] == [f"class {i}" for i in used]
+
+
+def test_twenty_colours_are_told_apart() -> None:
+    """On white and on black, too. Distances are OKLab's (Ottosson 2020); .02 is about the least that an eye sees."""
+    srgb = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in COLOURS])
+    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    cones = [
+        [0.41222147, 0.53633254, 0.05144599],
+        [0.2119035, 0.6806995, 0.10739696],
+        [0.08830246, 0.28171884, 0.62997870],
+    ]
+    opponent = [
+        [0.21045426, 0.79361779, -0.00407205],
+        [1.97799850, -2.42859221, 0.45059371],
+        [0.02590404, 0.78277177, -0.80867577],
+    ]
+    lab = np.cbrt(light @ np.array(cones).T) @ np.array(opponent).T
+    apart = np.linalg.norm(lab[:, None] - lab, axis=2) + 9 * np.eye(len(lab))
+    assert len(COLOURS) == 20 and apart.min() > 0.16
+    luminance = light @ [0.2126, 0.7152, 0.0722]
+    assert (1.05 / (luminance + 0.05)).min() > 1.5 and ((luminance + 0.05) / 0.05).min() > 1.9
+
+
+def test_the_plane_holds_the_most_variance(land: ExplorerData) -> None:
+    x = land.x["touch"] - land.x["touch"].mean(0)
+    first, second = land.plane("touch").T
+    scores = np.linalg.svd(x, full_matrices=False)
+    for found, expected in ((first, scores[0][:, 0]), (second, scores[0][:, 1])):
+        assert abs(np.corrcoef(found, expected)[0, 1]) > 0.98  # the ends are clipped
+
+
+def test_errors_are_the_probes(land: ExplorerData, pack: Pack, artifact: Path) -> None:
+    said = mvitac.load(artifact).predict(vision=pack.images["vision"], touch=pack.images["touch"])["pattern"]
+    wrong = np.flatnonzero(said.argmax(1).numpy() != pack.column("label_pattern"))
+    assert 0 < len(wrong) < pack.num
+    assert np.array_equal(land.shown("all", "pattern", mistakes=True), wrong)
+    value = decode(land.points("both", "error", "all", "pattern"))
+    named = np.array([value["legend"][c][0] for c in value["colour"]])
+    assert np.array_equal(np.flatnonzero(named == "wrong"), wrong)
+    assert "(probe: " in land.describe(int(wrong[0]))
+
+
+def test_neighbours_leave_out_the_point_itself(land: ExplorerData) -> None:
+    pairs = land.neighbours(land.x["touch"][5:6], "touch", 4, without=5)
+    every = land.x["touch"] @ land.x["touch"][5]
+    every[5] = -2
+    assert [i for i, _ in pairs] == np.argsort(-every, kind="stable")[:4].tolist()
+
+
+def test_a_dropped_picture_is_classified_and_finds_itself(land: ExplorerData, pack: Pack) -> None:
+    said, pairs = land.query(np.array(pack.images["touch"][17]), "touch", 3)
+    assert pairs[0][0] == 17 and pairs[0][1] == pytest.approx(1, abs=1e-4)
+    assert set(said) == {"pattern", "bright"} and sum(said["pattern"].values()) == pytest.approx(1, abs=1e-4)
+
+
+def test_a_pack_of_other_numbers_or_tasks(land: ExplorerData, artifact: Path, pack: Pack) -> None:
+    """The probes' answers are compared by name; a task that the pack lacks is answered all the same."""
+    other = reordered(pack)
+    other.spec = replace(other.spec, tasks=other.spec.tasks[:1])
+    found = ExplorerData(mvitac.load(artifact), other)
+    wrong = land.shown("all", "pattern", mistakes=True)
+    assert np.array_equal(found.shown("all", "pattern", mistakes=True), wrong)
+    assert found.describe(int(wrong[0])).partition(" · light")[0] in land.describe(int(wrong[0]))
+    picture = np.array(pack.images["touch"][17])
+    assert found.query(picture, "touch", 3)[0] == land.query(picture, "touch", 3)[0]
+
+
+def test_fewer_rows_are_of_every_class(artifact: Path, pack: Pack) -> None:
+    """Although the pack's three classes take turns, and every third row would be of one."""
+    few = ExplorerData(mvitac.load(artifact), pack, limit=40)
+    assert len(few.rows) == 40 and (np.diff(few.rows) > 0).all()
+    assert np.bincount(few.labels["pattern"]).min() >= 8
+
+
+def test_a_run_that_is_not_finished_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoint.pt").touch()
+    assert main(["explore", str(tmp_path / "run")]) == 2
+    assert "the run is not finished" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if not CHROMIUM:
+        pytest.skip("no Chromium on the PATH: the page is not tested (apt-get install chromium)")
+    opened = Browser(tmp_path_factory.mktemp("profile"))
+    yield opened
+    opened.close()
+
+
+def centre_of_a_point(browser: Browser, land: ExplorerData, index: int) -> tuple[float, float]:
+    """Where scatter.js draws row ``index`` before any zoom."""
+    left, top, width, height = browser.run(
+        "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
+        " return [b.left, b.top, b.width, b.height] })()"
+    )
+    x, y = land.plane("both")[index]
+    side = min(width, height) * 0.92
+    return left + width / 2 + (x - 0.5) * side, top + height / 2 + (y - 0.5) * side
+
+
+POINTS = "document.querySelector('[data-points]').dataset.points"
+CLICK_BOX = "document.querySelector('input[type=checkbox]').click()"
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+@contextlib.contextmanager
+def serving(arguments: list[str], port: int) -> Iterator[None]:
+    """The server in a process of its own, until it answers on ``port``."""
+    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    try:
+        while True:
+            with socket.socket() as one:
+                if one.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.1)
+                assert process.stderr
+                raise AssertionError(process.stderr.read().decode()[-2000:])
+        yield
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def listeners(port: int) -> set[str]:
+    """Addresses on which something listens on ``port`` (Linux; IPv4 and IPv6)."""
+    found = set()
+    for table, loopback in (("tcp", "0100007F"), ("tcp6", "")):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            local, state = line.split()[1], line.split()[3]
+            if state == "0A" and local.endswith(f":{port:04X}"):
+                found.add("127.0.0.1" if local.split(":")[0] == loopback else local)
+    return found
+
+
+def test_the_page_in_a_browser(
+    browser: Browser, land: ExplorerData, pack: Pack, artifact: Path, smoke_run: Path, tmp_path: Path
+) -> None:
+    """Map, hover, click, filter, two runs side by side, a phone's width; listens on loopback only."""
+    port = free_port()
+    command = ["-m", "mvitac", "explore", str(artifact), str(smoke_run), "--on", str(pack.path), "--port", str(port)]
+    with serving(command, port):
+        assert listeners(port) == {"127.0.0.1"}
+        browser.resize(1200, 900)
+        browser.open(f"http://127.0.0.1:{port}")
+        browser.wait(f"{POINTS} == {len(pack.rows('test'))}")
+        assert browser.run("document.querySelectorAll('.map canvas').length") == 2
+        row = int(pack.rows("test")[0])
+
+        def hover() -> None:
+            browser.mouse("mouseMoved", 1, 1)
+            browser.mouse("mouseMoved", *centre_of_a_point(browser, land, row))
+
+        browser.until("document.querySelector('.tip').style.display == 'block'", hover)
+        shown = browser.run("document.querySelector('.tip').textContent")
+        pictured = browser.run("document.querySelectorAll('.tip img').length")
+        assert pictured == 2 and shown.split(" ·")[0] in pack.column("id")
+        browser.until(
+            "document.querySelectorAll('.grid-wrap img, .gallery-item img').length >= 12",
+            lambda: browser.click(*centre_of_a_point(browser, land, row)),
+        )
+        check_zoom(browser, land, row)
+        browser.run(CLICK_BOX)
+        wrong = len(land.shown("test", "pattern", mistakes=True))
+        browser.wait(f"{POINTS} == {wrong}")
+        browser.resize(390, 844, mobile=True)
+        browser.wait("document.documentElement.scrollWidth <= 390")
+        browser.wait("document.querySelector('.map canvas').clientWidth > 200")
+        browser.screenshot(tmp_path / "phone.png")
+        with Image.open(tmp_path / "phone.png") as picture:
+            assert picture.size == (390, 844)
+        assert browser.problems == []
+
+
+def check_zoom(browser: Browser, land: ExplorerData, row: int) -> None:
+    """By wheel and by two fingers: the map changes, and what was under pointer or fingers is still there."""
+    x, y = centre_of_a_point(browser, land, row)
+    name = str(land.pack.column("id")[row])
+
+    def pinch() -> None:
+        for kind, apart in (("touchStart", 20), ("touchMove", 40), ("touchMove", 60)):
+            points = [{"x": x - apart, "y": y, "id": 0}, {"x": x + apart, "y": y, "id": 1}]
+            browser.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def hover() -> None:
+        browser.mouse("mouseMoved", 1, 1)
+        browser.mouse("mouseMoved", x, y)
+
+    for act in (lambda: browser.mouse("mouseWheel", x, y, deltaX=0, deltaY=-400), pinch):
+        browser.mouse("mouseMoved", 1, 1)
+        browser.run("window.before = document.querySelector('.map canvas').toDataURL()")
+        act()
+        browser.wait("document.querySelector('.map canvas').toDataURL() != window.before")
+        browser.until(f"document.querySelector('.tip').textContent.startsWith({name!r})", hover)
+
+
+def test_a_page_of_very_many_and_of_none(browser: Browser, artifact: Path, pack: Pack) -> None:
+    """100,000 rows, in which every answer is right: filtered to its mistakes, there is nothing to show."""
+    port = free_port()
+    code = (
+        "import mvitac, numpy as np; from mvitac.explorer import page, serve; from mvitac.landscape import Landscape;"
+        f"land = Landscape(mvitac.load({str(artifact)!r}), mvitac.Pack({str(pack.path)!r}));"
+        "i = np.arange(100_000) % len(land.rows); land.rows = land.rows[i]; land.split = np.full(len(i), 'test');"
+        "noise = np.random.default_rng(0).normal(0, 0.05, (len(i), 64)).astype('f4');"
+        "land.x = {m: x[i] + noise for m, x in land.x.items()};"
+        "land.labels = {t: x[i] for t, x in land.labels.items()}; land.guess = dict(land.labels);"
+        f"serve(page({{'run': land}}), port={port})"
+    )
+    with serving(["-c", code], port):
+        browser.resize(1200, 900)
+        browser.open(f"http://127.0.0.1:{port}")
+        browser.wait(f"{POINTS} == 100000")
+        middle = browser.run(
+            "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
+            " return [b.left + b.width / 2, b.top + b.height / 2] })()"
+        )
+
+        def hover() -> None:
+            browser.mouse("mouseMoved", 1, 1)
+            browser.mouse("mouseMoved", *middle)
+
+        browser.until("document.querySelectorAll('.tip img').length == 2", hover)
+        browser.until("document.querySelectorAll('.gallery-item img').length >= 12", lambda: browser.click(*middle))
+        browser.run(CLICK_BOX)
+        browser.wait(f"{POINTS} == 0")
+        assert "nothing to show" in browser.run("document.querySelector('.count').textContent")
+        assert browser.problems == []

@@ -1,0 +1,224 @@
+"""Simulated grasps: repeatable, physically sane, and 'before' shows nothing."""
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mvitac.sim import gel, grasps, objects, physics, skin
+
+SIZE = 40
+
+
+def digest(rows: list[dict]) -> str:
+    """Hash pictures and numbers of a grasp."""
+    state = hashlib.sha256()
+    for row in rows:
+        for key in sorted(row):
+            value = row[key]
+            state.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return state.hexdigest()
+
+
+def thing(name: str = "box") -> objects.Thing:
+    return objects.make_thing(0, objects.KINDS.index(name))
+
+
+def plan(**change) -> physics.Plan:
+    """A centred, level, firm grip."""
+    firm = physics.Plan(force_n=6.0, offset_m=(0.0, 0.0, 0.0), yaw=0.0, lift_m=0.05, friction=0.6)
+    return dataclasses.replace(firm, **change)
+
+
+def outcome(some: objects.Thing, some_plan: physics.Plan) -> physics.Moment:
+    return list(physics.Bench(some).moments(some_plan))[-1]
+
+
+def test_a_grasp_repeats_whatever_was_simulated_before_it_and_in_another_process():
+    first = digest(grasps.grasp(3, 5, 7, size=SIZE))
+    grasps.grasp(3, 5, 8, size=SIZE)
+    grasps.grasp(3, 6, 7, size=SIZE)
+    assert digest(grasps.grasp(3, 5, 7, size=SIZE)) == first
+    code = f"""
+import sys; sys.path.insert(0, {str(next(iter(__import__("mvitac").__path__)))!r} + "/..")
+sys.path.insert(0, {str(__file__).rsplit("/", 1)[0]!r})
+import test_grasps as t
+print(t.digest(t.grasps.grasp(3, 5, 7, size=t.SIZE)))
+"""
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert other.stdout.strip() == first
+
+
+def test_every_grasp_is_three_moments_of_three_pictures_with_one_outcome():
+    rows = grasps.grasp(0, 4, 0, size=SIZE)
+    assert [row["phase"] for row in rows] == list(grasps.PHASES) == ["before", "during", "after"]
+    for row in rows:
+        for key in ("vision", "touch_left", "touch_right"):
+            assert row[key].shape == (SIZE, SIZE, 3)
+            assert row[key].dtype == np.uint8
+        assert row["object"] == grasps.object_name(0, 4) == "capsule_004"
+    assert len({row["success"] for row in rows}) == len({row["sensor"] for row in rows}) == 1
+    assert rows[0]["success"] in (0, 1)
+
+
+def test_every_kind_of_thing_rests_still_before_the_grip():
+    for index in range(2 * len(objects.KINDS)):
+        bench = physics.Bench(objects.make_thing(1, index))
+        before = next(bench.moments(plan()))
+        assert np.abs(before.data.qvel).max() < 0.2, bench.thing.name
+        assert not before.unstable
+
+
+def test_before_the_grip_the_gels_show_their_background():
+    for index in range(6):
+        before, during, _ = grasps.grasp(0, index, 1, size=144)
+        sensor = gel.SENSORS[before["sensor"]]
+        assert before["contact_left"] == before["contact_right"] == 0
+        feel = np.random.default_rng([grasps._TOUCH, 0, index, 1])
+        feel.random()
+        units = feel.integers(2**31, size=2)
+        for side, unit in zip(("left", "right"), units, strict=True):
+            pixel = grasps.FIELD_MM / 144
+            empty = gel.background(sensor, np.random.default_rng(9), size=144, pixel_mm=pixel, unit=int(unit))
+            difference = before[f"touch_{side}"].astype(float) - empty
+            assert np.abs(difference).mean() < 2.5 * sensor.noise
+            if during[f"contact_{side}"] > 0.02:
+                assert np.abs(during[f"touch_{side}"].astype(float) - empty).mean() > np.abs(difference).mean() + 0.5
+
+
+def test_sensors_are_drawn_from_one_side_and_leave_physics_and_camera_alone():
+    usual, held_out = (grasps.grasp(0, 8, 2, size=SIZE, held_out_sensor=h) for h in (False, True))
+    assert not gel.SENSORS[usual[0]["sensor"]].held_out
+    assert gel.SENSORS[held_out[0]["sensor"]].held_out
+    for a, b in zip(usual, held_out, strict=True):
+        np.testing.assert_array_equal(a["vision"], b["vision"])
+        assert (a["success"], a["lift_mm"], a["force_n"]) == (b["success"], b["lift_mm"], b["force_n"])
+
+
+def test_a_moment_is_the_same_alone_and_among_the_others():
+    alone = grasps.grasp(0, 9, 1, size=SIZE, phases=("during",))
+    assert digest(alone) == digest(grasps.grasp(0, 9, 1, size=SIZE)[1:2])
+    with pytest.raises(ValueError, match="before"):
+        grasps.grasp(0, 9, 1, size=SIZE, phases=("later",))
+
+
+def test_picture_size_does_not_touch_the_outcome():
+    small, large = grasps.grasp(0, 12, 3, size=24), grasps.grasp(0, 12, 3, size=64)
+    assert (small[2]["success"], small[2]["lift_mm"]) == (large[2]["success"], large[2]["lift_mm"])
+
+
+@pytest.mark.parametrize("kind", ["box", "can", "rod", "capsule", "mug"])
+def test_a_firm_centred_grip_holds_and_a_heavy_or_slippery_thing_slips(kind):
+    some = thing(kind)
+    middle = (some.bounds[0] + some.bounds[1]) / 2
+    centred = (0.0, float(some.center_of_mass[1] - middle[1]), 0.0)
+    assert outcome(some, plan(force_n=10.0, offset_m=centred)).success == 1
+    assert outcome(some, plan(force_n=10.0, offset_m=centred, mass_scale=12 / (some.mass * 9.81))).success == 0
+    assert outcome(some, plan(force_n=0.5 * some.mass * 9.81, offset_m=centred, friction=0.15)).success == 0
+
+
+def test_a_long_thing_gripped_far_from_its_centre_turns_and_is_not_lifted():
+    some = dataclasses.replace(thing("rod"), density=1500.0)
+    assert outcome(some, plan(force_n=2.0, offset_m=(0.0, 0.025, 0.0))).success == 0
+
+
+def test_forces_balance():
+    """Both fingers press with the set force; held, the two gels together carry the weight."""
+    some = thing("box")
+    moments = list(physics.Bench(some).moments(plan(force_n=5.0)))
+    # A Bench reuses its state, but what a Moment holds of forces is its own.
+    during, after = moments[1], moments[2]
+    for touch in (during.left, during.right):
+        assert touch.normal_n == pytest.approx(5.0, rel=0.1)
+    assert during.left.normal_n == pytest.approx(during.right.normal_n, rel=0.1)
+    assert after.success == 1
+    carried = after.left.shear_n[1] + after.right.shear_n[1]  # picture rows run downwards
+    assert carried == pytest.approx(some.mass * 9.81, rel=0.1)
+    assert after.rise_m == pytest.approx(0.05, abs=0.006)
+
+
+def test_a_harder_grip_prints_a_wider_patch():
+    bench = physics.Bench(thing("can"))
+    smooth = dataclasses.replace(skin.draw_patch(np.random.default_rng(0)), amplitude_mm=0.0)
+    patch = []
+    for force in (2.0, 5.0, 11.0):
+        for moment in bench.moments(plan(force_n=force)):
+            if moment.phase == "during":
+                imprint = grasps._imprint(bench, smooth, moment.data, 0, moment.left.normal_n, 64)
+                patch.append(np.mean(imprint > 0.03))
+    assert patch[0] < patch[1] < patch[2]
+
+
+def test_outcomes_are_mixed_and_the_solver_is_stable():
+    results = []
+    for index in range(40):
+        bench = physics.Bench(objects.make_thing(0, index))
+        for i in range(3):
+            rng = np.random.default_rng([99, index, i])
+            patch = skin.draw_patch(rng)
+            results.append(list(bench.moments(grasps.draw_plan(bench.thing, patch, rng)))[-1])
+    assert 0.4 < np.mean([r.success for r in results]) < 0.75
+    assert np.mean([r.unstable for r in results]) < 0.02
+
+
+def test_peaks_and_pits_differ_in_the_sign_of_their_skewness_and_nothing_else():
+    """Heights over a flank: one is the other upside down, so spread is equal and skewness opposite."""
+    rng = np.random.default_rng(1)
+    points = np.stack([np.zeros(4000), *rng.uniform(-40, 40, (2, 4000))], 1)
+    for draw in range(12):
+        patch = dataclasses.replace(skin.draw_patch(np.random.default_rng(draw)), peaks=True)
+        peaks, pits = patch.relief_mm(points), dataclasses.replace(patch, peaks=False).relief_mm(points)
+        assert np.array_equal(peaks, -pits)
+        assert np.mean((peaks - peaks.mean()) ** 3) > 0.2 * peaks.std() ** 3
+
+
+def test_the_camera_does_not_see_what_the_fingers_slide_on():
+    """Before the fingers close, the picture is the same whether the patch grips or slides."""
+    bench, seen = physics.Bench(thing("rod")), {}
+    for peaks in (True, False):
+        patch = dataclasses.replace(skin.draw_patch(np.random.default_rng(0)), peaks=peaks)
+        key = {"size": SIZE, "held_out_sensor": False, "phases": grasps.PHASES}
+        seen[peaks] = grasps._record(bench, patch, plan(friction=0.85 if peaks else 0.3), (0, 2, 0), **key)
+    assert np.array_equal(seen[True][0]["vision"], seen[False][0]["vision"])
+    assert not np.array_equal(seen[True][1]["touch_left"], seen[False][1]["touch_left"])
+
+
+def test_how_hard_the_hand_presses_says_nothing_of_the_outcome():
+    """The set force over the weight has the same spread whatever the patch: it is drawn from the weight alone."""
+    share: dict[bool, list[float]] = {True: [], False: []}
+    for index in range(30):
+        some = objects.make_thing(0, index)
+        for i in range(10):
+            rng = np.random.default_rng([98, index, i])
+            patch = skin.draw_patch(rng)
+            share[patch.peaks].append(grasps.draw_plan(some, patch, rng).force_n / (9.81 * some.mass))
+    assert np.mean(share[True]) == pytest.approx(np.mean(share[False]), rel=0.05)
+    assert np.std(share[True]) < 0.15
+
+
+def test_a_lost_solver_is_a_failed_grasp_and_leaves_no_nan():
+    bench = physics.Bench(thing("can"))
+    bench.model.opt.gravity[2] = -1e6
+    last = list(bench.moments(plan()))[-1]
+    assert last.unstable == 1
+    assert last.success == 0
+    assert np.isfinite(last.data.qpos).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "allowed"),
+    [
+        ((0, grasps.NUM_OBJECTS, 0, 64), "0..105"),
+        ((0, -1, 0, 64), "0..105"),
+        ((0, 0, -1, 64), "0 or larger"),
+        ((-1, 0, 0, 64), "0 or larger"),
+        ((0, 0, 0, 8), "16..1024"),
+    ],
+)
+def test_bad_arguments_say_what_is_allowed(arguments, allowed):
+    seed, obj, index, size = arguments
+    with pytest.raises(ValueError, match=allowed):
+        grasps.grasp(seed, obj, index, size=size)

@@ -1,0 +1,67 @@
+"""What one process and each of two do alike: the runs, their methods, three steps, and the third step resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from mvitac.datasets.base import DatasetConfig
+from mvitac.methods.base import Method
+from mvitac.methods.cmc import CMCConfig
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.recipes import recipe, with_method
+from mvitac.run import Optim, Run
+from mvitac.system.distributed import World
+from mvitac.training import checkpoint
+from mvitac.training.step import Chunk, Step
+from support.small_steps import build as build_from
+from support.small_steps import gradients
+
+RUN = replace(
+    recipe("smoke"), optim=Optim(name="sgd"), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
+)
+METHODS = {
+    "mvitac": RUN.method,
+    "cmc": CMCConfig(out=12, num_negatives=1500),
+    "cmc softmax": CMCConfig(out=12, num_negatives=1500, softmax=True),
+    "cmc softmax, 2 negatives": CMCConfig(out=12, num_negatives=2, softmax=True),  # often a process holds neither
+}
+NUM_ROWS = 601  # of which two processes hold 301 and 300
+
+
+def run_of(method: str) -> Run:
+    return replace(RUN, method=METHODS[method])
+
+
+def build(method: str = "mvitac") -> Method:
+    return build_from(run_of(method), num_rows=NUM_ROWS)
+
+
+def loop_run(data: DatasetConfig, method: str) -> Run:
+    return replace(with_method(recipe("smoke", data), method), steps=4, checkpoint_every=2, log_every=1)
+
+
+def three_steps(
+    start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, to: Path, world: World | None = None
+) -> dict[str, Any]:
+    """What three steps on ``parts`` make, with a checkpoint ``to`` after the second."""
+    method, step = start()
+    result = {"losses": step(parts, lr=5e-3, seed=0, progress=0.5), "gradients": gradients(method)}
+    result["memory"] = {k: v.clone() for k, v in method.state_dict().items() if k.startswith(("banks.", "z_norm"))}
+    step(parts, lr=5e-3, seed=1, progress=0.5)
+    checkpoint.save(to, run, method, step.optimiser, 2, world)
+    result["last"] = step(parts, lr=5e-3, seed=2, progress=0.5)
+    result["own"] = {m: bank.values[: bank.num_own] for m, bank in getattr(method, "banks", {}).items()}
+    return {**result, "weights": method.state_dict()}
+
+
+def third_step(start: Callable[[], tuple[Method, Step]], parts: list[Chunk], run: Run, of: Path) -> dict[str, Tensor]:
+    """The weights after the last of these, begun from the checkpoint ``of``."""
+    method, step = start()
+    assert checkpoint.restore(of, run, method, step.optimiser, 3) == 2
+    step(parts, lr=5e-3, seed=2, progress=0.5)
+    return method.state_dict()

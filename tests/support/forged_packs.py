@@ -1,0 +1,42 @@
+"""Packs changed behind the library's back, with digests that agree with the change."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mvitac.system.files import digest, digest_file
+
+Spoil = Callable[[Path], object]
+
+
+def edited(path: Path, keys: tuple[str, ...], value: Any) -> None:
+    """Write ``value`` at ``keys`` of the JSON in ``path``."""
+    content = json.loads(path.read_text())
+    inner = content
+    for key in keys[:-1]:
+        inner = inner[key]
+    inner[keys[-1]] = value
+    path.write_text(json.dumps(content))
+
+
+def seal(path: Path) -> None:
+    """Make pack.json promise what the files hold now, so that the checks behind the digests are reached."""
+    meta = json.loads((path / "pack.json").read_text())
+    meta["digests"] = {name: digest_file(path / name) for name in meta["digests"] if (path / name).exists()}
+    meta.pop("digest", None)
+    (path / "pack.json").write_text(json.dumps({**meta, "digest": digest(meta)}))
+
+
+def described(*keys: str, value: Any) -> Spoil:
+    """pack.json with another value, consistently sealed."""
+
+    def spoil(path: Path) -> None:
+        edited(path / "pack.json", keys, value)
+        meta = json.loads((path / "pack.json").read_text())
+        meta.pop("digest", None)
+        (path / "pack.json").write_text(json.dumps({**meta, "digest": digest(meta)}))
+
+    return spoil

@@ -1,0 +1,47 @@
+"""Every method on a tiny trunk with narrow heads, a batch of noise for it, and its losses on that batch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Method, MethodConfig, Views
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.registry import default
+from support.toy import Toy
+
+TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
+ROWS = torch.arange(3, 83)
+
+
+def small(name: str) -> MethodConfig:
+    """The method's config with narrow heads, where it has any."""
+    config = default(MethodConfig, name)
+    narrow = {"hidden": 24, "out": 12, "queue": 20, "num_negatives": 9}
+    return replace(config, **{key: value for key, value in narrow.items() if hasattr(config, key)})
+
+
+def build(name: str, spec: DataSpec | None = None, config: MethodConfig | None = None) -> Method:
+    torch.manual_seed(0)
+    method = (config or small(name)).build(spec or Toy().spec(), TINY)
+    method.prepare(ROWS)
+    return method
+
+
+def views(method: Method, num: int = 8, seed: int = 5, vision: int = 3, touch: int = 3) -> Views:
+    generator = torch.Generator().manual_seed(seed)
+    channels = {"vision": vision, "touch": touch}
+    images = {
+        m: [torch.randn(num, c, 32, 32, generator=generator) for _ in range(method.views)]
+        for m, c in channels.items()
+        if c
+    }
+    labels = {"pattern": torch.arange(num) % 3, "bright": torch.arange(num) % 2}
+    return Views(images=images, labels=labels, rows=ROWS[torch.randperm(len(ROWS), generator=generator)[:num]])
+
+
+def outcome(method: Method, batch: Views) -> dict[str, torch.Tensor]:
+    torch.manual_seed(9)  # dropout, drawn negatives
+    return method(batch)

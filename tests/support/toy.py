@@ -1,0 +1,104 @@
+"""A dataset made of stripes, small and fast: the class decides the pattern both modalities see, the instance its phase.
+
+The three patterns (columns, rows, checks) stay themselves under a horizontal flip.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Task
+
+NUM_CLASSES = 3
+
+
+@dataclass
+class Toy(Source):
+    num: int = 120
+    vision_channels: int = 3
+    touch_channels: int = 3
+    damaged: tuple[int, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def spec(self) -> DataSpec:
+        return DataSpec(
+            name="toy",
+            vision_channels=self.vision_channels,
+            touch_channels=self.touch_channels,
+            tasks=(
+                Task(name="pattern", classes=("columns", "rows", "checks")),
+                Task(name="bright", classes=("dark", "light")),
+            ),
+            group_by="instance",
+            controls={"noise only": ("noise",)},
+            licence="none",
+            source="tests/support/toy.py",
+        )
+
+    def items(self) -> list[str]:
+        return [f"item {i}" for i in range(self.num)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"toy": self.num, **self.extra}
+
+    def read(self, item: int) -> list[Sample]:
+        if item in self.damaged:
+            raise ValueError(f"item {item} is damaged on purpose")
+        rng = np.random.default_rng([7, item])
+        category, instance = item % NUM_CLASSES, item // NUM_CLASSES // 2
+        bright = instance % 2
+
+        def image(channels: int) -> np.ndarray | None:
+            if not channels:
+                return None
+            y, x = np.mgrid[0:32, 0:32]
+            columns, rows = np.sin(0.8 * x + instance), np.sin(0.8 * y + instance)
+            wave = (columns, rows, columns * rows)[category] * 60 + 90 + 60 * bright
+            noisy = wave[:, :, None] + rng.normal(0, 8, (32, 32, channels))
+            return np.clip(noisy, 0, 255).astype(np.uint8)
+
+        split = ("train", "train", "val", "test")[instance // 2 % 4]
+        columns = {
+            "id": f"{item:04d}",
+            "group": f"{category}-{instance}",
+            "touch_group": f"{category}-{instance}",
+            "split": split,
+            "label_pattern": category,
+            "label_bright": bright,
+            "noise": float(rng.normal()),
+        }
+        return [Sample(vision=image(self.vision_channels), touch=image(self.touch_channels), columns=columns)]
+
+
+@dataclass
+class Counting(Toy):
+    """The toy, which keeps what was read of it."""
+
+    seen: list[int] = field(default_factory=list)
+
+    def read(self, item: int) -> list[Sample]:
+        self.seen.append(item)
+        return super().read(item)
+
+
+def reordered(pack: Pack) -> Pack:
+    """``pack``, its patterns numbered the other way round."""
+    other = copy.copy(pack)
+    first, *rest = pack.spec.tasks
+    other.spec = replace(pack.spec, tasks=(replace(first, classes=first.classes[::-1]), *rest))
+    at, labels = pack.table.column_names.index("label_pattern"), NUM_CLASSES - 1 - pack.column("label_pattern")
+    other.table = pack.table.set_column(at, "label_pattern", pa.array(labels))
+    return other
+
+
+def toy_pack(path: Path, size: int = 32, **kwargs: Any) -> Pack:
+    return build(Toy(**kwargs), path, size=size, quiet=True)

@@ -1,0 +1,59 @@
+"""What one process of test_distributed.py does: main("step", DIR), main("train", PACK, OUT, DIE_AFTER, METHOD)."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+
+from mvitac.datasets.pack import PackConfig, StreamConfig
+from mvitac.methods.base import Method
+from mvitac.nn.memory_bank import shard_banks
+from mvitac.system.distributed import join, synchronise_norms
+from mvitac.training import views as batches
+from mvitac.training.loop import train as pretrain
+from mvitac.training.step import Step
+from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
+from support.small_steps import split, views
+
+
+def step(folder: Path) -> None:
+    """Of every method three steps on this process's part of the joint batch, and the third from one process's checkpoint."""
+    world = join()
+    part = split(views(), len(views().rows) // world.size)[world.rank]
+
+    def start(name: str) -> tuple[Method, Step]:
+        method = build(name)
+        synchronise_norms(method, world)
+        shard_banks(method, world)
+        return method, Step(run_of(name), method, torch.device("cpu"), world)
+
+    for name in METHODS:
+        run, here = run_of(name), folder / name
+        made = three_steps(partial(start, name), [part], run, here / "two.pt", world)
+        resumed = third_step(partial(start, name), [part], run, here / "one.pt")
+        torch.save({**made, "resumed": resumed}, here / f"rank{world.rank}.pt")
+
+
+def train(pack: Path, out: Path, die_after: int, name: str) -> None:
+    """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw."""
+    shards = StreamConfig(url=str(pack), cache=pack.with_name("cache"), cache_gb=1e-3, window=2)
+    data = shards if pack.name == "shards" else PackConfig(path=pack)
+    real, seen = batches.make_views, []
+
+    def watched(*args: object) -> object:
+        if len(seen) == die_after:
+            raise RuntimeError("power cut")
+        seen.append(args[2].tolist())  # type: ignore[attr-defined]
+        return real(*args)  # type: ignore[arg-type]
+
+    batches.make_views = watched  # type: ignore[assignment]
+    pretrain(loop_run(data, name), out, resume=True, quiet=True)
+    torch.save(seen, out.with_name(f"{out.name}-rows{join().rank}.pt"))
+
+
+def main(kind: str, *given: str) -> None:
+    step(Path(given[0])) if kind == "step" else train(Path(given[0]), Path(given[1]), int(given[2]), given[3])
+    dist.destroy_process_group()

@@ -1,0 +1,315 @@
+"""What `--precision auto` becomes, what is said and kept of it, and that a CPU without bf16 trains in fp32."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from rich.console import Console
+
+import mvitac
+from mvitac.cli import live
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.deploy.engine import open_engine
+from mvitac.deploy.export import export
+from mvitac.evaluation.evaluate import ProbeConfig
+from mvitac.experiments.collect import forecast, gather, lay_out
+from mvitac.experiments.jobs import do, do_all
+from mvitac.experiments.plan import Plan, Row
+from mvitac.experiments.table import lines_of
+from mvitac.experiments.table_formats import latex, markdown
+from mvitac.recipes import RECIPES, recipe
+from mvitac.run import Run, load_run
+from mvitac.system import device as devices
+from mvitac.system.device import describe_precision, pick_precision
+from mvitac.training.loop import train
+from mvitac.training.step import Step
+from support.training_runs import assert_equal_weights, power_cut
+
+CPU = torch.device("cpu")
+OLD_CPU = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
+"""What makes torch treat any x86 CPU as one that has AVX2 and nothing newer."""
+Hardware = Callable[[bool], None]
+
+
+@pytest.fixture
+def hardware(monkeypatch: pytest.MonkeyPatch) -> Hardware:
+    """Calling it with True or False moves the test to a machine that computes bf16 itself, or not."""
+    return lambda own: monkeypatch.setattr(devices, "has_bf16", lambda device: own)
+
+
+def auto(pack: Pack, **changes: object) -> Run:
+    return replace(recipe("smoke", PackConfig(path=pack.path)), precision="auto", **changes)  # type: ignore[arg-type]
+
+
+# -- the choice -------------------------------------------------------------------------------------------------------
+
+
+def test_recipes_ask_for_auto_but_those_that_are_fixed() -> None:
+    asked = {name: recipe(name).precision for name in RECIPES}
+    assert asked == {"paper": "fp32", "authors": "fp32", "modern": "auto", "demo": "auto", "smoke": "fp32"}
+
+
+@pytest.mark.parametrize(
+    ("avx512_bf16", "amx", "onednn", "expected"),
+    [
+        (True, False, True, "bf16"),  # EPYC from Genoa
+        (True, True, True, "bf16"),  # Xeon from Sapphire Rapids
+        (False, True, True, "bf16"),
+        (False, False, True, "fp32"),  # AVX-512 alone: oneDNN emulates bf16 there and says that it can
+        (False, False, False, "fp32"),  # AVX2
+        (True, True, False, "fp32"),  # a chip that has it and a oneDNN that may not use it
+        (None, None, True, "fp32"),  # another torch, without these private functions
+        (True, True, None, "fp32"),
+    ],
+)
+def test_auto_on_cpus(
+    avx512_bf16: bool | None, amx: bool | None, onednn: bool | None, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for where, name, answer in (
+        (torch.cpu, "_is_avx512_bf16_supported", avx512_bf16),
+        (torch.cpu, "_is_amx_tile_supported", amx),
+    ):
+        if answer is None:
+            monkeypatch.delattr(where, name)
+        else:
+            monkeypatch.setattr(where, name, lambda answer=answer: answer)
+    known = {} if onednn is None else {"_is_mkldnn_bf16_supported": lambda: onednn}
+    monkeypatch.setattr(torch.ops, "mkldnn", SimpleNamespace(**known))
+    assert pick_precision("auto", CPU) == expected
+    assert [pick_precision(name, CPU) for name in ("fp32", "tf32", "bf16")] == ["fp32", "tf32", "bf16"]
+
+
+@pytest.mark.parametrize(("capability", "expected"), [((7, 5), "fp32"), ((8, 0), "bf16"), ((9, 0), "bf16")])
+def test_auto_on_gpus(capability: tuple[int, int], expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device", lambda device: torch.no_grad())
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
+    assert pick_precision("auto", torch.device("cuda:0")) == expected
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: including_emulation)
+    assert pick_precision("auto", torch.device("cuda:0")) == "fp32"
+    assert pick_precision("auto", torch.device("mps")) == "fp32"
+
+
+def test_nothing_below_train_takes_auto_for_fp32(pack: Pack) -> None:
+    run = auto(pack)
+    with pytest.raises(AssertionError, match="what auto means is decided before"):
+        Step(run, run.method.build(pack.spec, run.encoder), CPU)
+
+
+# -- said and kept ----------------------------------------------------------------------------------------------------
+
+
+def test_emulated_bf16_says_what_it_costs_here(hardware: Hardware, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {}
+    for own in (True, False):
+        hardware(own)
+        monkeypatch.setattr(devices, "slowdown", lambda device: 107.3)
+        told[own] = [
+            describe_precision(asked, pick_precision(asked, CPU), CPU) for asked in ("auto", "bf16", "fp32", "tf32")
+        ]
+    assert told[True] == ["precision: bf16 (auto)", "precision: bf16", "precision: fp32", "precision: tf32"]
+    assert told[False][0] == "precision: fp32 (auto, as this CPU does not compute bf16 itself)"
+    assert "emulated on this CPU: a 256x256 product takes 107 times as long as in fp32. Use --pre" in told[False][1]
+    assert told[False][2:] == told[True][2:]
+    monkeypatch.setattr(devices, "slowdown", lambda device: 0.7)  # some chip that torch knows more of than we do
+    assert describe_precision("bf16", "bf16", CPU) == "precision: bf16"
+
+
+def test_the_slowdown_is_measured_and_leaves_the_threads() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert devices.slowdown(CPU) > 0
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_what_auto_became_is_printed_and_kept(
+    pack: Pack, tmp_path: Path, hardware: Hardware, own: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hardware(own)
+    became = "bf16" if own else "fp32"
+    out = train(auto(pack), tmp_path / "r")
+    assert f"precision: {became} (auto" in capsys.readouterr().out
+    run, record = load_run(out)
+    assert (run.precision, record["precision"]) == ("auto", became)
+    assert mvitac.load(out).run.precision == became
+    assert train(replace(auto(pack), precision=became), tmp_path / "explicit", quiet=True)  # type: ignore[arg-type]
+    assert_equal_weights(out, tmp_path / "explicit")
+    assert not capsys.readouterr().out
+    # Another machine decides anew, and what is finished stays what it is.
+    hardware(not own)
+    again = ["pretrain", "--from", str(out / "run.json"), "--quiet", "--steps", "2", "--out", str(tmp_path / "again")]
+    assert main(again) == 0
+    assert load_run(tmp_path / "again")[1]["precision"] == ("fp32" if own else "bf16")
+    assert train(auto(pack), out, resume=True, quiet=True) == out
+
+
+def test_a_checkpoint_goes_on_in_its_own_precision_alone(pack: Pack, tmp_path: Path, hardware: Hardware) -> None:
+    run, out = auto(pack, checkpoint_every=2), tmp_path / "r"
+    hardware(True)
+    train(run, tmp_path / "straight", quiet=True)
+    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
+        train(run, out, quiet=True)
+    hardware(False)
+    with pytest.raises(
+        ValueError, match=r"begun in bf16, and --precision auto means fp32 .* --precision bf16, or delete"
+    ):
+        train(run, out, resume=True, quiet=True)
+    with pytest.raises(ValueError, match="holds a different run"):
+        train(replace(run, precision="fp32"), out, resume=True, quiet=True)
+    train(replace(run, precision="bf16"), out, resume=True, quiet=True)
+    assert_equal_weights(tmp_path / "straight", out)
+
+
+def test_runs_from_before_auto_go_on(pack: Pack, tmp_path: Path, hardware: Hardware) -> None:
+    """Recipes that are auto now asked for bf16 then, and records did not say what a run computed in."""
+    run, out = auto(pack, checkpoint_every=2), tmp_path / "r"
+    old = replace(run, precision="bf16")
+    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
+        train(old, out, quiet=True)
+    record = json.loads((out / "run.json").read_text())
+    assert record["run"]["precision"] == record.pop("precision") == "bf16"
+    (out / "run.json").write_text(json.dumps(record))
+    assert torch.load(out / "checkpoint.pt", weights_only=True)["run"] == old.digest()
+    hardware(False)
+    with pytest.raises(ValueError, match="begun in bf16"):
+        train(run, out, resume=True, quiet=True)
+    hardware(True)
+    train(run, out, resume=True, quiet=True)
+    assert mvitac.load(out).run.precision == "bf16"
+
+
+def test_digests_of_older_settings_stay() -> None:
+    """As commit fa05dc9 had them, where `modern` and `demo` were in bf16."""
+    digests = {name: recipe(name).digest()[:12] for name in ("paper", "authors", "smoke")}
+    digests |= {name: replace(recipe(name), precision="bf16").digest()[:12] for name in ("modern", "demo")}
+    assert digests == {
+        "paper": "2689d79f8e4d",
+        "authors": "3d8dd6ace52a",
+        "modern": "2dcbdc315156",
+        "demo": "4701dc4d4fd3",
+        "smoke": "3ee300f6a036",
+    }
+
+
+# -- other commands ---------------------------------------------------------------------------------------------------
+
+
+def test_compare_says_where_runs_differ(pack: Pack, tmp_path: Path, hardware: Hardware) -> None:
+    rows = (Row(label="MViTac"), Row(label="in fp32", set={"precision": "fp32"}))
+    plan = Plan(name="p", rows=rows, recipe="smoke", seeds=2, set={"steps": 2, "eval_every": 0, "precision": "auto"})
+    plan = replace(plan, data=PackConfig(path=pack.path))
+    out, session = tmp_path / "out", ProbeConfig(controls=False)
+    hardware(False)
+    work = lay_out(plan, pack, out, session)
+    assert [line for line in forecast(work) if "precision" in line] == [
+        "on this machine: precision: fp32 (auto, as this CPU does not compute bf16 itself)",
+        "on this machine: precision: fp32",
+    ]
+    do(work.jobs[0])
+    hardware(True)  # another machine does the rest
+    do_all(lay_out(plan, pack, out, session), 1, lambda line: None)
+    result = gather(work, out, session)
+    said = "the networks of 'MViTac, seed 1' in bf16, those of all other runs in fp32"
+    lines = lines_of(result)
+    assert f"Note: {said}." in markdown(result, lines) and f"% Note: {said}." in latex(result, lines)
+    same = {**result, "run_precisions": dict.fromkeys(result["run_precisions"], "fp32")}
+    older = {key: value for key, value in result.items() if key != "run_precisions"}
+    assert "the networks of" not in markdown(same, lines) + markdown(older, lines)
+
+
+def test_rows_of_a_plan_keep_their_precision(pack: Pack, tmp_path: Path) -> None:
+    """A row that names one is no copy of the reference, whose auto another machine may read in another way."""
+    rows = (Row(label="MViTac"), *(Row(label=p, set={"precision": p}) for p in ("fp32", "bf16")))
+    plan = Plan(name="p", rows=rows, recipe="modern", data=PackConfig(path=pack.path), set={"batch_size": 16})
+    plan = replace(plan, set={**plan.set, "augment.size": 32, "augment.whole": None})
+    work = lay_out(plan, pack, tmp_path / "out", ProbeConfig())
+    assert not work.left_out
+    assert {job.label: job.run.precision for job in work.jobs} == {"MViTac": "auto", "fp32": "fp32", "bf16": "bf16"}
+
+
+def test_a_bf16_export_needs_a_cpu_that_can_check_it(
+    smoke_run: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mvitac.deploy.export.has_bf16", lambda device: False)
+    with pytest.raises(
+        ValueError, match=r"--precision bf16: this CPU does not compute bf16 itself.*leave --precision out"
+    ):
+        export(mvitac.load(smoke_run), pack, tmp_path / "e", kind="openvino", precision="bf16")
+    assert not (tmp_path / "e").exists()
+
+
+def test_a_bf16_export_runs_in_fp32_where_openvino_lists_no_bf16(
+    onnx: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import openvino
+
+    hints: list[str] = []
+    listed = ["FP32"]
+
+    class Core:
+        def get_property(self, *names: str) -> list[str]:
+            return listed
+
+        def compile_model(self, path: Path, device: str, config: dict[str, str]) -> SimpleNamespace:
+            hints.append(config["INFERENCE_PRECISION_HINT"])
+            return SimpleNamespace(create_infer_request=lambda: None)
+
+    monkeypatch.setattr(openvino, "Core", Core)
+    monkeypatch.setattr("mvitac.deploy.engine.Engine", lambda *_, **__: SimpleNamespace(meta={"precision": "bf16"}))
+    said = []
+    for capabilities in (["FP32"], ["BF16", "FP32"]):
+        listed = capabilities
+        open_engine(onnx, "openvino", "bf16")
+        live._engine(str(onnx), 1, Console())
+        said.append("runs in fp32" in capsys.readouterr().out.replace("\n", " "))
+    assert (hints, said) == (["f32", "bf16"], [True, False])
+
+
+# -- a CPU without bf16 -----------------------------------------------------------------------------------------------
+
+SCRIPT = """
+import sys
+from mvitac.cli.main import main
+from mvitac.cli import live
+
+pack, out = sys.argv[1:]
+common = ["--data", "pack", "--data.path", pack, "--encoder.trunk", "mvitac_tiny", "--steps", "2", "--batch-size", "16"]
+common += ["--augment.size", "32", "--augment.whole", "None"]
+for name, chosen in {"demo": [], "modern": ["--encoder.weights", "scratch"], "bf16": ["--precision", "bf16"]}.items():
+    recipe = "modern" if name == "modern" else "demo"
+    assert main(["pretrain", "--recipe", recipe, *common, *chosen, "--out", f"{out}/{name}"]) == 0
+"""
+
+
+def test_recipes_train_in_fp32_on_a_cpu_without_bf16(pack: Pack, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", SCRIPT, str(pack.path), str(tmp_path)]
+    done = subprocess.run(command, env={**os.environ, **OLD_CPU}, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    became = {path.name: load_run(path)[1]["precision"] for path in tmp_path.iterdir()}
+    assert became == {"demo": "fp32", "modern": "fp32", "bf16": "bf16"}
+    text = " ".join(done.stdout.split())
+    assert text.count("precision: fp32 (auto, as this CPU does not compute bf16 itself)") == 2
+    assert re.search(r"bf16, which is emulated on this CPU: a 256x256 product takes \d+ times as long as in fp32", text)
+
+
+def test_recipes_train_in_bf16_where_torch_says_that_it_is_there(pack: Pack, tmp_path: Path) -> None:
+    chip = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    says = chip and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    out = train(auto(pack, steps=2), tmp_path / "r", quiet=True)
+    assert load_run(out)[1]["precision"] == ("bf16" if says else "fp32")

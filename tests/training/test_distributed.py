@@ -1,0 +1,162 @@
+"""Two processes (gloo) against one on the joint batch: gradients, weights, statistics, files, resuming."""
+
+from __future__ import annotations
+
+import json
+import socket
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from mvitac.data.pack import Pack
+from mvitac.data.sharding import write_shards
+from mvitac.datasets.pack import PackConfig
+from mvitac.methods.base import Method
+from mvitac.recipes import recipe
+from mvitac.system.distributed import World
+from mvitac.training.loop import train
+from mvitac.training.sampler import batches, training_rows
+from mvitac.training.step import Step
+from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
+from support.processes import begin
+from support.small_steps import assert_close, views
+from support.training_runs import power_cut
+
+CHAOS = 0.02
+"""Of the largest entry: weights 1e-7 apart are up to 4e-3 apart three steps later, where a ReLU turns over."""
+
+
+def together(folder: Path, *words: str, num: int = 2, fails: bool = False) -> None:
+    """Run the worker in ``num`` processes that find each other as torchrun's would."""
+    from support.worker_distributed import main
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    processes, said = [], [folder / f"rank{rank}.txt" for rank in range(num)]
+    for rank, output in enumerate(said):
+        place = {"WORLD_SIZE": str(num), "RANK": str(rank), "LOCAL_RANK": str(rank)}
+        processes.append(begin(main, *words, output=output, MASTER_ADDR="127.0.0.1", MASTER_PORT=port, **place))
+    for process, output in zip(processes, said, strict=True):
+        process.join(120)
+        assert process.exitcode is not None and (process.exitcode != 0) == fails, output.read_text()
+
+
+def alone(name: str) -> tuple[Method, Step]:
+    method = build(name)
+    return method, Step(run_of(name), method, torch.device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of every method a folder: what one process makes (alone.pt) and what two make (rank0.pt, rank1.pt)."""
+    folder = tmp_path_factory.mktemp("pair")
+    for name in METHODS:
+        (folder / name).mkdir()
+        made = three_steps(partial(alone, name), [views], run_of(name), folder / name / "one.pt")
+        torch.save(made, folder / name / "alone.pt")
+    together(folder, "step", str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> None:
+    """Synchronised BatchNorm in trunks and heads, gathered negatives, summed gradients: one process's to rounding. So are
+    CMC's banks, of which each process holds its rows and scores queries against them, and Z."""
+    one, first, second = (torch.load(pair / method / f"{name}.pt") for name in ("alone", "rank0", "rank1"))
+    assert_close(one["losses"], first["losses"], 1e-5)
+    assert_close(first["losses"], second["losses"], 0)
+    assert_close(one["gradients"], first["gradients"], 1e-3)
+    assert one["memory"].keys() == first["memory"].keys() and bool(one["memory"]) == method.startswith("cmc")
+    for name, value in one["memory"].items():
+        torch.testing.assert_close(first["memory"][name], value, rtol=1e-4, atol=1e-5)
+    assert_close(one["last"], first["last"], 1e-3)
+    assert_close(one["weights"], first["weights"], CHAOS)
+    assert first["weights"].keys() - second["weights"].keys() == {f"banks.{m}.values" for m in first["own"]}
+    for name, value in second["weights"].items():
+        assert torch.equal(value, first["weights"][name]), name
+    for rank, own in enumerate((first["own"], second["own"])):
+        for name, rows in own.items():
+            assert len(rows) == (301, 300)[rank] and torch.equal(
+                rows, first["weights"][f"banks.{name}.values"][rank::2]
+            )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_process_goes_on_where_two_stopped_and_two_where_one_did(pair: Path, method: str) -> None:
+    one, first = (torch.load(pair / method / f"{name}.pt") for name in ("alone", "rank0"))
+    assert_close(one["weights"], first["resumed"], CHAOS)
+    resumed = third_step(partial(alone, method), [views], run_of(method), pair / method / "two.pt")
+    assert_close(resumed, first["weights"], CHAOS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pack", "shards"])
+def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tmp_path: Path, kind: str) -> None:
+    if kind == "shards":
+        write_shards(pack, str(tmp_path / "shards"), shard_mb=0.05, quiet=True)
+    data = str(pack.path if kind == "pack" else tmp_path / "shards")
+    straight, cut = tmp_path / "straight", tmp_path / "cut"
+    together(tmp_path, "train", data, str(straight), "99", "mvitac")
+    together(tmp_path, "train", data, str(cut), "3", "mvitac", fails=True)
+    assert not (cut / "model.safetensors").exists()
+    together(tmp_path, "train", data, str(cut), "99", "mvitac")
+    a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
+    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+    for path in (straight, cut):
+        lines = [json.loads(line) for line in (path / "log.jsonl").read_text().splitlines()]
+        assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4]
+    first, second = (torch.load(tmp_path / f"straight-rows{r}.pt") for r in (0, 1))
+    epoch = [[*chain(*rows)] for rows in (first[:3], second[:3])]  # 60 training rows: three batches of 16 per epoch
+    assert len(set(epoch[0])) == len(set(epoch[1])) == 24 and not set(epoch[0]) & set(epoch[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [1, 2])
+def test_the_loop_keeps_whole_banks_when_the_number_of_processes_changes(
+    pack: Pack, tmp_path: Path, first: int
+) -> None:
+    """Cut after step 3 of 4, resumed from step 2 by another number: in the end the rows seen by either have moved, to unit
+    length, and the others are where they were at the start."""
+    out, run = tmp_path / "run", loop_run(PackConfig(path=pack.path), "cmc")
+    if first == 1:
+        with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+            train(run, out, quiet=True)
+        together(tmp_path, "train", str(pack.path), str(out), "99", "cmc")
+    else:
+        together(tmp_path, "train", str(pack.path), str(out), "3", "cmc", fails=True)
+        assert torch.load(out / "checkpoint.pt")["step"] == 2
+        train(run, out, resume=True, quiet=True)
+    rows = training_rows(run, pack)
+    seen = np.isin(rows, np.concatenate(list(batches(run, pack, rows, 0, 4))))
+    assert 0 < seen.sum() < len(rows)
+    torch.manual_seed(run.seed)
+    start = run.method.build(pack.spec, run.encoder)
+    start.prepare(torch.from_numpy(rows))
+    state = torch.load(out / "checkpoint.pt")
+    assert state["step"] == 4 and (state["method"]["z_norm"] > 0).all()
+    for name, before in start.state_dict().items():
+        if name.startswith("banks."):
+            bank = state["method"][name]
+            assert torch.equal(bank[~seen], before[~seen]) and not torch.isclose(bank[seen], before[seen]).all(1).any()
+            torch.testing.assert_close(bank[seen].norm(dim=1), torch.ones(int(seen.sum())))
+
+
+def test_a_batch_that_does_not_divide_is_named(pack: Pack, tmp_path: Path) -> None:
+    from mvitac.training.loop import _check_world
+
+    with pytest.raises(ValueError, match="batch_size 16 is not the same whole number of pairs for each of 3 processes"):
+        _check_world(recipe("smoke"), World(0, 3))
+
+
+def test_a_world_of_one_does_nothing() -> None:
+    z = torch.randn(4, 3)
+    world = World()
+    assert world.gather(z) is z and torch.equal(world.own(z, 4), z)
+    assert world.sum(z) is z and world.spread(z) is z and world.unshard(z, 4) is z and torch.equal(world.shard(z), z)
+    assert world.writes and world.anyone(True) and not world.anyone(False)

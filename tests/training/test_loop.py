@@ -1,0 +1,285 @@
+"""The loop: resumed = straight bit for bit, batches without near-duplicates, a loss that stops when it is no number."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.model import fresh
+from mvitac.run import Optim
+from mvitac.training.loader import Feed
+from mvitac.training.log import last_line
+from mvitac.training.loop import Diverged, train
+from mvitac.training.sampler import epoch_order, partners
+from mvitac.training.validation import evaluate
+from mvitac.training.views import make_views
+from support.processes import begin, finish
+from support.toy import toy_pack
+from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+
+
+@pytest.fixture(scope="module")
+def straight(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(smoke(pack), tmp_path_factory.mktemp("run") / "straight", quiet=True)
+
+
+def test_leaves_the_promised_files(straight: Path) -> None:
+    assert {p.name for p in straight.iterdir()} == {"run.json", "log.jsonl", "checkpoint.pt", "model.safetensors"}
+    lines = [json.loads(line) for line in (straight / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "loss" in line] == [2, 4, 6, 8]
+    assert [line["step"] for line in lines if "eval" in line] == [4, 8]
+    for line in lines:
+        if "loss" in line:
+            assert line["loss"] == pytest.approx(sum(line[k] for k in ("vv", "tt", "vt", "tv")), rel=1e-5)
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 7])
+def test_stopped_and_resumed_equals_straight(pack: Pack, straight: Path, tmp_path: Path, stop_after: int) -> None:
+    """Also across a change of epoch, with dropout, and with a checkpoint older than the stop."""
+    run = smoke(pack, checkpoint_every=2)
+    with power_cut(stop_after), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "r", quiet=True)
+    train(run, tmp_path / "r", resume=True, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
+    steps = [json.loads(line)["step"] for line in (tmp_path / "r" / "log.jsonl").read_text().splitlines()]
+    assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
+
+
+def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:
+    method = replace(smoke(pack).method, dropout=0.5)  # type: ignore[call-arg]
+    run = smoke(pack, method=method, optim=Optim(name="sgd", lr=0.05, schedule="cosine"), checkpoint_every=1)
+    train(run, tmp_path / "straight", quiet=True)
+    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "cut", quiet=True)
+    train(run, tmp_path / "cut", resume=True, quiet=True)
+    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+
+
+def command(pack: Pack, out: Path) -> list[str]:
+    fields = ["--steps", "30", "--checkpoint-every", "1", "--eval-every", "0", "--log-every", "1", "--quiet"]
+    choice = ["--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path)]
+    return ["pretrain", *choice, *fields, "--out", str(out), "--resume"]
+
+
+@pytest.mark.slow
+def test_sigkill_at_random_moments(pack: Pack, tmp_path: Path) -> None:
+    """Killed with SIGKILL three times at random steps, then resumed: the weights of the run that was not."""
+    finish(begin(main, command(pack, tmp_path / "straight")))
+    out, rng = tmp_path / "killed", random.Random()
+    killed = 0
+    for goal in sorted(rng.sample(range(2, 26), 3)):
+        process = begin(main, command(pack, out))
+        while process.is_alive():
+            log = out / "log.jsonl"
+            if log.exists() and len(log.read_text().splitlines()) >= goal:
+                time.sleep(rng.random() * 0.02)  # anywhere within a step or its checkpoint
+                process.kill()
+                process.join()
+                killed += process.exitcode == -signal.SIGKILL
+    finish(begin(main, command(pack, out)))
+    assert killed == 3
+    assert_equal_weights(tmp_path / "straight", out)
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(pack: Pack, straight: Path, tmp_path: Path) -> None:
+    sent = []
+
+    def logger(step: int, values: dict[str, float]) -> None:
+        if step == 4 and not sent:
+            sent.append(step)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    from mvitac.training.loop import Interrupted
+
+    with pytest.raises(Interrupted, match=r"after step 4 of 8; continue with --resume"):
+        train(smoke(pack), tmp_path / "r", quiet=True, loggers=(logger,))
+    assert torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)["step"] == 4
+    train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
+
+
+def test_not_a_number_stops_with_step_parts_and_advice(pack: Pack, tmp_path: Path) -> None:
+    run = smoke(pack, optim=Optim(name="sgd", lr=1e30), log_every=1)
+    with pytest.raises(Diverged, match=r"not finite at step \d \(.*vv .*\).*lower --optim\.lr"):
+        train(run, tmp_path / "r", quiet=True)
+    assert not (tmp_path / "r" / "model.safetensors").exists()
+
+
+def test_no_checkpoint_is_kept_of_weights_that_are_no_numbers(pack: Pack, tmp_path: Path) -> None:
+    """Checked before each is written, not only where losses are reported."""
+    run = smoke(pack, optim=Optim(name="sgd", lr=1e30), log_every=8, checkpoint_every=1)
+    with pytest.raises(Diverged, match=r"the last checkpoint is kept"):
+        train(run, tmp_path / "r", quiet=True)
+    kept = torch.load(tmp_path / "r" / "checkpoint.pt", weights_only=True)
+    assert 1 <= kept["step"] < 8 and all(torch.isfinite(value).all() for value in kept["method"].values())
+
+
+def test_the_package_has_the_function_every_time(pack: Pack, tmp_path: Path) -> None:
+    """The second use in a process must find the function again, not a module of that name."""
+    import mvitac
+
+    for name in ("a", "b"):
+        assert mvitac.train(smoke(pack, steps=1), tmp_path / name, quiet=True) == tmp_path / name
+    assert_equal_weights(tmp_path / "a", tmp_path / "b")
+
+
+def test_a_run_tells_its_speed_soon(pack: Pack, tmp_path: Path) -> None:
+    """Steps after the first, which starts everything, so that whoever reads its log can tell the time left."""
+    log = train(smoke(pack, steps=12, log_every=10), tmp_path / "r", quiet=True) / "log.jsonl"
+    said = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["step"] for line in said if "loss" in line] == [3, 10, 12]
+
+
+def test_seed_decides(pack: Pack, straight: Path, tmp_path: Path) -> None:
+    train(smoke(pack), tmp_path / "same", quiet=True)
+    assert_equal_weights(straight, tmp_path / "same")
+    train(smoke(pack, seed=1), tmp_path / "other", quiet=True)
+    assert not torch.equal(
+        weights(straight)["encoders.touch.conv1.0.weight"], weights(tmp_path / "other")["encoders.touch.conv1.0.weight"]
+    )
+
+
+def test_resume_refuses_a_different_run(pack: Pack, straight: Path) -> None:
+    with pytest.raises(ValueError, match="already holds a run"):
+        train(smoke(pack), straight, quiet=True)
+    with pytest.raises(ValueError, match="holds a different run"):
+        train(smoke(pack, seed=3), straight, resume=True, quiet=True)
+
+
+def test_from_run_json_repeats_it(pack: Pack, straight: Path, tmp_path: Path) -> None:
+    from mvitac.cli.main import main
+
+    assert main(["pretrain", "--from", str(straight / "run.json"), "--out", str(tmp_path / "again"), "--quiet"]) == 0
+    assert_equal_weights(straight, tmp_path / "again")
+
+
+def test_learns_the_stripes(tmp_path: Path) -> None:
+    """150 steps on three patterns: kNN on unseen instances well above the untrained trunk's, by touch and by vision."""
+    pack = toy_pack(tmp_path / "pack", num=360)
+    optim = Optim(name="adamw", lr=3e-3, schedule="cosine", warmup=0.1)
+    run = smoke(pack, steps=150, batch_size=60, optim=optim, eval_every=0)
+    before = evaluate(fresh(run, pack.spec, pack.size), pack, run)
+    log = train(run, tmp_path / "r", quiet=True) / "log.jsonl"
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    after = lines[-1]["eval"]
+    for modality in ("touch", "vision"):
+        assert after[f"{modality}/knn pattern"] > before[f"{modality}/knn pattern"] + 0.1, (before, after)
+    for part in ("vv", "tt", "vt", "tv"):
+        assert lines[-2][part] < 0.9 * lines[0][part], part
+
+
+def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
+    run = smoke(
+        pack, method=SupervisedConfig(tasks=("pattern",)), steps=60, batch_size=30, optim=Optim(name="adamw", lr=3e-3)
+    )
+    out = train(run, tmp_path / "r", quiet=True)
+    values = json.loads((out / "log.jsonl").read_text().splitlines()[-1])["eval"]
+    assert values["touch/knn pattern"] > 0.9, values
+    assert "alignment" not in values  # it has no shared space
+
+
+def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mvitac
+    from mvitac.training import validation as module
+
+    used: list[np.ndarray] = []
+    real = module.pack_features
+    monkeypatch.setattr(
+        module, "pack_features", lambda m, p, mod, rows, **k: used.append(rows) or real(m, p, mod, rows, **k)
+    )
+    evaluate(mvitac.load(straight), pack, smoke(pack))
+    assert used and not set(np.concatenate(used)) & set(pack.rows("test"))
+
+
+def test_one_per_touch_spreads_groups() -> None:
+    """50 groups of 1 to 9 rows: any 25 consecutive rows of the first pass hold 25 different groups."""
+    rng = np.random.default_rng(0)
+    groups = rng.permutation(np.repeat(np.arange(50), rng.integers(1, 10, 50)))
+    order = epoch_order(len(groups), groups, seed=4)
+    assert sorted(order) == list(range(len(groups)))
+    assert len(set(groups[order[:25]])) == 25 and len(set(groups[order[25:50]])) == 25
+    assert not np.array_equal(order, epoch_order(len(groups), groups, seed=5))
+    plain = epoch_order(len(groups), None, seed=4)
+    assert sorted(plain) == list(range(len(groups)))
+
+
+def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, groups = np.arange(pack.num), pack.touch_groups
+    found = partners(pack, rows, torch.Generator().manual_seed(0))
+    assert (found != rows).all()  # every toy instance has two rows
+    assert np.array_equal(groups[found], groups[rows])
+    assert np.array_equal(found, partners(pack, rows, torch.Generator().manual_seed(0)))
+    real = Pack.column
+
+    def halved(self: Pack, name: str) -> np.ndarray:
+        values = real(self, name)
+        if name == "split":  # one row of each group moves to test: its partner must not follow it there
+            values[groups.argsort(kind="stable")[::2]] = "test"
+        return values
+
+    monkeypatch.setattr(Pack, "column", halved)
+    rows = np.flatnonzero(real(pack, "split") != "test")  # those already in test keep their partner there
+    assert np.array_equal(partners(pack, rows, torch.Generator().manual_seed(0)), rows)
+
+
+@pytest.mark.parametrize("num_views", [1, 2])
+@pytest.mark.parametrize("positives", ["same-image", "same-touch", "same-touch-pairs"])
+def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> None:
+    rows = pack.rows("train")[:16]
+    asked: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
+    device = torch.device("cpu")
+
+    class Spy(Feed):
+        def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
+            asked[modality].append(rows)
+            return super().__call__(modality, rows)
+
+    run, generator = smoke(pack, positives=positives), torch.Generator().manual_seed(0)
+    made = make_views(run, pack, rows, num_views, generator, device, Spy(pack, device))
+    assert {m: len(views) for m, views in made.images.items()} == {"vision": num_views, "touch": num_views}
+    touch_groups = pack.touch_groups
+    for found in (one for each in asked.values() for one in each):
+        assert np.array_equal(touch_groups[found], touch_groups[rows])
+    other = {m: [bool((found != rows).all()) for found in each] for m, each in asked.items()}
+    if num_views == 2:
+        assert other["vision"] == other["touch"] == ([False] if positives == "same-image" else [False, True])
+    else:
+        assert other == {"vision": [False], "touch": [positives == "same-touch-pairs"]}
+
+
+def test_same_touch_positives_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        train(smoke(pack, positives="same-touch"), tmp_path / name, quiet=True)
+    assert_equal_weights(tmp_path / "a", tmp_path / "b")
+    train(smoke(pack, positives="same-image"), tmp_path / "c", quiet=True)
+    first = "encoders.touch.conv1.0.weight"
+    assert not torch.equal(weights(tmp_path / "a")[first], weights(tmp_path / "c")[first])
+
+
+def test_learning_rate_schedules() -> None:
+    warm = Optim(lr=1.0, schedule="cosine", warmup=0.1)
+    assert [warm.rate(s, 100, 0) for s in (0, 9, 10)] == pytest.approx([0.1, 1.0, 1.0])
+    assert warm.rate(55, 100, 0) == pytest.approx(0.5)
+    step = Optim(lr=1.0, schedule="step")
+    assert [step.rate(0, 1, e) for e in (0, 9, 10, 25)] == pytest.approx([1, 1, 0.9, 0.81])
+
+
+def test_last_line_is_the_last_one_about_losses(tmp_path: Path) -> None:
+    assert last_line(tmp_path) == {}
+    told = {"step": 20, "loss": 3.456, "pairs_per_s": 81.6}
+    lines = [{**told, "step": 10}, told, {"step": 20, "eval": {}}, {"step": 21, "eval": {}}, {"step": 22, "eval": {}}]
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"step": 30, "lo')
+    assert last_line(tmp_path) == told

@@ -1,0 +1,193 @@
+"""The fast and the small step against the plain one: fp32 reference, gradient caching, recomputation, compilation."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from mvitac.data.pack import Pack
+from mvitac.methods.base import Method, MethodConfig
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.nn.encoders import draws_random_numbers
+from mvitac.recipes import recipe
+from mvitac.run import Run
+from mvitac.system import processes
+from mvitac.training.loop import train
+from mvitac.training.step import Step
+from support.small_methods import small
+from support.small_steps import RUN, assert_close, build, gradients, split, views
+
+CPU = torch.device("cpu")
+
+
+def take(run: Run, method: Method, parts: list, num: int = 1) -> dict[str, Tensor]:
+    step, losses = Step(run, method, CPU), {}
+    for i in range(num):
+        losses = step(parts, lr=1e-3, seed=i, progress=0.5)
+    return losses
+
+
+def test_the_step_is_the_plain_one_written_out() -> None:
+    """Adam, loss.backward and eq. 1-3 in plain torch: three steps later all weights agree to 1e-5."""
+    run = replace(RUN, method=MViTacConfig(hidden=24, out=12))
+    fast, plain, batch = build(run), build(run), views()
+    take(run, fast, [lambda: batch], num=3)
+    optimiser = torch.optim.Adam([p for p in plain.parameters() if p.requires_grad], 1e-3, eps=1e-7, foreach=False)
+    for _ in range(3):
+        loss = plain(batch)["loss"]
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        for name, key in plain.key.state_dict().items():
+            query = plain.query.state_dict()[name.replace(".module.", ".")]
+            key.copy_(0.99 * key + 0.01 * query if key.is_floating_point() else query)
+    assert_close(fast.state_dict(), plain.state_dict(), 1e-4)
+
+
+def test_bf16_keeps_the_direction_of_the_gradient() -> None:
+    """Stated tolerance: cosine above .9, on noise at random weights, with the fp32 gradient, losses within 3 %."""
+    run = replace(RUN, method=MViTacConfig(hidden=24, out=12))
+    exact, rounded, batch = build(run), build(run), views()
+    a, b = take(run, exact, [lambda: batch]), take(replace(run, precision="bf16"), rounded, [lambda: batch])
+    first, second = (torch.cat([g.flatten() for g in gradients(m).values()]) for m in (exact, rounded))
+    assert torch.cosine_similarity(first, second, dim=0) > 0.9
+    assert not torch.equal(first, second)
+    for name in a:
+        assert float(b[name]) == pytest.approx(float(a[name]), rel=0.03)
+
+
+CHUNKED = [
+    *[(small("mvitac"), size) for size in (2, 4, 6)],
+    (replace(small("mvitac"), losses=("vv", "vt")), 4),
+    *[(small(name), 4) for name in ("cmc", "ssvtp", "simclr", "moco", "mct", "byol", "dino", "vicreg")],
+]
+
+
+@pytest.mark.parametrize(("config", "size"), CHUNKED, ids=lambda value: getattr(value, "name", value))
+def test_gradient_caching_is_exact_without_batchnorm_statistics(config: MethodConfig, size: int) -> None:
+    """With BatchNorm in eval mode no pair sees another: cached in any chunks = direct, losses, gradients and memory."""
+    run = replace(RUN, method=config)
+    direct, cached = build(run, norm=False), build(run, norm=False)
+    a = take(run, direct, [lambda: views()])
+    b = take(run, cached, split(views(), size))
+    assert_close(a, b, 1e-5)
+    assert_close(gradients(direct), gradients(cached), 1e-4)
+    remembered = [
+        {k: v for k, v in m.state_dict().items() if k.startswith(("banks", "queues", "centre"))}
+        for m in (direct, cached)
+    ]
+    assert (config.name in ("cmc", "moco", "mct", "dino")) == bool(remembered[0])
+    for name, value in remembered[0].items():
+        torch.testing.assert_close(value, remembered[1][name], rtol=1e-4, atol=1e-5)
+
+
+def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -> None:
+    """The direct graph of the same chunks, kept whole; and the running statistics move once per chunk."""
+    direct, cached, parts = build(), build(), split(views(), 4)
+    z, keys = [], []
+    for i, part in enumerate(parts):
+        torch.manual_seed(i)
+        z.append(direct.queries(part()))
+        keys.append(direct.keys(part()))
+    joined = {name: torch.cat([one[name] for one in many]) for many in (z, keys) for name in many[0]}
+    losses = direct.contrast(joined)
+    losses["loss"].backward()
+    torch.manual_seed(9)
+    found = take(RUN, cached, parts)
+    assert_close({n: v.detach() for n, v in losses.items()}, found, 1e-5)
+    assert_close(gradients(direct), gradients(cached), 1e-4)
+    counts = {name: int(b) for name, b in cached.query.named_buffers() if "num_batches" in name}
+    assert set(counts.values()) == {3}
+    for name, buffer in direct.query.named_buffers():
+        torch.testing.assert_close(buffer, dict(cached.query.named_buffers())[name])
+
+
+def test_recomputing_changes_nothing_but_memory() -> None:
+    kept, recomputed = build(), build()
+    a, b = take(RUN, kept, [views]), take(replace(RUN, recompute=True), recomputed, [views])
+    assert_close(a, b, 1e-6)
+    assert_close(gradients(kept), gradients(recomputed), 1e-5)
+
+
+def test_recomputing_saves_memory() -> None:
+    saved = []
+    for recompute in (False, True):
+        method, total = build(), 0
+
+        def count(tensor: Tensor) -> Tensor:
+            nonlocal total
+            total += tensor.nbytes
+            return tensor
+
+        step = Step(replace(RUN, recompute=recompute), method, CPU)
+        with torch.autograd.graph.saved_tensors_hooks(count, lambda t: t):
+            step([views], lr=1e-3, seed=0, progress=0.5)
+        saved.append(total)
+    assert saved[1] < saved[0]
+
+
+def test_chunks_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
+    from mvitac.datasets.pack import PackConfig
+
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, steps=4)
+    first, second = (train(run, tmp_path / name, quiet=True) / "model.safetensors" for name in "ab")
+    a, b = (safetensors.torch.load_file(path) for path in (first, second))
+    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
+    from mvitac.datasets.pack import PackConfig
+
+    with pytest.raises(ValueError, match="chunk 5: give a divisor of batch_size 16"):
+        replace(RUN, chunk=5)
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, method=SupervisedConfig())
+    with pytest.raises(ValueError, match="'supervised' takes its loss pair by pair"):
+        train(run, tmp_path / "r", quiet=True)
+
+
+def test_copies_do_not_share_weights() -> None:
+    """Guards the tests above: two builds are equal and apart."""
+    a, b = build(), build()
+    assert_close(dict(a.named_parameters()), dict(b.named_parameters()), 0)
+    before = copy.deepcopy(b.state_dict())
+    take(RUN, a, [views])
+    assert all(torch.equal(v, before[k]) for k, v in b.state_dict().items())
+
+
+def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MViTac's two towers train in two threads where there are two: the same weights, bit for bit."""
+    run = replace(RUN, method=MViTacConfig(keys="end-to-end", losses=("vt", "tv")))
+    at_once, calls = processes._at_once, []
+    monkeypatch.setattr(processes, "_at_once", lambda towers: calls.append(len(towers)) or at_once(towers))
+
+    def trained(threads: int) -> dict[str, Tensor]:
+        torch.set_num_threads(threads)
+        method = build(run).train()
+        step = Step(run, method, CPU)
+        for i in range(3):
+            step([views], lr=1e-2, seed=i, progress=0.5)
+        assert torch.get_num_threads() == threads
+        unused = [name for name, weights in method.named_parameters() if weights.grad is None]
+        assert unused and all(".intra." in name for name in unused)  # not zeros, which weight decay would act on
+        return method.state_dict()
+
+    before = torch.get_num_threads()
+    try:
+        one, two = trained(1), trained(2)
+    finally:
+        torch.set_num_threads(before)
+    assert calls == [2, 2] * 3  # forward and backward of each step, of the second training alone
+    for name, weights in one.items():
+        assert torch.equal(weights, two[name]), name
+
+
+def test_networks_with_dropout_are_not_side_by_side() -> None:
+    assert draws_random_numbers(build())
+    assert not draws_random_numbers(build(replace(RUN, method=MViTacConfig())))
