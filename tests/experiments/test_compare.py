@@ -188,7 +188,7 @@ def test_a_plan_from_a_file(tmp_path: Path) -> None:
         ("rows = [", "not valid TOML"),
         ('[[rows]]\nlabel = "a"', "unknown reference row 'MViTac'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
-        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "a"', "is there twice"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "a"', "is given twice"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "differ only in signs"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
         ('reference = "a"\nseeds = 0\n[[rows]]\nlabel = "a"', "seeds 0"),
@@ -776,7 +776,7 @@ def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys:
     ("folds", "message"),
     [
         (["split=fold1", "split=same"], "folds 'fold1' and 'same' both test object '0'"),
-        (["split=fold1", "split=fold1"], "fold 'split=fold1' is there twice"),
+        (["split=fold1", "split=fold1"], "fold 'split=fold1' is given twice"),
         (["split=my_fold", "split=my-fold"], "do not tell them apart"),
         (["split=fold1", "split=Fold1"], "do not tell them apart"),
         (["split=_"], "do not tell them apart"),

@@ -123,7 +123,6 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
     scored = [_scores(job) for job in finished]
     controls, found = _controls(work, out, session)
     runs = [load_run(job.out) for job in finished]
-    made = [record for _, record in runs]
     return {
         "plan": to_json(work.plan),
         "data": work.pack.spec.name,
@@ -139,8 +138,8 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "unfinished": [job.name for job in work.jobs if not job.done],
         "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
         "device": describe(pick_device(work.jobs[0].run.device)),
-        "run_commits": list(dict.fromkeys(record.get("commit") for record in made)),
-        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for record in made)),
+        "run_commits": list(dict.fromkeys(record.get("commit") for _, record in runs)),
+        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for _, record in runs)),
         "run_precisions": {job.name: precision_of(*run) for job, run in zip(finished, runs, strict=True)},
         **provenance(),
     }

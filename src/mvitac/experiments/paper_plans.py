@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mvitac.experiments.plan import Plan, Row
+from mvitac.experiments.plan import Plan, Printed, Row
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief
 
@@ -40,11 +41,7 @@ PRINTED = Row(label="MViTac, positives of the same image", set={**MOMENTUM, "pos
 """The paper's positives, for recipes with other ones (``Run.positives``)."""
 
 ANCESTORS = (
-    Row(label="SimCLR per modality", method="simclr"),
-    Row(label="MoCo per modality", method="moco"),
-    Row(label="BYOL per modality", method="byol"),
-    Row(label="DINO per modality", method="dino"),
-    Row(label="VICReg per modality", method="vicreg"),
+    *(Row(label=f"{name} per modality", method=name.lower()) for name in ("SimCLR", "MoCo", "BYOL", "DINO", "VICReg")),
     Row(label="MCT", method="mct"),
 )
 """Baselines that the paper's methods build on."""
@@ -54,40 +51,34 @@ def _three(category: float, soft: float, rough: float) -> dict[str, float]:
     return {"category": category, "soft": soft, "rough": rough}
 
 
+def _touch_and_both(touch: tuple[float, float, float], both: tuple[float, float, float]) -> Printed:
+    return {"touch": _three(*touch), "both": _three(*both)}
+
+
+CMC_TAU = Row(label="TAG (CMC), its own tau .07", method="cmc", set={"method.temperature": 0.07})
+TOUCH_ONLY = Row(label="supervised, touch only", method="supervised", set={"method.modalities": ["touch"]})
+VISION_ONLY = Row(label="supervised, vision only", method="supervised", set={"method.modalities": ["vision"]})
+MVITAC = Row(label="MViTac", set=MOMENTUM)
+VARIANTS = (
+    PRINTED,
+    Row(label="MViTac, end-to-end", set=END_TO_END),
+    Row(label="MViTac, end-to-end, all pairs", set=ALL_PAIRS),
+    MODERN,
+)
 TABLE1 = Plan(
     name="table1",
     title="Table I: material properties by linear probes of frozen features",
     printed_on="touch-and-go",
     printed_majority=_three(18.6, 66.1, 56.3),
     rows=(
-        Row(
-            label="supervised, touch only",
-            method="supervised",
-            set={"method.modalities": ["touch"]},
-            printed={"touch": _three(57.4, 89.1, 79.3)},
-        ),
-        Row(label="supervised, vision only", method="supervised", set={"method.modalities": ["vision"]}),
+        replace(TOUCH_ONLY, printed={"touch": _three(57.4, 89.1, 79.3)}),
+        VISION_ONLY,
         Row(label="supervised, both", method="supervised", printed={"both": _three(48.0, 85.9, 80.0)}),
-        Row(
-            label="TAG (CMC)",
-            method="cmc",
-            printed={"touch": _three(54.7, 77.3, 79.4), "both": _three(68.6, 87.1, 82.4)},
-        ),
-        Row(label="TAG (CMC), its own tau .07", method="cmc", set={"method.temperature": 0.07}),
-        Row(
-            label="SSVTP",
-            method="ssvtp",
-            printed={"touch": _three(46.1, 79.7, 75.8), "both": _three(70.7, 88.6, 83.6)},
-        ),
-        Row(
-            label="MViTac",
-            set=MOMENTUM,
-            printed={"touch": _three(57.6, 86.2, 82.1), "both": _three(74.9, 91.8, 84.1)},
-        ),
-        PRINTED,
-        Row(label="MViTac, end-to-end", set=END_TO_END),
-        Row(label="MViTac, end-to-end, all pairs", set=ALL_PAIRS),
-        MODERN,
+        Row(label="TAG (CMC)", method="cmc", printed=_touch_and_both((54.7, 77.3, 79.4), (68.6, 87.1, 82.4))),
+        CMC_TAU,
+        Row(label="SSVTP", method="ssvtp", printed=_touch_and_both((46.1, 79.7, 75.8), (70.7, 88.6, 83.6))),
+        replace(MVITAC, printed=_touch_and_both((57.6, 86.2, 82.1), (74.9, 91.8, 84.1))),
+        *VARIANTS,
         *ANCESTORS,
     ),
 )
@@ -100,16 +91,13 @@ TABLE2 = Plan(
     set={"augment.vision.grayscale": 0.0, "augment.touch.grayscale": 0.0},  # appendix B: none for grasping
     rows=(
         Row(label="TAG (CMC)", method="cmc", printed={"both": {"success": 56.3}}),
-        Row(label="TAG (CMC), its own tau .07", method="cmc", set={"method.temperature": 0.07}),
+        CMC_TAU,
         Row(label="SSVTP", method="ssvtp"),
-        Row(label="MViTac", set=MOMENTUM, printed={"both": {"success": 60.3}}),
-        PRINTED,
-        Row(label="MViTac, end-to-end", set=END_TO_END),
-        Row(label="MViTac, end-to-end, all pairs", set=ALL_PAIRS),
-        MODERN,
+        replace(MVITAC, printed={"both": {"success": 60.3}}),
+        *VARIANTS,
         Row(label="Calandra et al., supervised", method="calandra", printed={"both": {"success": 73.1}}),
-        Row(label="supervised, touch only", method="supervised", set={"method.modalities": ["touch"]}),
-        Row(label="supervised, vision only", method="supervised", set={"method.modalities": ["vision"]}),
+        TOUCH_ONLY,
+        VISION_ONLY,
         Row(label="supervised, both", method="supervised"),
         *ANCESTORS,
     ),

@@ -13,7 +13,7 @@ from html import escape
 import numpy as np
 from PIL import Image
 
-from mvitac.report.figures import COLOURS
+from mvitac.report.palette import COLOURS
 
 _STYLE = """
 :root { color-scheme: light dark; --page: #f6f7f9;

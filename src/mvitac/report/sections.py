@@ -16,7 +16,8 @@ from mvitac.evaluation.probe import MIN_GALLERY
 from mvitac.evaluation.scores import interval, summarise
 from mvitac.model import Model
 from mvitac.report import figures, html, tables
-from mvitac.report.figures import HUES, MODALITY_HUES, Line
+from mvitac.report.figures import Line
+from mvitac.report.palette import HUES, MODALITY_HUES
 from mvitac.run import Run
 from mvitac.system.files import write_atomic
 
