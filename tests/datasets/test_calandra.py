@@ -244,7 +244,7 @@ def test_gels_of_two_sizes_are_refused(tmp_path: Path) -> None:
         ({"phases": ("before", "during"), "ask": ("after",)}, "phases leaves 'after' out"),
         ({"val_share": 1.0}, "val_share"),
         ({"split_seed": -1}, "split_seed"),
-        ({"repairs": ("lemon",)}, "written=right"),
+        ({"repairs": ("lemon",)}, "wrong=right"),
     ],
 )
 def test_impossible_options_are_refused(options: dict[str, Any], message: str) -> None:
@@ -253,7 +253,7 @@ def test_impossible_options_are_refused(options: dict[str, Any], message: str) -
 
 
 def test_missing_data_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="is no folder"):
+    with pytest.raises(ValueError, match="is not a folder"):
         CalandraConfig(path=tmp_path / "nowhere").source()
     with pytest.raises(ValueError, match="OPARA"):
         CalandraConfig(path=tmp_path).source()

@@ -427,8 +427,8 @@ def test_jpegs_that_are_missing_or_cut_are_listed(tmp_path: Path) -> None:
     ("name", "text", "expected"),
     [
         ("train.txt", "nonsense", "train.txt line 1 is 'nonsense': expected <recording>/<10 digits>.jpg,<label>"),
-        ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is none of -1 to 19"),
-        ("test_rough.txt", "a/0000000001.jpg,2", "label 2 is none of -1 to 1"),
+        ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is not in -1 to 19"),
+        ("test_rough.txt", "a/0000000001.jpg,2", "label 2 is not in -1 to 1"),
         ("test.txt", "", "test.txt is empty"),
         ("test.txt", f"{NAMES[0]}/0000000020.jpg,1", "0000000020.jpg is listed twice"),
         ("test.txt", None, "has no train.txt and test.txt: they are in https://github.com"),
@@ -468,9 +468,9 @@ def test_label_txt_alone_serves_and_knows_no_official_split(tree: Path, tmp_path
 
 
 def test_nothing_there_is_told(tmp_path: Path, tree: Path) -> None:
-    with pytest.raises(ValueError, match="is no folder: give the one with the lists"):
+    with pytest.raises(ValueError, match="is not a folder: give the one with the lists"):
         TouchAndGoConfig(root=tmp_path / "nowhere").source()
-    with pytest.raises(ValueError, match=r"is no folder: give the download .* https://touch-and-go\.github\.io"):
+    with pytest.raises(ValueError, match=r"is not a folder: give the download .* https://touch-and-go\.github\.io"):
         TouchAndGoConfig(root=tmp_path / "nowhere", lists=tree).source()
     with pytest.raises(ValueError, match="8 of 8 listed recordings cannot be packed"):
         TouchAndGoConfig(root=tmp_path, lists=tree, partial=True).source()

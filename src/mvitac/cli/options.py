@@ -15,6 +15,9 @@ def parse(kind: Callable[..., T] | type[T], argv: Sequence[str], prog: str, *, d
     """tyro, with its boxed errors folded into the one line every command owes."""
     import tyro
 
+    argv = [
+        re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", word) for word in argv
+    ]  # old name
     if "-h" in argv or "--help" in argv:
         wide: Any = contextlib.nullcontext()
     else:

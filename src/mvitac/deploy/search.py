@@ -109,7 +109,7 @@ def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
     if "touch" in names and model.spec.difference and not has_difference(pack):
         raise ValueError(
             f"{pack.path} has touch as the sensor gives it, the model was trained on difference images: pack the data"
-            " with --difference"
+            " with --subtract-background"
         )
     if not names:
         raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
