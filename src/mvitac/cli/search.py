@@ -125,9 +125,7 @@ def find(argv: list[str]) -> None:
     index = Index(options.index)
     query = _picture(options.image)
     background = _picture(options.background) if options.background else None
-    rows, scores = index.find(
-        index.model(), query, options.source, options.target, options.k, background=background
-    )
+    rows, scores = index.find(index.model(), query, options.source, options.target, options.k, background=background)
     found = [
         {
             "cosine": round(float(score), 6),

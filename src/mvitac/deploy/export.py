@@ -79,11 +79,6 @@ class ExportConfig:
         if self.precision == "bf16" and (self.kind != "openvino" or self.int8):
             raise ValueError("--precision bf16 is a mode of openvino without --int8: give --format openvino")
 
-    @property
-    def tolerance(self) -> dict[str, Any]:
-        """Allowed differences, as an export's description holds them."""
-        return {"min_cosine": self.min_cosine, "accuracy_loss": self.accuracy_loss}
-
 
 def export(
     model: Model, pack: Pack, out: Path, config: ExportConfig = ExportConfig(), *, calibrate: Pack | None = None
@@ -116,7 +111,9 @@ def export(
         _check_fits(model, given, modality)
     rows = pack.rows("test", having=graph.modalities)
     if not len(rows):
-        raise ValueError(f"{pack.path} has no rows in split test: an export is checked on rows that no probe was fitted on")
+        raise ValueError(
+            f"{pack.path} has no rows in split test: an export is checked on rows that no probe was fitted on"
+        )
     rows = sample(rows, config.num_rows)
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -200,7 +197,7 @@ def _write_manifest(
         "classes": graph.classes,
         "preprocessing": preprocessing(model),
         "weights": model.weights_digest(),
-        "tolerance": config.tolerance,
+        "tolerance": {"min_cosine": config.min_cosine, "accuracy_loss": config.accuracy_loss},
         "report": report,
         "provenance": provenance(),
         "files": {name: digest_file(folder / name) for name in (CHECK, *FILES[config.kind])},
@@ -289,7 +286,7 @@ def parity(
     for name in (n for n in graph.outputs if n.startswith(("embedding_", "shared_"))):
         values = cosines(found[name], wanted[name])
         report["cosine"][name] = {"min": float(values.min()), "mean": float(values.mean())}
-        if not values.min() >= config.min_cosine:
+        if not values.min() >= (config.min_cosine or 0):
             raise ValueError(
                 f"the export is not the trained model: {name} has cosine {values.min():.4f} on real inputs, at least"
                 f" {config.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows)}"
