@@ -36,6 +36,8 @@ from mvitac.transforms.random_views import plain_view
 FORMAT = "mvitac-model"
 ImageInput = np.ndarray | Tensor | Image.Image | Sequence[Any]
 """One image or several, as ``Model.embed`` accepts them."""
+EMBED_BATCH = 256
+"""Images that ``Model.embed`` passes through an encoder at once."""
 
 
 class Model(nn.Module):
@@ -159,10 +161,13 @@ class Model(nn.Module):
             arrays = to_arrays(value, self.spec.channels(modality), modality)
             if modality == "touch" and background is not None:
                 arrays = subtracted(arrays, to_arrays(background, self.spec.channels("touch"), "background"))
-            arrays = [fit(a, self.stored) for a in arrays]
-            images = torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).to(device)
-            features = self.features(modality, images, for_heads=shared)
-            result[modality] = self.project(modality, features) if shared else features
+            chunks = []
+            for i in range(0, len(arrays), EMBED_BATCH):
+                batch = np.stack([fit(a, self.stored) for a in arrays[i : i + EMBED_BATCH]])
+                images = torch.from_numpy(batch).permute(0, 3, 1, 2).to(device)
+                features = self.features(modality, images, for_heads=shared)
+                chunks.append(self.project(modality, features) if shared else features)
+            result[modality] = torch.cat(chunks)
         return result
 
     def predict(
