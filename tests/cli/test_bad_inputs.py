@@ -1,8 +1,9 @@
 """Two hundred bad inputs: each ends in one line that says what was given and what to do, exit code 2, nothing left behind.
 
 Every case runs ``mvitac.cli.main.main`` in this process. While it runs, training, packing and probing are traps: a
-mistake that is noticed only after the work began fails its case. ``{tmp}``, ``{pack}``, ``{run}`` and ``{out}`` in a command stand for
-the test's own folder, a good pack, a good finished run (all copies where they are spoilt) and a free place for output.
+mistake that is noticed only after the work began fails its case. ``{tmp}``, ``{pack}``, ``{run}`` and ``{out}`` in a
+command stand for the test's own folder, a good pack, a good finished run (all copies where they are spoilt) and a free
+place for output.
 """
 
 from __future__ import annotations
