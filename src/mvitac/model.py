@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ from PIL import Image
 from torch import Tensor, nn
 
 from mvitac.data.images import difference, fit
+from mvitac.data.notebook import table
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Method
-from mvitac.nn.encoders import SCRATCH
+from mvitac.nn.encoders import SCRATCH, num_features
 from mvitac.nn.linear_probe import LinearProbe
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
@@ -63,6 +65,17 @@ class Model(nn.Module):
         # Not in the state dict: the weights of a run are the same with and without published probes.
         self.readouts: dict[str, LinearProbe] = {}
         self.eval()
+
+    def __repr__(self) -> str:
+        widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())
+        method, trunk = self.run.method.name, self.run.encoder.trunk
+        return f"Model({method} of {trunk}, trained on {self.spec.name}: features {widths})"
+
+    def _repr_html_(self) -> str:
+        rows = [(modality, num_features(trunk)) for modality, trunk in self.encoders.items()]
+        probes = [(task, ", ".join(classes)) for task, classes in self.classes.items()]
+        text = f"<p>{escape(repr(self))}</p>{table(rows, ('input', 'features'))}"
+        return text + (table(probes, ("probe", "classes")) if probes else "")
 
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
