@@ -34,6 +34,7 @@ from PIL import Image
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data import build as packing
+from mvitac.data import build_parts
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
@@ -95,7 +96,7 @@ def refused(
         if not work:
             for module, name in (
                 (batches_module, "make_views"),
-                (packing, "_write_part"),
+                (build_parts, "_write_part"),
                 (probe_module, "features"),
             ):
                 monkeypatch.setattr(module, name, trap(name))
