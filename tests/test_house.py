@@ -24,7 +24,9 @@ def test_figures_of_a_small_tree(tmp_path: Path) -> None:
     found = measure(tmp_path)
     assert found["modules per folder"] == {"mvitac": 3, "mvitac/nn": 2, "mvitac/training": 2}
     assert found["arrows between packages"] == 3  # training -> nn, training -> run, unused -> run
-    assert found["cycle of packages"] == found["cycle of modules"] == []  # imports in functions and for types do not count
+    assert (
+        found["cycle of packages"] == found["cycle of modules"] == []
+    )  # imports in functions and for types do not count
     assert found["files reached from mvitac.training.loop"] == 6  # all but unused.py
     assert found["functions over 40 lines"] == 1 and found["functions over 60 lines"] == []
     assert (found["words of docs"], found["lines of docs over 120"], found["lines of prose over 120"]) == (6, 2, 1)

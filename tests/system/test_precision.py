@@ -22,7 +22,7 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.engine import open_engine
-from mvitac.deploy.export import export
+from mvitac.deploy.export import ExportConfig, export
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.experiments.collect import forecast, gather, lay_out
 from mvitac.experiments.jobs import do, do_all
@@ -250,7 +250,7 @@ def test_a_bf16_export_needs_a_cpu_that_can_check_it(
     with pytest.raises(
         ValueError, match=r"--precision bf16: this CPU does not compute bf16 itself.*leave --precision out"
     ):
-        export(mvitac.load(smoke_run), pack, tmp_path / "e", kind="openvino", precision="bf16")
+        export(mvitac.load(smoke_run), pack, tmp_path / "e", ExportConfig(kind="openvino", precision="bf16"))
     assert not (tmp_path / "e").exists()
 
 
