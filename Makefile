@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench difficulty docs pins clean
+.PHONY: demo test check bench difficulty docs notebooks pictures pins clean
 
 # torch brings CUDA, 5 of the 7 GB. A torch that .venv can import is kept: one that was installed there first (the CPU's),
 # or the system's, with make VENV_ARGS=--system-site-packages. One that make installed itself follows constraints.txt.
@@ -40,8 +40,14 @@ bench: .venv/ready  ## speed against the bare networks and the typical research 
 difficulty: .venv/ready  ## the simulator's difficulty rule, measured anew (long)
 	$(BIN)/python -m benchmarks.difficulty materials
 
-docs: .venv/ready  ## draw the pictures of the docs again
+docs: .venv/ready  ## the documentation site, into site/ (open site/index.html); any warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+notebooks: .venv/ready  ## write the tutorials' notebooks anew from their pages
+	$(BIN)/jupytext --quiet --update --to ipynb docs/tutorials/[!i]*.md
+
+pictures: .venv/ready  ## draw the docs' picture of the simulator again
 	$(BIN)/mvitac data sheet materials --out docs/materials.png
 
 clean:
-	rm -rf .venv build dist .pytest_cache .ruff_cache
+	rm -rf .venv build dist site .pytest_cache .ruff_cache

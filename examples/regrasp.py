@@ -30,7 +30,7 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.policy import ObservationEncoder
 from mvitac.evaluation.classifiers import fit_linear
-from mvitac.evaluation.probe import ProbeSplit, parts
+from mvitac.evaluation.probe import ProbeSplit, split_rows
 from mvitac.evaluation.scores import interval, paired_difference
 from mvitac.model import Model, fresh
 from mvitac.nn.encoders import SCRATCH
@@ -93,7 +93,7 @@ def predict(x: np.ndarray, y: np.ndarray, rows: ProbeSplit) -> np.ndarray:
 
 
 def play(p: np.ndarray, y: np.ndarray, objects: np.ndarray, hands: np.ndarray, threshold: float) -> dict[str, Any]:
-    """Episodes and lifts that held, by object, and grasps tried on average: a record of ``mvitac.evaluation.scores.interval``."""
+    """Episodes and held lifts by object, and the mean number of grasps: a record for ``evaluation.scores.interval``."""
     lifted, tried = decide(p[hands], threshold)
     thing, held = objects[hands[:, 0]], y[hands[np.arange(len(hands)), lifted]]
     num = int(objects.max()) + 1
@@ -111,7 +111,7 @@ def experiment(model: Model, pack: Pack, seeds: int, candidates: int) -> dict[st
         raise ValueError(f"{pack.path} holds no grasps with a camera and two gels: train a run with --data grasps")
     if seeds < 1 or candidates < 1:
         raise ValueError(f"seeds {seeds}, candidates {candidates}: give at least 1 of each")
-    rows = parts(pack, task, "both")
+    rows = split_rows(pack, task, "both")
     every = np.concatenate([rows.train, rows.val, rows.test])
     labels = pack.labels("success")
     if len(set(labels[rows.train])) < 2:

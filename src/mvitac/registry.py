@@ -1,6 +1,6 @@
-"""Kinds of things (methods, datasets) that register by being defined, and their configs as plain JSON.
+"""Registry of methods and datasets, and conversion of their configs to and from JSON.
 
-A *kind* is a direct subclass of ``Registered``; every later subclass with a ``name`` is one choice of that kind:
+A *kind* is a direct subclass of ``Registered``. Each further subclass that has a ``name`` is one choice of that kind:
 
     class MethodConfig(Registered): ...
     class MViTacConfig(MethodConfig): name = "mvitac"
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class Registered:
-    """Base of every kind; ``choices`` maps the names defined so far to their classes, one dict per kind."""
+    """Base class of every kind. ``choices`` maps each registered name of the kind to its class."""
 
     name: ClassVar[str]
     choices: ClassVar[dict[str, type]]
@@ -33,13 +33,13 @@ class Registered:
             cls.choices = {}
         elif "name" in cls.__dict__:
             known = cls.choices.get(cls.name)
-            # A dataclass with slots is defined twice under one qualified name; anything else is a clash.
+            # dataclass(slots=True) defines the class twice under one qualified name; any other duplicate is an error.
             assert known is None or known.__qualname__ == cls.__qualname__, f"two classes are named {cls.name!r}"
             cls.choices[cls.name] = cls
 
 
 def unknown(what: str, given: str, allowed: typing.Iterable[str]) -> ValueError:
-    """A ValueError that says what was given, what is allowed, and the likeliest intention."""
+    """Return a ValueError that names the given value, the allowed ones and the closest match."""
     allowed = list(allowed)
     near = difflib.get_close_matches(given, allowed, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -47,7 +47,7 @@ def unknown(what: str, given: str, allowed: typing.Iterable[str]) -> ValueError:
 
 
 def find(kind: type[T], name: str) -> type[T]:
-    """The class registered under ``name``; ValueError names the choices."""
+    """Return the class registered under ``name``; the ValueError for an unknown name lists the choices."""
     choices = kind.choices  # type: ignore[attr-defined]
     if name not in choices:
         raise unknown(kind.__name__.removesuffix("Config").lower(), name, choices)
@@ -55,36 +55,56 @@ def find(kind: type[T], name: str) -> type[T]:
 
 
 def default(kind: type[T], name: str) -> T:
-    """The class registered under ``name`` with all its defaults."""
+    """Return an instance of the class registered under ``name``, with default values."""
     return find(kind, name)()
 
 
 def import_all(package: str, path: typing.Iterable[str]) -> None:
-    """Import every module of ``package``, so that what they define is registered: a new choice is one new file."""
+    """Import every module of ``package`` to register its classes, so that adding a choice needs one new file only."""
     for module in pkgutil.iter_modules(path):
         importlib.import_module(f"{package}.{module.name}")
 
 
 LATER = {"later": True}
-"""Metadata of a field that joined a format later: it is written only where it is not at its default, so that whatever does
-without it keeps its bytes and digests."""
+"""Metadata for a field added to an existing format. The field is written only if it is not at its default, so that older
+files and digests stay valid."""
 
 
-def to_json(config: Any) -> Any:
-    """A (nested) config dataclass as JSON-ready values; a registered one carries its ``name``."""
+LATER_IN_DIGEST = {"later in digest": True}
+"""Metadata of a field that is always written, but is omitted from digests at its default, so that old digests stay valid."""
+
+
+def to_json(config: Any, *, for_digest: bool = False) -> Any:
+    """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``.
+
+    Args:
+        config: A config, or a container of configs and plain values.
+        for_digest: Leave out the fields of ``LATER_IN_DIGEST`` that have their default.
+    """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        said = [f for f in dataclasses.fields(config) if f.metadata != LATER or getattr(config, f.name) != f.default]
-        fields = {f.name: to_json(getattr(config, f.name)) for f in said}
+        omitted = (LATER, LATER_IN_DIGEST) if for_digest else (LATER,)
+        all_fields = dataclasses.fields(config)
+        written = [f for f in all_fields if f.metadata not in omitted or getattr(config, f.name) != f.default]
+        fields = {f.name: to_json(getattr(config, f.name), for_digest=for_digest) for f in written}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
-        return {str(key): to_json(value) for key, value in config.items()}
+        return {str(key): to_json(value, for_digest=for_digest) for key, value in config.items()}
     if isinstance(config, (list, tuple)):
-        return [to_json(value) for value in config]
+        return [to_json(value, for_digest=for_digest) for value in config]
     return str(config) if isinstance(config, Path) else config
 
 
 def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
-    """Rebuild what ``to_json`` wrote, by the field annotations; ValueError names the field that does not fit."""
+    """Rebuild a value written by ``to_json``.
+
+    Args:
+        annotation: Type to build: a dataclass, a container of supported types, or a plain type.
+        value: Parsed JSON.
+        where: Name of the field, for error messages.
+
+    Raises:
+        ValueError: If a value does not have the annotated type; the message names the field.
+    """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (types.UnionType, typing.Union):
         if value is None and type(None) in arguments:
@@ -96,35 +116,48 @@ def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
             raise unknown(f"value of {where}", str(value), [str(a) for a in arguments])
         return value
     if origin is tuple:
-        if not isinstance(value, list):
-            raise ValueError(f"{where}: expected a list, got {value!r}")
-        each = [arguments[0]] * len(value) if len(arguments) == 2 and arguments[1] is Ellipsis else arguments
-        if len(each) != len(value):
-            raise ValueError(f"{where}: expected {len(each)} values, got {value!r}")
-        return tuple(from_json(a, v, where) for a, v in zip(each, value, strict=True))
+        return _tuple_from_json(arguments, value, where)
     if origin is dict:
-        if not isinstance(value, dict):
-            raise ValueError(f"{where}: expected an object, got {value!r}")
-        return {key: from_json(arguments[1], v, f"{where}.{key}") for key, v in value.items()}
+        return {key: from_json(arguments[1], v, f"{where}.{key}") for key, v in _object(value, where).items()}
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-        if not isinstance(value, dict):
-            raise ValueError(f"{where}: expected an object, got {value!r}")
-        given, cls = dict(value), annotation
-        if issubclass(annotation, Registered):
-            name = given.pop("name", "")
-            if not isinstance(name, str):
-                raise ValueError(f"{where}.name: expected one of {', '.join(annotation.choices)}, got {name!r}")
-            cls = find(annotation, name)
-        hints = typing.get_type_hints(cls)
-        known = {f.name for f in dataclasses.fields(cls)}
-        for key in given:
-            if key not in known:
-                raise unknown(f"field in {where}", key, sorted(known))
-        for field in dataclasses.fields(cls):
-            required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-            if required and field.name not in given:
-                raise ValueError(f"{where}: field {field.name!r} is missing")
-        return cls(**{key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()})
+        return _dataclass_from_json(annotation, _object(value, where), where)
+    return _scalar_from_json(annotation, value, where)
+
+
+def _object(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{where}: expected an object, got {value!r}")
+    return dict(value)
+
+
+def _tuple_from_json(types_: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise ValueError(f"{where}: expected a list, got {value!r}")
+    each = [types_[0]] * len(value) if len(types_) == 2 and types_[1] is Ellipsis else types_
+    if len(each) != len(value):
+        raise ValueError(f"{where}: expected {len(each)} values, got {value!r}")
+    return tuple(from_json(a, v, where) for a, v in zip(each, value, strict=True))
+
+
+def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
+    if issubclass(cls, Registered):
+        name = given.pop("name", "")
+        if not isinstance(name, str):
+            raise ValueError(f"{where}.name: expected one of {', '.join(cls.choices)}, got {name!r}")
+        cls = find(cls, name)
+    fields, hints = dataclasses.fields(cls), typing.get_type_hints(cls)  # type: ignore[arg-type]
+    names = sorted(field.name for field in fields)
+    for key in given:
+        if key not in names:
+            raise unknown(f"field in {where}", key, names)
+    for field in fields:
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and field.name not in given:
+            raise ValueError(f"{where}: field {field.name!r} is missing")
+    return cls(**{key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()})
+
+
+def _scalar_from_json(annotation: Any, value: Any, where: str) -> Any:
     if annotation is Path:
         if not isinstance(value, str) or "\0" in value:
             raise ValueError(f"{where}: expected a path (text without NUL characters), got {value!r}")
@@ -134,6 +167,6 @@ def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
             raise ValueError(f"{where}: {str(value)[:20]}... is too large for a number")
         return float(value)
     wrong = isinstance(annotation, type) and annotation is not Any and not isinstance(value, annotation)
-    if wrong or (isinstance(value, bool) and annotation in (int, float)):  # a bool is an int to Python only
+    if wrong or (isinstance(value, bool) and annotation in (int, float)):  # in Python, bool is a subclass of int
         raise ValueError(f"{where}: expected {annotation.__name__}, got {value!r}")
     return value

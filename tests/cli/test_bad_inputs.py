@@ -1,7 +1,7 @@
 """Two hundred bad inputs: each ends in one line that says what was given and what to do, exit code 2, nothing left behind.
 
-Every case runs ``mvitac.cli.main.main`` in this process. While it runs, training, packing and probing are traps: a mistake that
-is noticed only after the work began fails its case. ``{tmp}``, ``{pack}``, ``{run}`` and ``{out}`` in a command stand for
+Every case runs ``mvitac.cli.main.main`` in this process. While it runs, training, packing and probing are traps: a
+mistake that is noticed only after the work began fails its case. ``{tmp}``, ``{pack}``, ``{run}`` and ``{out}`` in a command stand for
 the test's own folder, a good pack, a good finished run (all copies where they are spoilt) and a free place for output.
 """
 
@@ -156,8 +156,9 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("method", PRETRAIN + "--method mvitca", ["'mvitca'", "did you mean 'mvitac'"]),
     ("dataset", "pretrain --data graps --out {out}", ["'graps'", "did you mean 'grasps'"]),
     ("recipe", "pretrain --recipe pape --out {out}", ["'pape'", "did you mean 'paper'"]),
-    ("sink", PRETRAIN + "--sink tensorbord", ["'tensorbord'", "did you mean 'tensorboard'"]),
-    ("sink-not-installed", PRETRAIN + "--sink trackio", ["pip install", "mvitac[trackio]"]),
+    ("logger", PRETRAIN + "--logger tensorbord", ["'tensorbord'", "did you mean 'tensorboard'"]),
+    ("logger-by-its-old-name", PRETRAIN + "--sink tensorbord", ["'tensorbord'", "did you mean 'tensorboard'"]),
+    ("logger-not-installed", PRETRAIN + "--logger trackio", ["pip install", "mvitac[trackio]"]),
     ("trunk", PRETRAIN + "--encoder.trunk resnet81", ["'resnet81'", "did you mean", "resnet18"]),
     ("trunk-empty", PRETRAIN + "--encoder.trunk=", ["trunk ''", "timm"]),
     ("trunk-tag", PRETRAIN + "--encoder.trunk resnet18.nobody_in1k", ["resnet18.nobody_in1k", "tag"]),

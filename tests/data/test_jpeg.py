@@ -260,7 +260,7 @@ def test_impossible_requests(tmp_path: Path, capsys: pytest.CaptureFixture[str],
     words = ["data", "simulate", "materials", "--num", "20", "--out", str(tmp_path / "p")]
     assert main([*words, "--store", "jpeg", "--quality", str(quality)]) == 2
     error = capsys.readouterr().err
-    assert f"quality {quality} is not possible: give JPEG's 1 to 100" in error and error.count("\n") == 1
+    assert f"quality {quality} is not possible: give a JPEG quality from 1 to 100" in error and error.count("\n") == 1
     assert main([*words, "--store", "png"]) == 2
     assert "--store" in (error := capsys.readouterr().err) and "png" in error and error.count("\n") == 1
     with pytest.raises(ValueError, match="unknown store 'png'"):
@@ -439,7 +439,7 @@ def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch
     for pack, name in ((small, "prefetch"), (decoded, "MainThread")):
         makers.clear()
         run, rows = run_on(pack), pack.rows("train")
-        for parts in views.feed_parts(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
+        for parts in views.load_chunks(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
             assert len(parts[0]().rows) == run.batch_size
         assert makers == [name] * 3
 

@@ -20,7 +20,7 @@ import torch
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.sharding import deal_rows, write_shards
+from mvitac.data.sharding import assign_rows, write_shards
 from mvitac.data.streaming import Cache, StreamedPack
 from mvitac.datasets.pack import StreamConfig
 from mvitac.evaluation.features import pack_features
@@ -100,8 +100,8 @@ def test_training_reads_shards_of_its_own_and_a_touch_lies_in_one(shards: Path, 
 
 def test_what_is_larger_than_a_shard_is_cut(pack: Pack) -> None:
     row = 2 * 32 * 32 * 3
-    assert [len(rows) for rows in deal_rows(pack, row - 1, 0)] == [1] * 120
-    parts = deal_rows(pack, 7 * row, 0)
+    assert [len(rows) for rows in assign_rows(pack, row - 1, 0)] == [1] * 120
+    parts = assign_rows(pack, 7 * row, 0)
     assert sorted(np.concatenate(parts)) == [*range(120)] and max(map(len, parts)) == 6  # touches of two stay whole
 
 

@@ -109,7 +109,7 @@ def test_a_trim_without_encoding_anew_counts_what_is_shown(
 
 def test_pieces_put_together_without_encoding_anew_are_refused(made: dict[str, Path], tmp_path: Path) -> None:
     path = edited(made["mpeg4"], tmp_path / "v.mp4", (31, 20), (5, 10))
-    with pytest.raises(ValueError, match=r"v\.mp4 is put together from pieces by an edit list: encode it anew"):
+    with pytest.raises(ValueError, match=r"v\.mp4 is put together from pieces by an edit list: encode it again"):
         num_frames(path)
 
 

@@ -309,7 +309,7 @@ def test_tars_that_cannot_be_read(tmp_path: Path) -> None:
     with tarfile.open(tmp_path / "bare.tar", "w") as tar:
         add(tar, "a.json", b"{}")
     for path, says in (
-        (root, r"shard-0\.tar cannot be read as a tar that is not compressed"),
+        (root, r"shard-0\.tar cannot be read as an uncompressed tar"),
         (tmp_path / "empty", r"is no \.tar and holds none"),
         (tmp_path / "bare.tar", "holds no images"),
     ):

@@ -452,7 +452,7 @@ def test_another_way_to_write_a_path_hides_no_leak(tmp_path: Path, rows: Table) 
     other = next(row for row in rows if row["side"] == "test")
     first = next(row for row in rows if row["side"] == "train")
     other["left"] = f"./left/../{first['left']}"
-    with pytest.raises(ValueError, match="leaks: 1 of 23 left images are on two sides"):
+    with pytest.raises(ValueError, match="leaks: 1 of 23 left images are in more than one split"):
         config(write(rows, tmp_path / "m.csv"), split="side").source()
 
 
@@ -524,17 +524,17 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "leak of a group": (
         one(1, side="test"),
         {"split": "side"},
-        r"1 of 8 groups \(object\) are on two sides, e\.g\. '000' in test and train",
+        r"1 of 8 groups \(object\) are in more than one split, e\.g\. '000' in test and train",
     ),
     "leak of a touch": (each(seq=0), {"touch_group": "seq"}, r"1 of 1 touch groups \(seq\).*give the group"),
-    "leak of an image": (each(vision="vision/00.png"), {}, r"1 of 1 vision images are on two sides"),
+    "leak of an image": (each(vision="vision/00.png"), {}, r"1 of 1 vision images are in more than one split"),
     "nothing to train on": (each(side="test"), {"split": "side"}, r"'side' gives no rows of train"),
     "nothing to test": (
         each(side="train"),
         {"split": "side"},
         r"'side' gives label 'material' no labelled rows in test",
     ),
-    "one group": (each(object="a"), {}, r"dealing 1 groups gives label 'material' no labelled rows in test"),
+    "one group": (each(object="a"), {}, r"assigning 1 groups gives label 'material' no labelled rows in test"),
     "filter leaves nothing": (None, {"only": ("seq>=9",)}, r"none of 24 rows meets seq>=9"),
     "control with gaps": (
         one(4, width=""),
@@ -542,7 +542,7 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
         r"'width' is empty in 1 labelled rows, first row 4",
     ),
     "control of names": (many_names, {"controls": ("w=side",)}, r"'side' has 72 values that are not numbers"),
-    "id twice": (each(id="a"), {}, r"id 'a' stands in several rows"),
+    "id twice": (each(id="a"), {}, r"id 'a' occurs in several rows"),
 }
 
 
@@ -570,7 +570,7 @@ BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "seed": ({"split_seed": -1}, "split_seed -1"),
     "control without column": ({"controls": ("width",)}, "'width': write it as name=column"),
     "control without name": ({"controls": ("=width",)}, "write it as name=column"),
-    "control named like ours": ({"controls": ("border=width",)}, "'border' is made anyway"),
+    "control named like ours": ({"controls": ("border=width",)}, "'border' is always computed"),
     "control twice": ({"controls": ("a=b", "a=c")}, "a name of its own"),
     "condition": ({"only": ("seq",)}, "condition 'seq': write column=value"),
     "condition <": ({"only": ("seq<4",)}, "condition 'seq<4'"),
@@ -635,7 +635,7 @@ def test_bad_folders_are_named(tmp_path: Path, rows: Table) -> None:
     for name in ("train/vision/a/1", "train/touch/a/1", "test/touch/a/2"):
         picture(tmp_path / f"half/{name}.png")
     refused(tmp_path / "half", r"vision images in some splits only \(row")
-    for side, says in (("validation", "write 'val' instead"), ("other", "take it away")):
+    for side, says in (("validation", "write 'val' instead"), ("other", "remove it")):
         for name in ("train/a/1", "test/b/2", f"{side}/a/3"):
             picture(tmp_path / f"{side} beside/{name}.png")
         refused(tmp_path / f"{side} beside", rf"images in folder '{side}' beside train and test: {says}")

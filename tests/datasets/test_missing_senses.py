@@ -20,7 +20,7 @@ from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.publish import fit_readouts
 from mvitac.evaluation import probe as probe_module
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.probe import parts
+from mvitac.evaluation.probe import split_rows
 from mvitac.model import Model, load
 from mvitac.recipes import recipe
 from mvitac.report.explorer_data import ExplorerData
@@ -105,7 +105,7 @@ def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch:
         assert rows and holes.has(modality)[sorted(rows)].all()
     task = holes.spec.tasks[0]
     num = {r["modality"]: r["num_test"] for r in result["records"] if r["source"] == "mvitac"}
-    assert num == {m: len(parts(holes, task, m).test) for m in ("vision", "touch", "both")}
+    assert num == {m: len(split_rows(holes, task, m).test) for m in ("vision", "touch", "both")}
     assert num["both"] < min(num["vision"], num["touch"])
 
 
@@ -119,7 +119,7 @@ def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> Non
     found = fit_readouts(model, holes)
     for task in holes.spec.tasks:
         for modality in ("vision", "touch", "both"):
-            assert found[f"{task.name}.{modality}"].question.num_test == len(parts(holes, task, modality).test)
+            assert found[f"{task.name}.{modality}"].question.num_test == len(split_rows(holes, task, modality).test)
 
 
 def test_an_export_is_checked_and_calibrated_on_what_is_there(holes: Pack, model: Model, tmp_path: Path) -> None:

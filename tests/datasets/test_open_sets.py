@@ -312,7 +312,7 @@ def test_physiclear_newer_layout_and_missing_labels(clones: Path, tmp_path: Path
     assert PhysiclearConfig(path=tmp_path / "new").source().items()
     file = tmp_path / "new/src/utils/constants.py"
     file.write_text(file.read_text().replace("TEXTURE_RANK", "OTHER"))
-    with pytest.raises(ValueError, match="says nothing of TEXTURE_RANK"):
+    with pytest.raises(ValueError, match="does not define TEXTURE_RANK"):
         PhysiclearConfig(path=tmp_path / "new").source()
     file.unlink()
     with pytest.raises(ValueError, match=r"has no utils/constants\.py"):

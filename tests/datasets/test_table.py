@@ -145,11 +145,11 @@ def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path
         for i in range(12)
     ]
     config = FolderConfig(path=table(films / "cut.csv", rows), size=16)
-    with pytest.raises(ValueError, match=r"4 of 4 groups \(video\) are on two sides, e\.g\. '0/gel\.avi'"):
+    with pytest.raises(ValueError, match=r"4 of 4 groups \(video\) are in more than one split, e\.g\. '0/gel\.avi'"):
         config.source()
     findings, _ = examine_source(replace(config, allow_leak=True).source(), size=16, quiet=True)
     (found,) = [finding for finding in findings if finding.item == "groups across splits"]
-    assert found.verdict == "broken" and "group (video): 4 of 4 on two sides" in found.evidence
+    assert found.verdict == "broken" and "group (video): 4 of 4 in more than one split" in found.evidence
     findings, _ = examine_source(replace(config, split="by-group").source(), size=16, quiet=True)
     assert [finding.verdict for finding in findings if finding.item == "groups across splits"] == ["ok"]
 
@@ -343,8 +343,8 @@ def test_a_sensor_column_of_another_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"background": ("background",)}, "only used for difference images"),
-        ({"difference": True, "background": ("a",), "no_contact": ("phase=empty",)}, "the one or the other"),
+        ({"background": ("background",)}, "only used with subtract-background"),
+        ({"difference": True, "background": ("a",), "no_contact": ("phase=empty",)}, "give only one of them"),
         ({"difference": True, "background": ("a", "b")}, "need as many background columns"),
         ({"difference": True, "background": ("nowhere",)}, "unknown column 'nowhere'"),
         (

@@ -32,7 +32,7 @@ from mvitac.datasets.touch_and_go.lists import (
 )
 from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig
 from mvitac.datasets.touch_and_go.recordings import Recording
-from mvitac.evaluation.probe import parts
+from mvitac.evaluation.probe import split_rows
 from support.videos import numbered, read_number, write_video
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -242,10 +242,10 @@ def test_three_tasks_share_the_rows(official: Pack) -> None:
 def test_the_official_split_is_the_lists(official: Pack) -> None:
     category, rough = official.spec.tasks[0], official.spec.tasks[2]
     frame, place = official.column("frame"), np.array([NAMES.index(name) for name in official.column("group")])
-    found = parts(official, category)
+    found = split_rows(official, category)
     assert set(frame[found.test]) == {*range(70, 78)}
     assert {*found.train, *found.val} == {*np.flatnonzero(((frame < 70) | (frame >= 130)) & (place < 7))}
-    found = parts(official, rough)
+    found = split_rows(official, rough)
     assert set(place[found.test]) == {2, 3} and set(place[[*found.train, *found.val]]) == {0, 1, 7}
     # Pre-training sees the owners' list and nothing else.
     seen = official.rows("train", "unlabelled")
@@ -427,8 +427,8 @@ def test_jpegs_that_are_missing_or_cut_are_listed(tmp_path: Path) -> None:
     ("name", "text", "expected"),
     [
         ("train.txt", "nonsense", "train.txt line 1 is 'nonsense': expected <recording>/<10 digits>.jpg,<label>"),
-        ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is none of -1 to 19"),
-        ("test_rough.txt", "a/0000000001.jpg,2", "label 2 is none of -1 to 1"),
+        ("train.txt", "a/0000000001.jpg,20", "train.txt line 1: label 20 is not in -1 to 19"),
+        ("test_rough.txt", "a/0000000001.jpg,2", "label 2 is not in -1 to 1"),
         ("test.txt", "", "test.txt is empty"),
         ("test.txt", f"{NAMES[0]}/0000000020.jpg,1", "0000000020.jpg is listed twice"),
         ("test.txt", None, "has no train.txt and test.txt: they are in https://github.com"),
@@ -463,14 +463,14 @@ def test_label_txt_alone_serves_and_knows_no_official_split(tree: Path, tmp_path
     (tmp_path / "label.txt").write_text("".join(f"{n}/{i:010d}.jpg,{i % 3 - 1}\n" for n in NAMES for i in range(9)))
     spec = TouchAndGoConfig(root=tree, lists=tmp_path).source().spec()
     assert [task.name for task in spec.tasks] == ["category", "soft"]
-    with pytest.raises(ValueError, match="which the official split is"):
+    with pytest.raises(ValueError, match="which the official split needs"):
         TouchAndGoConfig(root=tree, lists=tmp_path, split="official").source()
 
 
 def test_nothing_there_is_told(tmp_path: Path, tree: Path) -> None:
-    with pytest.raises(ValueError, match="is no folder: give the one with the lists"):
+    with pytest.raises(ValueError, match="is not a folder: give the one with the lists"):
         TouchAndGoConfig(root=tmp_path / "nowhere").source()
-    with pytest.raises(ValueError, match=r"is no folder: give the download .* https://touch-and-go\.github\.io"):
+    with pytest.raises(ValueError, match=r"is not a folder: give the download .* https://touch-and-go\.github\.io"):
         TouchAndGoConfig(root=tmp_path / "nowhere", lists=tree).source()
     with pytest.raises(ValueError, match="8 of 8 listed recordings cannot be packed"):
         TouchAndGoConfig(root=tmp_path, lists=tree, partial=True).source()

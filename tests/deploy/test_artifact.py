@@ -27,7 +27,7 @@ from mvitac.deploy.publish import card, fit_readouts, push
 from mvitac.deploy.search import check_pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import pack_features
-from mvitac.evaluation.probe import parts
+from mvitac.evaluation.probe import split_rows
 from mvitac.model import subtracted
 from mvitac.system.files import digest_file
 
@@ -70,7 +70,7 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
     model = mvitac.load(artifact)
     summary = probe_runs([smoke_run], ProbeConfig(controls=False))["summary"]
     for task in pack.spec.tasks:
-        rows = parts(pack, task).test
+        rows = split_rows(pack, task).test
         labels = pack.column(f"label_{task.name}")[rows]
         for modality, names in (("touch", ["touch"]), ("vision", ["vision"]), ("both", ["vision", "touch"])):
             found = model.predict(**{m: pack.images[m][rows] for m in names})[task.name]
@@ -86,7 +86,7 @@ def test_a_probe_gives_scikit_learns_probabilities(smoke_run: Path, pack: Pack) 
 
     model = mvitac.load(smoke_run)
     for task in pack.spec.tasks:  # one of three classes, one of two
-        rows = parts(pack, task)
+        rows = split_rows(pack, task)
         labels = pack.column(f"label_{task.name}").astype(int)
         x = {r: pack_features(model, pack, "touch", getattr(rows, r)).numpy() for r in ("train", "val", "test")}
         fitted, _ = fit_linear(x["train"], labels[rows.train], x["val"], labels[rows.val])

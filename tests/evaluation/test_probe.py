@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from rich.console import Console
 from sklearn.linear_model import LogisticRegression
 
 from mvitac.data.build import build
@@ -19,15 +22,15 @@ from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import features as features_module
-from mvitac.evaluation.classifiers import fit_paper, train_heads
+from mvitac.evaluation.classifiers import fit_papers, train_heads
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, _places, probe_runs
-from mvitac.evaluation.probe import cross_modal, parts, probe_all, probe_features, probe_model
+from mvitac.evaluation.probe import cross_modal, probe_all, probe_features, probe_model, split_rows
 from mvitac.evaluation.scores import interval, summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh, load
 from mvitac.recipes import recipe
 from mvitac.report.report import _as_scored, open_runs
-from mvitac.report.tables import markdown
+from mvitac.report.tables import print_retrieval, print_summary
 from mvitac.run import Optim
 from mvitac.training.loop import train
 from support.toy import Toy, toy_pack
@@ -48,7 +51,7 @@ def result(runs: list[Path]) -> dict:
 def features_that_know(pack: Pack, task_index: int, how_well: float = 3.0) -> np.ndarray:
     """Features of the task's (train, val, test) rows in which the label is a direction plus noise."""
     task = pack.spec.tasks[task_index]
-    rows = parts(pack, task)
+    rows = split_rows(pack, task)
     everything = np.concatenate([rows.train, rows.val, rows.test])
     labels = pack.column(f"label_{task.name}")[everything]
     rng = np.random.default_rng(0)
@@ -59,7 +62,7 @@ def features_that_know(pack: Pack, task_index: int, how_well: float = 3.0) -> np
 @pytest.mark.parametrize("task_index", [0, 1])
 def test_finds_what_is_there(pack: Pack, kind: str, task_index: int) -> None:
     task = pack.spec.tasks[task_index]
-    found = probe_features(features_that_know(pack, task_index), pack, task, parts(pack, task), kind, 0)
+    found = probe_features(features_that_know(pack, task_index), pack, task, split_rows(pack, task), kind, 0)
     assert found["accuracy"] == 1.0
     assert found["balanced_accuracy"] == 1.0
     assert found["macro_f1"] == 1.0
@@ -70,7 +73,7 @@ def test_finds_what_is_there(pack: Pack, kind: str, task_index: int) -> None:
 def test_finds_nothing_in_noise(pack: Pack) -> None:
     task = pack.spec.tasks[0]
     noise = np.random.default_rng(1).normal(size=features_that_know(pack, 0).shape).astype(np.float32)
-    found = probe_features(noise, pack, task, parts(pack, task), "linear", 0)
+    found = probe_features(noise, pack, task, split_rows(pack, task), "linear", 0)
     assert found["accuracy"] < 0.65
 
 
@@ -79,15 +82,15 @@ def test_the_papers_probe_learns_and_repeats() -> None:
     rng = np.random.default_rng(0)
     y = rng.integers(0, 3, 2048)
     x = (10 * np.repeat(np.eye(3)[y], 100, axis=1) + rng.normal(0, 5, (2048, 300))).astype(np.float32)
-    predict = fit_paper(x, y, 3, seed=0)
+    predict = fit_papers(x, [y], [3], seed=0)[0]
     assert (predict(x).argmax(1) == y).mean() > 0.9
-    assert np.array_equal(predict(x), fit_paper(x, y, 3, seed=0)(x))
-    assert not np.array_equal(predict(x), fit_paper(x, y, 3, seed=1)(x))
+    assert np.array_equal(predict(x), fit_papers(x, [y], [3], seed=0)[0](x))
+    assert not np.array_equal(predict(x), fit_papers(x, [y], [3], seed=1)[0](x))
 
 
 def test_linear_equals_scikit_learn(pack: Pack) -> None:
     task = pack.spec.tasks[0]
-    rows, x = parts(pack, task), features_that_know(pack, 0, how_well=0.4)
+    rows, x = split_rows(pack, task), features_that_know(pack, 0, how_well=0.4)
     found = probe_features(x, pack, task, rows, "linear", 0)
     labels = pack.column("label_pattern")
     num_train, num_both = len(rows.train), len(rows.train) + len(rows.val)
@@ -101,7 +104,7 @@ def test_linear_equals_scikit_learn(pack: Pack) -> None:
 def test_nothing_is_chosen_on_test(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shuffling the test labels changes the score but not the regularisation nor the predictions."""
     task = pack.spec.tasks[0]
-    rows, x = parts(pack, task), features_that_know(pack, 0, how_well=0.6)
+    rows, x = split_rows(pack, task), features_that_know(pack, 0, how_well=0.6)
     before = probe_features(x, pack, task, rows, "linear", 0)
     real = Pack.column
 
@@ -126,7 +129,7 @@ def test_val_is_carved_from_train_by_group_if_there_is_none(tmp_path: Path, monk
         return np.where(values == "val", "train", values) if name == "split" else values
 
     monkeypatch.setattr(Pack, "column", without_val)
-    rows = parts(pack, pack.spec.tasks[0])
+    rows = split_rows(pack, pack.spec.tasks[0])
     groups = pack.column("group")
     assert len(rows.val) and not set(groups[rows.val]) & set(groups[rows.train])
     assert not set(groups[rows.val]) & set(groups[rows.test])
@@ -139,12 +142,15 @@ def test_every_score_has_its_controls(result: dict) -> None:
         assert set(result["summary"][task]["none"]) == {"majority", "noise only"}
         assert "border" in result["summary"][task]["touch"]
         assert result["summary"][task]["touch"]["mvitac"]["seeds"] == [0, 1]
-    text = markdown(result)
-    assert "| majority |" in text and "| mvitac | touch -> vision |" in text
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_summary(result, console)
+    print_retrieval(result, console)
+    text = console.export_text()
+    assert "majority" in text and re.search(r"mvitac +│ touch -> vision", text)
 
 
 def test_majority_is_the_share_of_trains_commonest_class(pack: Pack, result: dict) -> None:
-    rows = parts(pack, pack.spec.tasks[1])
+    rows = split_rows(pack, pack.spec.tasks[1])
     labels = pack.column("label_bright")
     common = np.bincount(labels[np.concatenate([rows.train, rows.val])]).argmax()
     expected = float((labels[rows.test] == common).mean())
@@ -339,12 +345,12 @@ def test_tasks_of_one_run_are_probed_together(pack: Pack) -> None:
     """The records are those of each task probed on its own."""
     x = features_that_know(pack, 0)
     tasks = list(pack.spec.tasks)
-    order = np.concatenate([*dataclasses.astuple(parts(pack, tasks[0]))])
+    order = np.concatenate([*dataclasses.astuple(split_rows(pack, tasks[0]))])
 
     def matrix(modality: str, rows: np.ndarray) -> np.ndarray:
         return x[[int(np.flatnonzero(order == row)[0]) for row in rows]]
 
     records = probe_all(matrix, pack, tasks, ["touch"], ["paper"], 3)
     for task, record in zip(tasks, records, strict=True):
-        alone = probe_features(x, pack, task, parts(pack, task), "paper", 3)
+        alone = probe_features(x, pack, task, split_rows(pack, task), "paper", 3)
         assert record["accuracy"] == alone["accuracy"] and record["confusion"] == alone["confusion"]

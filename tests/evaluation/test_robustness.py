@@ -16,7 +16,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import robustness as module
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import ProbeSplit, parts, probe_features
+from mvitac.evaluation.probe import ProbeSplit, probe_features, split_rows
 from mvitac.evaluation.robustness import DROPOUT, LEAK, MISSING, NOISE, PREPARED, STRESSES, stress
 from mvitac.experiments.collect import gather, lay_out
 from mvitac.experiments.jobs import do_all
@@ -58,7 +58,7 @@ def test_every_stress_of_every_modality(records: dict) -> None:
 def test_a_missing_modality_leaves_what_the_other_says(trained: Path, pack: Pack, records: dict) -> None:
     """Zeroed in the probe's own units: exactly the score of the both-probe with its columns at train's mean."""
     model, task = load(trained), pack.spec.tasks[0]
-    rows = parts(pack, task)
+    rows = split_rows(pack, task)
     everything, num = np.concatenate([rows.train, rows.val, rows.test]), len(rows.train) + len(rows.val)
     z = {m: features(model, pack, m, everything).copy() for m in model.encoders}
     z["vision"][num:] = z["vision"][:num].mean(0)
@@ -96,7 +96,7 @@ def test_modality_dropout_learns_from_each_row_three_times(
 
 
 def test_few_labels_take_their_share_and_one_of_each_class(pack: Pack) -> None:
-    rows, labels = parts(pack, pack.spec.tasks[0]), pack.labels("pattern")
+    rows, labels = split_rows(pack, pack.spec.tasks[0]), pack.labels("pattern")
     for share in (0.01, 0.1, 0.5):
         keep, few = module._few(rows, labels, share, seed=3)
         assert set(labels[few.train]) == set(labels[few.val]) == {0, 1, 2}
@@ -110,7 +110,7 @@ def test_few_labels_take_their_share_and_one_of_each_class(pack: Pack) -> None:
 
 
 def test_a_leak_gives_half_of_each_test_group_away_and_nothing_else(pack: Pack) -> None:
-    rows, groups = parts(pack, pack.spec.tasks[0]), pack.column("group")
+    rows, groups = split_rows(pack, pack.spec.tasks[0]), pack.column("group")
     everything = np.concatenate([rows.train, rows.val, rows.test])
     (keep, honest), (keep_leaking, leaking) = (module._halved(rows, groups, leaks, seed=1) for leaks in (False, True))
     assert np.array_equal(everything[keep], np.concatenate([honest.train, honest.val, honest.test]))

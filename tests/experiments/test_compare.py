@@ -188,7 +188,7 @@ def test_a_plan_from_a_file(tmp_path: Path) -> None:
         ("rows = [", "not valid TOML"),
         ('[[rows]]\nlabel = "a"', "unknown reference row 'MViTac'"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\ntau = 1', "unknown field in plan.rows 'tau'"),
-        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "a"', "is there twice"),
+        ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "a"', "is given twice"),
         ('reference = "a"\n[[rows]]\nlabel = "a"\n[[rows]]\nlabel = "A"', "differ only in signs"),
         ('reference = "pixels"\n[[rows]]\nlabel = "pixels"', "row 'pixels' has the name of a control"),
         ('reference = "a"\nseeds = 0\n[[rows]]\nlabel = "a"', "seeds 0"),
@@ -313,7 +313,7 @@ def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_pat
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press, daemon=True).start()
-    with pytest.raises(Interrupted, match="stopped; the same command goes on from here"):
+    with pytest.raises(Interrupted, match="stopped; the same command continues from here"):
         do_all(work, 2, lambda line: None, terminal)
     assert not any((job.out / "model.safetensors").exists() for job in work.jobs)
     steps = [torch.load(path, weights_only=True)["step"] for path in tmp_path.rglob("checkpoint.pt")]
@@ -351,7 +351,7 @@ def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) ->
             train(work.jobs[0].run, work.jobs[0].out, pack=pack)
         do_all(work, 1, said.append)
         assert (
-            "[0/2] MViTac, seed 0: another process is at it; this command makes the whole table once it is done" in said
+            "[0/2] MViTac, seed 0: another process runs it; this command makes the whole table once it is done" in said
         )
         assert [job.done for job in work.jobs] == [False, True] and not work.jobs[0].out.exists()
         go.set()
@@ -776,7 +776,7 @@ def test_folds_are_run_apart_and_pooled(two_folds: Path, tmp_path: Path, capsys:
     ("folds", "message"),
     [
         (["split=fold1", "split=same"], "folds 'fold1' and 'same' both test object '0'"),
-        (["split=fold1", "split=fold1"], "fold 'split=fold1' is there twice"),
+        (["split=fold1", "split=fold1"], "fold 'split=fold1' is given twice"),
         (["split=my_fold", "split=my-fold"], "do not tell them apart"),
         (["split=fold1", "split=Fold1"], "do not tell them apart"),
         (["split=_"], "do not tell them apart"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,13 @@ from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.scores import summarise
+from mvitac.evaluation.scores import interval, summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.recipes import recipe
 from mvitac.report import figures
 from mvitac.report.galleries import nearest_groups
 from mvitac.report.report import wall_seconds, write_report
-from mvitac.report.tables import cell, columns_of
+from mvitac.report.tables import cell, columns_of, retrieval_rows
 from mvitac.run import Run
 from mvitac.training.loop import train
 
@@ -130,7 +131,7 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
     task = ""
     for row in filter(None, rows):
         task = row[0] if len(row) == 1 else task
-        shown[task, row[0]] = row[1:]
+        shown[task, row[0]] = [unescape(value).replace("\xa0", " ") for value in row[1:]]
     assert set(result["summary"]) == {"category", "soft", "rough"}
     for task, found in result["summary"].items():
         sources = {source for cells in found.values() for source in cells}
@@ -216,7 +217,7 @@ def test_gallery_agrees_with_the_score(materials: Path, result: dict[str, Any]) 
     queries = re.findall(r'<div class="query">.*?(?=<div class="query">|</section>)', html, re.DOTALL)
     assert len(queries) == 16
     for query in queries:
-        rank = re.search(r"is at rank (\d+) of (\d+)", query)
+        rank = re.search(r"has rank (\d+) of (\d+)", query)
         assert rank
         assert int(rank[2]) == result["retrieval"][0]["num_groups"]
         marks = re.findall(r'<div class="(right|same|wrong)">', query)
@@ -252,7 +253,7 @@ def test_touch_alone(tmp_path: Path) -> None:
 def test_without_labels(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(labelled=False))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
-    assert "What the frozen features are worth" not in page.text
+    assert "Scores of the frozen features" not in page.text
     assert "finds its thing among the first five by camera" in page.text
     assert len(page.all("img")) == 2 * 8 * 6  # eight queries with five groups, both directions
 
@@ -269,12 +270,49 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     assert len(page.all("img")) == 2 * 8 * 6  # the gallery of the second run; the first one has none
     linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
     assert f"with supervised, mvitac {100 * nearest['mvitac']['mean']:.1f}" in page.text
-    assert cell({"both": linear}, "mvitac", "both") in page.text
+    assert cell({"both": linear}, "mvitac", "both") in page.text.replace("\xa0", " ")
     assert not page.all("script")
     alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
-    assert "Not scored: no space that both modalities share." in alone.text
+    assert "Not scored: no method here has a space that both modalities share." in alone.text
     assert "The runs left no log lines." in alone.text
     assert not alone.all("img")
+
+
+def test_the_comparison_sorts_methods_and_shares_the_palette() -> None:
+    """Best method on top, controls below all methods, one colour per modality in every figure."""
+    dots = [
+        figures.Dot("weak", "touch", 0.2, 0.1, 0.3, None, False),
+        figures.Dot("strong", "touch", 0.3, 0.2, 0.4, None, False),
+        figures.Dot("strong", "both", 0.6, 0.5, 0.7, 0.65, False),
+        figures.Dot("pixels", "touch", 0.9, 0.8, 1.0, None, True),
+        figures.Dot("majority", "none", 0.1, 0.1, 0.1, None, True),
+    ]
+    axes = figures.comparison({"task": dots}).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["pixels", "weak", "strong"]  # from below
+    handles, labels = axes.get_legend_handles_labels()
+    colours = {label: handle.get_color() for handle, label in zip(handles, labels, strict=True)}
+    assert colours["touch"] == figures.colour("blue") and colours["both"] == figures.colour("green")
+    assert labels.count("printed") == 1 and "majority" in labels
+    whole = axes.get_ylim()
+    bars = figures.bars("x", {"touch": {"a": {"mean": 0.5, "low": 0.4, "high": 0.6}}}, {"majority": 0.1}, "%").axes[0]
+    dashed = [line for line in bars.lines if line.get_linestyle() == "--"]
+    assert whole and len(dashed) == 1 and min(dashed[0].get_ydata()) > 0  # below the group's name at y = 0
+
+
+def test_retrieval_has_one_number_for_one_thing() -> None:
+    """R@5 of the table is the mean of its interval, also where float32 would round to another tenth."""
+    counts = {"group_sizes": [2000], "group_correct": [3], "seed": 0}
+    record = {
+        "source": "a",
+        "direction": "x",
+        "R@1": 0.1,
+        "R@5": float(np.float32(3 / 2000)),
+        "R@10": 0.1,
+        "chance R@5": 0.1,
+    }
+    mean = interval([{**record, **counts}])[0]
+    assert retrieval_rows([{**record, **counts}])[0][3] == f"{100 * mean:.1f}"
+    assert f"{100 * record['R@5']:.1f}" != f"{100 * mean:.1f}"  # what this is about
 
 
 def test_wall_time_adds_up_the_logged_speeds(materials: Path) -> None:

@@ -15,8 +15,8 @@ from mvitac.system.distributed import join, synchronise_norms
 from mvitac.training import views as batches
 from mvitac.training.loop import train as pretrain
 from mvitac.training.step import Step
-from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps, views
-from support.small_steps import split
+from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
+from support.small_steps import split, views
 
 
 def step(folder: Path) -> None:

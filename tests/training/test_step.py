@@ -15,8 +15,10 @@ from mvitac.data.pack import Pack
 from mvitac.methods.base import Method, MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
+from mvitac.nn.encoders import draws_random_numbers
 from mvitac.recipes import recipe
 from mvitac.run import Run
+from mvitac.system import processes
 from mvitac.training.loop import train
 from mvitac.training.step import Step
 from support.small_methods import small
@@ -146,7 +148,7 @@ def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="chunk 5: give a divisor of batch_size 16"):
         replace(RUN, chunk=5)
     run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, method=SupervisedConfig())
-    with pytest.raises(ValueError, match="'supervised' takes its loss pair by pair"):
+    with pytest.raises(ValueError, match="'supervised' supports neither several processes nor --chunk"):
         train(run, tmp_path / "r", quiet=True)
 
 
@@ -157,3 +159,35 @@ def test_copies_do_not_share_weights() -> None:
     before = copy.deepcopy(b.state_dict())
     take(RUN, a, [views])
     assert all(torch.equal(v, before[k]) for k, v in b.state_dict().items())
+
+
+def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MViTac's two towers train in two threads where there are two: the same weights, bit for bit."""
+    run = replace(RUN, method=MViTacConfig(keys="end-to-end", losses=("vt", "tv")))
+    at_once, calls = processes._at_once, []
+    monkeypatch.setattr(processes, "_at_once", lambda towers: calls.append(len(towers)) or at_once(towers))
+
+    def trained(threads: int) -> dict[str, Tensor]:
+        torch.set_num_threads(threads)
+        method = build(run).train()
+        step = Step(run, method, CPU)
+        for i in range(3):
+            step([views], lr=1e-2, seed=i, progress=0.5)
+        assert torch.get_num_threads() == threads
+        unused = [name for name, weights in method.named_parameters() if weights.grad is None]
+        assert unused and all(".intra." in name for name in unused)  # not zeros, which weight decay would act on
+        return method.state_dict()
+
+    before = torch.get_num_threads()
+    try:
+        one, two = trained(1), trained(2)
+    finally:
+        torch.set_num_threads(before)
+    assert calls == [2, 2] * 3  # forward and backward of each step, of the second training alone
+    for name, weights in one.items():
+        assert torch.equal(weights, two[name]), name
+
+
+def test_networks_with_dropout_are_not_side_by_side() -> None:
+    assert draws_random_numbers(build())
+    assert not draws_random_numbers(build(replace(RUN, method=MViTacConfig())))

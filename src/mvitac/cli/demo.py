@@ -3,30 +3,33 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from mvitac.cli.options import parse
+from mvitac.cli.options import parse, selectors
 
 
 def demo(argv: list[str]) -> None:
-    """mvitac demo [--out DIR] [--seeds N] [--resume]"""
+    """mvitac demo [--recipe R] [--out DIR] [--seeds N] [fields]"""
+    chosen, rest = selectors(argv, ("--recipe",))
     from typing import Annotated
 
     import tyro
     from rich.console import Console
 
     from mvitac.experiments.demo import run_demo
-    from mvitac.recipes import recipe
+    from mvitac.recipes import RECIPES, recipe
     from mvitac.run import Run
 
     @dataclass(frozen=True, kw_only=True)
     class Options:
-        """The whole road on simulated materials: simulate, pre-train, probe, report. A second call goes on where the
-        first stopped."""
-
         out: Path = Path("runs/demo")
         """Folder of the demo: one run per seed, summary.json, report."""
-        seeds: int = 2
+        seeds: int = 1
         """How many times to pre-train, each from its own seed."""
-        run: Annotated[Run, tyro.conf.arg(name="")] = recipe("demo")
+        run: Annotated[Run, tyro.conf.arg(name="")] = recipe(chosen.get("--recipe", "quick"))
 
-    options = parse(Options, argv, "demo")
+    Options.__doc__ = f"""The whole road on simulated materials: simulate, pre-train, probe, report. A second call goes on
+    where the first stopped.
+
+      --recipe {"|".join(RECIPES)}  (default quick; demo is that of the published tables)
+    """
+    options = parse(Options, rest, "demo")
     run_demo(options.run, options.out, options.seeds, Console(markup=False))

@@ -27,6 +27,9 @@ def parse(
     """
     import tyro
 
+    argv = [
+        re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", w) for w in argv
+    ]  # 0.1.0's name
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
     if default is not None:
         options["default"] = default

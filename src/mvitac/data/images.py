@@ -1,4 +1,4 @@
-"""Images as arrays: decode, resize to a square, subtract a background."""
+"""Functions on images: decode, resize to a square, subtract a background."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from PIL import Image, ImageOps
 
 
 def fit(image: np.ndarray, size: int) -> np.ndarray:
-    """uint8 [H, W, C] -> [size, size, C], squashed as the paper does (appendix B), three channels at a time."""
+    """Resize uint8 [H, W, C] to [size, size, C], ignoring the aspect ratio as the paper does (appendix B)."""
     if image.shape[:2] == (size, size):
         return image
-    # A pixel of one sensor as one element of three bytes: taken apart at the speed of memory, ten times that of bytes.
+    # One element of three bytes per pixel and sensor: copies ten times as fast as single bytes.
     pixels = np.ascontiguousarray(image).view("V3")
     sensors = [np.ascontiguousarray(pixels[:, :, i]).view(np.uint8) for i in range(pixels.shape[2])]
     shaped = [s.reshape(*image.shape[:2], 3) for s in sensors]
@@ -22,7 +22,7 @@ def fit(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def shrink(image: Image.Image, size: int) -> np.ndarray:
-    """An RGB image as uint8 [size, size, 3], the pixels ``fit`` gives, without its array in full size."""
+    """Resize an RGB image to uint8 [size, size, 3]: the same pixels as ``fit``, without an array in full size."""
     if image.size != (size, size):
         image = image.resize((size, size), Image.Resampling.BILINEAR)
     return np.asarray(image)
@@ -32,14 +32,14 @@ IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".p
 
 
 def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
-    """An image file as RGB: upright (EXIF), 16 bits scaled to 8, transparent parts black.
+    """Read an image file as RGB: rotated by EXIF, 16 bits scaled to 8, transparent parts black.
 
-    ``name`` is what to call an open file in errors.
+    ``name`` is the name of an open file in error messages.
     """
     name = name or str(path)
     try:
         with Image.open(path) as image:
-            # A camera's MPO hides a second picture behind the first; a GIF or TIFF stack is no photo.
+            # A camera's MPO has a second image after the photo; GIF and TIFF stacks are refused.
             if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
                 raise ValueError(f"it holds {getattr(image, 'n_frames', 0)} frames, not one: store one image per row")
             image.load()
@@ -47,7 +47,7 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
             return _to_rgb(image)
     except FileNotFoundError:
         raise ValueError(f"{name} does not exist any more: it was there when packing began") from None
-    # What PIL raises for damaged files is not one family.
+    # PIL has no common base class for errors of damaged files.
     except (OSError, ValueError, SyntaxError, TypeError, IndexError, EOFError, struct.error) as error:
         raise ValueError(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from None
     except Image.DecompressionBombError as error:
@@ -71,7 +71,7 @@ def _to_rgb(image: Image.Image) -> Image.Image:
 
 
 def difference(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """``image`` minus ``background``, halved, plus one half: no contact is 128; uint8 as both."""
+    """Return (image - background) / 2 + 128 as uint8, so that no contact is 128."""
     if image.shape != background.shape:
         (h, w), (h2, w2) = image.shape[:2], background.shape[:2]
         raise ValueError(f"image is {w} x {h}, its background {w2} x {h2}: a difference needs one size")

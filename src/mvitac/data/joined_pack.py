@@ -1,6 +1,6 @@
-"""Two packs as one, for what is learned on the one and scored on the other: a probe that meets a new sensor, room or robot.
+"""Two packs as one: train probes on the first and test them on the second (another sensor, room or robot).
 
-No torch here.
+This module does not import torch.
 """
 
 from __future__ import annotations
@@ -14,47 +14,35 @@ from mvitac.data.jpeg import Lazy
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import Task
 from mvitac.registry import unknown
+from mvitac.system.files import brief
 
 
 class JoinedPack(Pack):
-    """Train and val rows are those of ``learn``, test rows those of ``score``; rows numbered as the one after the other.
+    """Train and val rows of ``learn`` followed by test rows of ``score``.
 
-    Tasks are those both have, classes by their names in ``learn``. ValueError if the packs have no task in common, classes
-    that were not learned, other image shapes, or a group on both sides: none of its rows would be unseen.
+    Tasks are those that both packs have, with the classes of ``learn``.
+
+    Raises:
+        ValueError: If the packs have no common task, other image shapes, classes in ``score`` that ``learn`` does not
+            have, or a group in both (its test rows would not be unseen).
     """
 
     def __init__(self, learn: Pack, score: Pack) -> None:
         self.path, self.meta = score.path, score.meta
         self.num, self.size, self.store = learn.num + score.num, learn.size, "raw"
         self.digests = {"learn": learn.digest, "score": score.digest}
-        for modality in ("vision", "touch"):
-            shapes = [(pack.size, pack.spec.channels(modality)) for pack in (learn, score)]
-            if shapes[0] != shapes[1]:
-                raise ValueError(
-                    f"{modality} has {shapes[0][1]} channels at {shapes[0][0]} px in {learn.path} and {shapes[1][1]} at"
-                    f" {shapes[1][0]} px in {score.path}: pack both alike (--data.size)"
-                )
-        known = {task.name: task for task in learn.spec.tasks}
-        tasks = [(known[task.name], task) for task in score.spec.tasks if task.name in known]
-        if not tasks:
-            names = [", ".join(task.name for task in pack.spec.tasks) or "none" for pack in (learn, score)]
-            raise ValueError(f"no task is in both packs: {learn.path} has {names[0]}, {score.path} {names[1]}")
-        for ours, theirs in tasks:
-            if (ours.only, ours.split) != (theirs.only, theirs.split):
-                raise ValueError(f"task {ours.name!r} is about other rows or split otherwise in {score.path}")
-        sides = {"split", *(task.split for task, _ in tasks)}
+        _check_shapes(learn, score)
+        tasks = _common_tasks(learn, score)
+        columns = {"split", *(task.split for task, _ in tasks)}
         self.table = _joined(
-            _side(learn, tasks, sides, "learned", {"train", "val"}), _side(score, tasks, sides, "scored", {"test"})
+            _side(learn, tasks, columns, "learned", {"train", "val"}), _side(score, tasks, columns, "scored", {"test"})
         )
+        theirs = score.spec.controls
         self.spec = replace(
             learn.spec,
             name=f"{score.path.name}, probes learned on {learn.path.name}",
             tasks=tuple(task for task, _ in tasks),
-            controls={
-                name: columns
-                for name, columns in learn.spec.controls.items()
-                if score.spec.controls.get(name) == columns
-            },
+            controls={name: given for name, given in learn.spec.controls.items() if theirs.get(name) == given},
             notes=tuple(dict.fromkeys((*learn.spec.notes, *score.spec.notes))),
         )
         self.images: dict[str, Images] = {m: _Both(learn.images[m], score.images[m]) for m in self.spec.modalities}
@@ -66,12 +54,35 @@ class JoinedPack(Pack):
                 by = learn.spec.group_by
                 raise ValueError(
                     f"{by} {str(shared[0])!r} is learned from in {learn.path} and scored in {score.path}, one of"
-                    f" {len(shared)}: give packs whose splits agree, or another name to what is another {by}"
+                    f" {len(shared)}: give packs whose splits agree, or give a different {by} another name"
                 )
 
 
+def _check_shapes(learn: Pack, score: Pack) -> None:
+    for modality in ("vision", "touch"):
+        shapes = [(pack.size, pack.spec.channels(modality)) for pack in (learn, score)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"{modality} has {shapes[0][1]} channels at {shapes[0][0]} px in {learn.path} and {shapes[1][1]} at"
+                f" {shapes[1][0]} px in {score.path}: pack both with the same shape (--data.size)"
+            )
+
+
+def _common_tasks(learn: Pack, score: Pack) -> list[tuple[Task, Task]]:
+    """Return the tasks that both packs have, as defined by each."""
+    known = {task.name: task for task in learn.spec.tasks}
+    tasks = [(known[task.name], task) for task in score.spec.tasks if task.name in known]
+    if not tasks:
+        names = [", ".join(task.name for task in pack.spec.tasks) or "none" for pack in (learn, score)]
+        raise ValueError(f"no task is in both packs: {learn.path} has {names[0]}, {score.path} {names[1]}")
+    for ours, theirs in tasks:
+        if (ours.only, ours.split) != (theirs.only, theirs.split):
+            raise ValueError(f"task {ours.name!r} is about other rows or split otherwise in {score.path}")
+    return tasks
+
+
 class _Both(Lazy):
-    """Images of one pack, then of another."""
+    """The images of one pack followed by those of another."""
 
     def __init__(self, first: Images, second: Images) -> None:
         _, height, width, channels = first.shape
@@ -85,9 +96,12 @@ class _Both(Lazy):
         return images
 
 
-def _side(pack: Pack, tasks: list[tuple[Task, Task]], sides: set[str], name: str, keep: set[str]) -> pa.Table:
-    """What probes read of the table of ``pack``: other splits than ``keep`` hidden, labels as numbered by the first of each
-    pair of tasks."""
+def _side(pack: Pack, tasks: list[tuple[Task, Task]], splits: set[str], name: str, keep: set[str]) -> pa.Table:
+    """Return the columns of ``pack`` that probes read.
+
+    Rows of splits other than ``keep`` get the split "hidden" in the columns ``splits``. Labels are numbered as in the first
+    task of each pair; ids get the prefix ``name``.
+    """
     read = {
         "id",
         "group",
@@ -96,14 +110,14 @@ def _side(pack: Pack, tasks: list[tuple[Task, Task]], sides: set[str], name: str
     }
     columns = {n: pack.table.column(n) for n in pack.table.column_names if n in read}
     columns["id"] = pa.array([f"{name}/{one}" for one in columns["id"].to_pylist()])
-    for column in sides:
+    for column in splits:
         columns[column] = pa.array([s if s in keep else "hidden" for s in pack.table.column(column).to_pylist()])
     for modality in pack.spec.modalities:
         columns[f"has_{modality}"] = pa.array(pack.has(modality))
     own = {task.name: task for task in pack.spec.tasks}
     for task, _ in tasks:
-        places = [task.classes.index(c) if c in task.classes else -2 for c in own[task.name].classes]
-        labels = np.array([*places, -1])[pack.column(f"label_{task.name}").astype(int)]  # -1, none, is the last
+        numbers = [task.classes.index(c) if c in task.classes else -2 for c in own[task.name].classes]
+        labels = np.array([*numbers, -1])[pack.column(f"label_{task.name}").astype(int)]  # -1 (no label) is the last
         if (labels == -2).any():
             new = next(c for c in own[task.name].classes if c not in task.classes)
             raise unknown(f"class of {task.name}", f"{new} ({pack.path})", task.classes)
@@ -112,9 +126,9 @@ def _side(pack: Pack, tasks: list[tuple[Task, Task]], sides: set[str], name: str
 
 
 def _joined(first: pa.Table, second: pa.Table) -> pa.Table:
-    """The rows of both with the columns of both."""
+    """Return the rows of both tables with their common columns."""
     names = [name for name in first.column_names if name in second.column_names]
     try:
         return pa.concat_tables([first.select(names), second.select(names)], promote_options="permissive")
     except pa.ArrowException as error:
-        raise ValueError(f"the packs' columns differ in kind ({' '.join(str(error).split())[:120]})") from None
+        raise ValueError(f"the packs' columns differ in kind ({brief(error)})") from None

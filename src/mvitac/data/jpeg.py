@@ -1,8 +1,8 @@
-"""A pack's images kept as JPEG: a fraction of the bytes of their pixels, decoded when they are asked for.
+"""Images stored as JPEG in a pack: they need a fraction of the disk space and are decoded when indexed.
 
-One file holds the JPEGs of all rows, one right after another; how many bytes each has is in the pack's table. The sensors
-of a stacked image stand one below the other in one JPEG of three channels. A black image, which also stands for one that
-is missing, has no bytes. No torch here.
+One file holds the JPEGs of all rows, one after another; the pack's table has the length of each. Stacked sensors are
+placed below each other in one JPEG of three channels. A black image, which also represents a missing one, has length 0.
+This module does not import torch.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ from mvitac.system.files import brief
 
 QUALITY = 95
 FEW = 8
-"""Images up to which one thread decodes them: handing them out would cost more than it saves."""
+"""Up to this number of images, one thread is faster than several."""
 
 
 def encode(image: np.ndarray, quality: int) -> bytes:
-    """uint8 [S, S, C] as JPEG, with the colours in full resolution (4:4:4): a gel tells slopes by its coloured lights, and
-    the usual 4:2:0 keeps but a quarter of them. Other builds of libjpeg may give other bytes."""
+    """Encode uint8 [S, S, C] as JPEG. Colours keep full resolution (4:4:4), because a gel shows slopes by colour.
+
+    Other builds of libjpeg may give other bytes.
+    """
     if not image.any():
         return b""
     size = len(image)
@@ -38,8 +40,10 @@ def encode(image: np.ndarray, quality: int) -> bytes:
 
 
 def decode(jpeg: bytes, shape: tuple[int, int, int]) -> np.ndarray:
-    """uint8 ``shape`` [S, S, C]; ValueError or OSError if ``jpeg`` is cut short or of another shape. (Damage within gives
-    other pixels, as libjpeg has it: what a pack holds is known by its sums.)"""
+    """Decode to uint8 ``shape`` [S, S, C]; ValueError or OSError if ``jpeg`` is truncated or has another shape.
+
+    Other damage gives wrong pixels without an error; a pack detects it by checksums.
+    """
     if not jpeg:
         return np.zeros(shape, np.uint8)
     size, _, channels = shape
@@ -51,9 +55,9 @@ def decode(jpeg: bytes, shape: tuple[int, int, int]) -> np.ndarray:
 
 
 class Lazy(ABC):
-    """An array uint8 [N, S, S, C] whose rows are made when they are indexed. Safe to share between threads.
+    """An array uint8 [N, S, S, C] whose rows are computed when indexed. Threads may share it.
 
-    Indexed as numpy does it, rows first: a number, a slice, an array of numbers or a mask, then anything of an image's axes.
+    Indexing is numpy's: first the rows (number, slice, array or mask), then any index of an image's axes.
     """
 
     dtype = np.dtype(np.uint8)
@@ -67,11 +71,11 @@ class Lazy(ABC):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all images once made."""
+        """Bytes of all images in memory."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        """A new array, as numpy would give it; ValueError names the file and the row that is damaged."""
+        """Return a new array; ValueError names the file and the row if it is damaged."""
         rows, *within = index if isinstance(index, tuple) else (index,)
         rows = np.asarray(self._numbers[rows])
         images = self._made(rows.ravel()).reshape(*rows.shape, *self.shape[1:])
@@ -79,45 +83,43 @@ class Lazy(ABC):
 
     @abstractmethod
     def _made(self, rows: np.ndarray) -> np.ndarray:
-        """uint8 [n, S, S, C]: the images of ``rows`` [n], which are numbers of rows that are there."""
+        """Return the images uint8 [n, S, S, C] of ``rows`` [n], which are valid row numbers."""
 
 
 class Jpegs(Lazy):
-    """What a file of JPEGs stands for: rows are decoded, many at once by as many threads as there are cores, or as
-    OMP_NUM_THREADS allows."""
+    """A file of JPEGs as an array. Many rows are decoded in parallel, by at most OMP_NUM_THREADS (or 8) threads."""
 
     def __init__(self, path: Path, shape: tuple[int, int, int, int], lengths: np.ndarray) -> None:
-        """``lengths`` [N] are the bytes of each row; ValueError if the file has not as many."""
+        """``lengths`` [N] are the bytes of each row; ValueError if the file has another size."""
         super().__init__(shape)
         self.path = path
         self._ends = np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
         if (held := path.stat().st_size) != self._ends[-1]:
             raise ValueError(f"{path} holds {held} bytes, its table promises {self._ends[-1]}")
-        self._file = np.memmap(path, np.uint8, "r") if held else np.zeros(0, np.uint8)  # nothing cannot be mapped
+        self._file = np.memmap(path, np.uint8, "r") if held else np.zeros(0, np.uint8)  # an empty file cannot be mapped
 
     def jpeg(self, row: int) -> bytes:
-        """Row ``row`` as it is stored."""
+        """Return the stored bytes of ``row``."""
         return self._file[self._ends[row] : self._ends[row + 1]].tobytes()
 
     def _made(self, rows: np.ndarray) -> np.ndarray:
         images = np.empty((len(rows), *self.shape[1:]), np.uint8)
-
-        def fill(some: np.ndarray) -> None:
-            for i in some:
-                row = int(rows[i])
-                try:
-                    images[i] = decode(self.jpeg(row), self.shape[1:])
-                except Exception as error:  # Pillow raises several kinds
-                    raise ValueError(
-                        f"{self.path}: row {row} cannot be decoded ({brief(error)}): the pack is damaged, make it again"
-                    ) from None
-
-        places = np.arange(len(rows))
         if len(rows) <= FEW or (num := _num_threads()) == 1:
-            fill(places)
+            self._decode(rows, images)
         else:
-            list(_threads().map(fill, np.array_split(places, min(4 * num, len(rows) // 2))))
+            chunks = min(4 * num, len(rows) // 2)
+            list(_threads().map(self._decode, np.array_split(rows, chunks), np.array_split(images, chunks)))
         return images
+
+    def _decode(self, rows: np.ndarray, images: np.ndarray) -> None:
+        """Decode ``rows`` into ``images``."""
+        for i, row in enumerate(rows.tolist()):
+            try:
+                images[i] = decode(self.jpeg(row), self.shape[1:])
+            except Exception as error:  # Pillow raises several kinds
+                raise ValueError(
+                    f"{self.path}: row {row} cannot be decoded ({brief(error)}): the pack is damaged, make it again"
+                ) from None
 
 
 def _num_threads() -> int:
@@ -127,5 +129,5 @@ def _num_threads() -> int:
 
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    """Of this process; Pillow decodes without Python's lock."""
+    """Return this process's pool; Pillow releases the GIL while decoding."""
     return ThreadPoolExecutor(_num_threads(), "jpeg")

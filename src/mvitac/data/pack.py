@@ -1,13 +1,13 @@
-"""The pack: what any dataset becomes on disk, read once, then memory-mapped by every run.
+"""The pack: a dataset on disk, built once and memory-mapped by every run.
 
     <pack>/pack.json         format, counts, digests, spec, source, licence, versions
-           samples.parquet   one row per sample: id, group, split, label_<task>, sensor, ..., crc_<modality>
-                             has_vision, has_touch (bool) where some rows lack an image; zeros stand for it
-           vision.npy        uint8 [N, size, size, 3]      absent where the dataset has no camera
+           samples.parquet   one row per sample: id, group, split, label_<task>, sensor, ..., crc_<modality>;
+                             has_vision, has_touch (bool) if some rows lack an image, which is stored as zeros
+           vision.npy        uint8 [N, size, size, 3]      absent if the dataset has no camera
            touch.npy         uint8 [N, size, size, 3 or 6]
 
-A pack that stores JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``data/jpeg.py``), and bytes_<modality> in its table.
-Here it is opened and checked; ``data/build.py`` makes one. No torch here.
+A pack stored as JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``data/jpeg.py``) and columns bytes_<modality>.
+This module opens and checks packs; ``data/build.py`` builds them. It does not import torch.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mvitac.data import notebook
 from mvitac.data.jpeg import Jpegs, Lazy
 from mvitac.data.spec import DataSpec
 from mvitac.registry import from_json, unknown
@@ -31,26 +32,55 @@ from mvitac.system.files import brief, digest, digest_file, read_json
 FORMAT = "mvitac-pack"
 SHARDED = "mvitac-shards"
 FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}
-"""By how the images are stored."""
+"""Format version by how images are stored."""
 SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}
 SPLITS = ("train", "val", "test", "unlabelled")
-"""Pre-training sees train and unlabelled; val chooses (kNN while training, a probe's regularisation); test only scores."""
+"""Pre-training uses train and unlabelled. Val is for choosing (kNN during training, a probe's C), test for scores only."""
 
 Store = Literal["raw", "jpeg"]
 Images = np.ndarray | Lazy
 
 
 class Pack:
-    """An opened pack: ``table`` (pyarrow), ``images[modality]`` (uint8 [N, S, S, C], memory-mapped or decoded as they are
-    indexed), ``spec``."""
+    """An opened pack.
+
+    Attributes:
+        spec: Description of the dataset.
+        table: One row per sample (pyarrow).
+        images: Modality -> uint8 [N, S, S, C], memory-mapped, or decoded when indexed.
+
+    Example:
+        >>> pack = Pack("packs/materials")
+        >>> pack.images["touch"][pack.rows("test")]
+    """
 
     format: ClassVar[str] = FORMAT
     window: int = 0
-    """Shards whose rows training may mix at a time; 0 where all rows are equally near (``data/streaming.py`` has others)."""
+    """Number of shards whose rows training mixes at a time; 0 = all rows (shards: ``data/streaming.py``)."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
-        """Open and check ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""
+        """Open and check the pack at ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""
         self.path = Path(path)
+        self.meta: dict[str, Any] = self._read_meta()
+        try:
+            self.spec: DataSpec = from_json(DataSpec, self.meta.get("spec"), "spec")
+            self.num, self.size = (int(from_json(int, self.meta.get(name), name)) for name in ("num", "size"))
+            self.store: Store = from_json(Store, self.meta.get("store", "raw"), "store")
+            if FORMAT_VERSIONS[self.store] != (version := self.meta["format_version"]):
+                raise ValueError(f"store: {self.store} is not of format {version}")
+            self.digests: dict[str, str] = from_json(dict[str, str], self.meta.get("digests"), "digests")
+            files = self._files()
+            if sorted(self.digests) != sorted(names := ("samples.parquet", *files)):
+                raise ValueError(f"digests: expected those of {', '.join(names)}")
+        except ValueError as error:
+            raise ValueError(f"{self.path / 'pack.json'} is damaged ({error}): re-pack it") from None
+        self.table: pa.Table = self._read_table()
+        self.images: dict[str, Images] = self._open(files)
+        for name, modality in files.items() if verify else ():
+            self._check_digest(name, modality)
+
+    def _read_meta(self) -> dict[str, Any]:
+        """Return the content of pack.json; ValueError unless it describes a pack that this version reads."""
         if not self.path.is_dir():
             raise ValueError(f"no pack at {self.path}: make one with `mvitac data simulate` or `mvitac data pack`")
         meta = read_json(self.path / "pack.json", "a pack's description")
@@ -66,53 +96,46 @@ class Pack:
             raise ValueError(
                 f"{self.path / 'pack.json'} does not match its digest: it was changed or damaged, re-pack it"
             )
-        self.meta: dict[str, Any] = meta
+        return meta
+
+    def _read_table(self) -> pa.Table:
+        """Return the content of samples.parquet, checked."""
+        self._check_digest(name := "samples.parquet")
         try:
-            self.spec: DataSpec = from_json(DataSpec, meta.get("spec"), "spec")
-            self.num, self.size = (int(from_json(int, meta.get(name), name)) for name in ("num", "size"))
-            self.store: Store = from_json(Store, meta.get("store", "raw"), "store")
-            if FORMAT_VERSIONS[self.store] != version:
-                raise ValueError(f"store: {self.store} is not of format {version}")
-            self.digests: dict[str, str] = from_json(dict[str, str], meta.get("digests"), "digests")
-            files = self._files()
-            if sorted(self.digests) != sorted(names := ("samples.parquet", *files)):
-                raise ValueError(f"digests: expected those of {', '.join(names)}")
-        except ValueError as error:
-            raise ValueError(f"{self.path / 'pack.json'} is damaged ({error}): re-pack it") from None
-        self._check_digest("samples.parquet")
-        try:
-            self.table: pa.Table = pq.read_table(self._file("samples.parquet"))
+            table = pq.read_table(self._file(name))
         except Exception as error:  # arrow raises several kinds for a damaged file
             raise ValueError(
-                f"{self.path / 'samples.parquet'} cannot be read ({brief(error)}): the pack is damaged, make it again"
+                f"{self.path / name} cannot be read ({brief(error)}): the pack is damaged, make it again"
             ) from None
-        if self.table.num_rows != self.num:
-            raise ValueError(
-                f"{self.path / 'samples.parquet'} has {self.table.num_rows} rows, pack.json promises {self.num}: re-pack it"
-            )
+        if table.num_rows != self.num:
+            raise ValueError(f"{self.path / name} has {table.num_rows} rows, pack.json promises {self.num}: re-pack it")
         try:
-            check_table(self.table, self.spec)
+            check_table(table, self.spec)
         except ValueError as error:
-            raise ValueError(f"{self.path / 'samples.parquet'}: {error} (make the pack again)") from None
-        self.images: dict[str, Images] = self._open(files)
-        for name, modality in files.items() if verify else ():
-            self._check_digest(name, modality)
+            raise ValueError(f"{self.path / name}: {error} (make the pack again)") from None
+        return table
+
+    def __repr__(self) -> str:
+        return f"Pack({str(self.path)!r}: {self.num} rows of {self.spec.name} at {self.size} px)"
+
+    def _repr_html_(self) -> str:
+        return notebook.pack_html(self)
 
     @property
     def digest(self) -> str:
-        """Content address of images and table: equal content, equal digest, whatever the spec says of it."""
+        """Digest of images and table. It does not depend on the spec."""
         return digest(self.digests)
 
     def column(self, name: str) -> np.ndarray:
-        """One table column as numpy [N]; ValueError names the columns there are."""
+        """Return a table column as numpy [N]; the ValueError for an unknown one lists the columns."""
         if name not in self.table.column_names:
             raise unknown("column", name, self.table.column_names)
         return np.array(self.table.column(name).to_numpy(zero_copy_only=False))  # arrow memory is read-only
 
     def labels(self, task: str, *splits: str) -> np.ndarray:
-        """[N] int64 labels of ``task``, -1 where there is none or the task is not about the row (``Task.only``).
+        """Return int64 labels [N] of ``task``; -1 if a row has none or is excluded by ``Task.only``.
 
-        With ``splits``, -1 also where the row is, for this task, on another side (``Task.split``).
+        With ``splits``, labels of rows in other splits (column ``Task.split``) are -1, too.
         """
         if (task, *splits) not in self._labels:
             about = next(t for t in self.spec.tasks if t.name == task)
@@ -129,15 +152,21 @@ class Pack:
         return {}
 
     def has(self, modality: str) -> np.ndarray:
-        """bool [N]: which rows have an image of ``modality``; the others hold zeros, which nothing should look at."""
+        """Return bool [N]: which rows have an image of ``modality``. The images of the others are zeros: do not use them."""
         name = f"has_{modality}"
         return self.column(name) if name in self.table.column_names else np.ones(self.num, bool)
 
     def rows(
         self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = (), by: str = "split"
     ) -> np.ndarray:
-        """Ascending int64 row numbers whose split (column ``by``) is among ``splits``, whose columns equal ``only`` and
-        which have an image of every modality in ``having``."""
+        """Return row numbers, ascending int64.
+
+        Args:
+            splits: Splits to include.
+            only: Column -> value that a row must have.
+            having: Modalities of which a row must have an image.
+            by: Column with the split.
+        """
         mask = np.isin(self.column(by), splits)
         for modality in having:
             mask &= self.has(modality)
@@ -147,7 +176,7 @@ class Pack:
 
     @functools.cached_property
     def touch_groups(self) -> np.ndarray:
-        """[N] int64: number of each row's touch group (column touch_group, else group), in which rows are near-copies."""
+        """int64 [N], number of each row's touch group (column touch_group, else group): its rows are near-duplicates."""
         name = "touch_group" if "touch_group" in self.table.column_names else "group"
         return np.unique(self.column(name).astype(str), return_inverse=True)[1]
 
@@ -157,28 +186,30 @@ class Pack:
         return np.split(order, np.cumsum(np.bincount(self.touch_groups))[:-1])
 
     def rows_of(self, touch_group: int) -> np.ndarray:
-        """Ascending row numbers of touch group number ``touch_group``."""
+        """Return the row numbers of touch group number ``touch_group``, ascending."""
         return self._rows_by_touch_group[touch_group]
 
     @functools.cached_property
     def shards(self) -> np.ndarray:
-        """[N] int: number of the shard each row lies in; a pack on the disk is one."""
+        """int [N], number of each row's shard; a pack on disk is a single shard."""
         return np.zeros(self.num, np.int64)
 
     def near(self, rows: np.ndarray, num: int) -> np.ndarray:
-        """Those of ``rows`` (ascending) in the first shards, as many shards as hold ``num`` of them: to draw a sample from.
-        All of a pack on the disk; shards are in random order."""
+        """Return those of ``rows`` (ascending) that are in the first shards, which hold at least ``num`` of them.
+
+        Shards are in random order, so this is a random sample that needs few shards. A pack on disk returns all rows.
+        """
         return rows[self.shards[rows] <= self.shards[rows[:num]].max(initial=0)]
 
     def expect(self, rows: np.ndarray) -> None:
-        """Be told that ``rows`` are read next, in this order, and no others are soon: shards are fetched ahead by it."""
+        """Announce that ``rows`` are read next, in this order, so that shards can be fetched ahead."""
 
     def _files(self) -> dict[str, str]:
-        """Name of each image file that pack.json promises -> its modality."""
+        """Return image file -> modality, as described by pack.json."""
         return {f"{m}{SUFFIXES[self.store]}": m for m in self.spec.modalities}
 
     def _open(self, files: dict[str, str]) -> dict[str, Images]:
-        """The images of each modality, which lie in ``files``."""
+        """Open the image files."""
         reader = {"raw": self._map, "jpeg": self._jpegs}[self.store]
         return {m: reader(m, self._file(name)) for name, m in files.items()}
 
@@ -188,8 +219,7 @@ class Pack:
             raise ValueError(f"{self.path / name} does not match its digest{where}: the pack is damaged, make it again")
 
     def _damaged_rows(self, modality: str, images: Images, first: int = 0) -> str:
-        """Which rows of a damaged image file, from row ``first`` on, do not match their own sums, for the error; "" if
-        that cannot be said."""
+        """Return a text naming the rows, from ``first`` on, that do not match their checksums; "" if there are none."""
         if f"crc_{modality}" not in self.table.column_names:
             return ""
         sums = self.table.column(f"crc_{modality}").slice(first, len(images)).to_pylist()
@@ -224,9 +254,9 @@ class Pack:
         expected = self._shape(modality, self.num)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # about headers that only damage can produce
+                warnings.simplefilter("ignore")  # about damaged headers
                 images = np.load(path, mmap_mode="r", allow_pickle=False)
-        except Exception as error:  # numpy raises whatever a damaged header leads its parser to
+        except Exception as error:  # numpy raises many kinds for a damaged header
             raise ValueError(f"{path} cannot be mapped ({brief(error)}): the pack is damaged, make it again") from None
         if not isinstance(images, np.ndarray) or images.shape != expected or images.dtype != np.uint8:
             held = f"{images.dtype} {images.shape}" if isinstance(images, np.ndarray) else "no array"
@@ -235,21 +265,15 @@ class Pack:
 
 
 def check_table(table: pa.Table, spec: DataSpec) -> None:
-    """What every reader of a pack's table relies on; ValueError names the column, the row and what is allowed."""
+    """Check what every reader of a pack's table relies on; ValueError names the column, the row and what is allowed."""
     labels = {f"label_{task.name}": len(task.classes) for task in spec.tasks}
-    for name in ("id", "group", "split", *labels, *(c for columns in spec.controls.values() for c in columns)):
+    controls = [c for columns in spec.controls.values() for c in columns]
+    for name in ("id", "group", "split", *labels, *controls, *(c for task in spec.tasks for c in task.only)):
         if name not in table.column_names:
             raise unknown("column", name, table.column_names)
-    for name in (name for task in spec.tasks for name in task.only):
-        if name not in table.column_names:
-            raise unknown("column", name, table.column_names)
-
-    def first(bad: Any) -> int:
-        return int(np.flatnonzero(np.asarray(bad))[0])
-
     for name in ("id", "group", "split", "touch_group", *labels):
         if name in table.column_names and table.column(name).null_count:
-            row = first(table.column(name).is_null().to_numpy())
+            row = _first(table.column(name).is_null().to_numpy())
             raise ValueError(f"column {name} is empty in row {row}: every row needs one")
     for name in (f"has_{modality}" for modality in spec.modalities):
         if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
@@ -261,33 +285,47 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
             if split not in SPLITS:
                 raise unknown(column, str(split), SPLITS)
     for name, num in labels.items():
-        kind = table.column(name).type
-        if not pa.types.is_integer(kind):
-            raise ValueError(f"column {name} holds {kind}: a label is a whole number, 0 to {num - 1}, or -1 for none")
-        values = table.column(name).to_numpy()
-        if ((values < -1) | (values >= num)).any():
-            row = first((values < -1) | (values >= num))
-            raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
-    for name in (c for columns in spec.controls.values() for c in columns):
-        kind = table.column(name).type
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-            raise ValueError(f"column {name} holds {kind}: a control needs a number in every row")
-        values = table.column(name).to_numpy(zero_copy_only=False).astype(float)
-        if not np.isfinite(values).all():
-            raise ValueError(f"column {name} is no number in row {first(~np.isfinite(values))}: a control needs one")
+        _check_labels(table.column(name), name, num)
+    for name in controls:
+        _check_numbers(table.column(name), name)
     _check_ids(table.column("id").to_pylist())
+
+
+def _first(bad: np.ndarray) -> int:
+    return int(np.flatnonzero(bad)[0])
+
+
+def _check_labels(column: pa.ChunkedArray, name: str, num: int) -> None:
+    if not pa.types.is_integer(column.type):
+        raise ValueError(
+            f"column {name} holds {column.type}: a label is a whole number, 0 to {num - 1}, or -1 for none"
+        )
+    values = column.to_numpy()
+    if (bad := (values < -1) | (values >= num)).any():
+        row = _first(bad)
+        raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
+
+
+def _check_numbers(column: pa.ChunkedArray, name: str) -> None:
+    kind = column.type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+        raise ValueError(f"column {name} holds {kind}: a control needs a number in every row")
+    if (bad := ~np.isfinite(column.to_numpy(zero_copy_only=False).astype(float))).any():
+        raise ValueError(f"column {name} is not a number in row {_first(bad)}: a control needs one")
 
 
 def _check_ids(ids: list[Any]) -> None:
     seen: set[Any] = set()
     for one in ids:
         if one in seen:
-            raise ValueError(f"id {one!r} is there twice: give every sample its own")
+            raise ValueError(f"id {one!r} occurs twice: give every sample its own")
         seen.add(one)
 
 
 def has_difference(pack: Pack) -> bool:
-    """Whether touch is stored minus its background; packs from before their description said so tell by how they were
-    asked for."""
-    asked = pack.meta.get("fingerprint") or {}
-    return pack.spec.difference or bool((asked.get("options") or asked).get("difference"))
+    """Return whether touch is stored minus its background.
+
+    Older packs have no such field in their spec, only the option in their fingerprint.
+    """
+    options = pack.meta.get("fingerprint") or {}
+    return pack.spec.difference or bool((options.get("options") or options).get("difference"))

@@ -1,8 +1,8 @@
-"""What of an unfinished pack is on the disk: image files, and parts that vouch for the rows written to them.
+"""Files of an unfinished pack: image files, and one file per part with the checksums of its rows.
 
-A raw image is written once, at its final place. JPEGs, whose place depends on the length of all before them, are written in
-files of the parts, which are joined in order. A part's own file comes last and holds the sums of its rows, so whatever was
-cut is found and done again (``data/build.py``). No torch here.
+Raw images are written directly to their final position. The position of a JPEG depends on the length of all before it, so
+each part writes its JPEGs to a file of its own, and these are joined in order. The part's own file is written last: a
+resumed build (``data/build.py``) verifies the checksums and repeats the parts that fail. This module does not import torch.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from mvitac.data.jpeg import encode
 from mvitac.system.files import naming, read_json
 
 LIKELY_RATIO = 3
-"""Bytes of an image's pixels over those of its JPEG: rather low, real frames have 4 at 64 px and 6 to 10 at 256."""
+"""Assumed compression ratio of JPEG. It is a low estimate: real frames have 4 at 64 px and 6 to 10 at 256 px."""
 
 Buffer = bytes | memoryview
 
 
 @dataclass(frozen=True)
 class RowFile:
-    """The image file of one modality, made at full length: whoever has a row writes it at its place."""
+    """The image file of one modality, created at full length. Each row is written at its position."""
 
     path: Path
     num: int
     shape: tuple[int, int, int]
 
     def header(self, num: int) -> bytes:
-        """What stands before ``num`` rows; numpy leaves room in it, so that its length is the same for any number."""
+        """Return the .npy header of ``num`` rows; numpy pads it, so its length does not depend on ``num``."""
         buffer = io.BytesIO()
         shape = (num, *self.shape)
         np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
         return buffer.getvalue()
 
     def place(self, row: int) -> int:
-        """Byte of the file at which ``row`` begins."""
+        """Return the position of ``row`` in the file."""
         return len(self.header(self.num)) + row * math.prod(self.shape)
 
     def need(self) -> int:
-        """Bytes of disk that are yet to be taken."""
+        """Return the disk space in bytes that is still needed."""
         return self.place(self.num) - (self.path.stat().st_blocks * 512 if self.path.exists() else 0)
 
     def create(self) -> None:
-        """Make the file, zeros that take no space; what an interrupted build wrote stays."""
+        """Create a sparse file of zeros; keep what an interrupted build wrote."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.touch()
         with naming(self.path), self.path.open("r+b") as file:
@@ -57,34 +57,34 @@ class RowFile:
             file.truncate(self.place(self.num))
 
     def stored(self, image: np.ndarray) -> Buffer:
-        """``image`` as it is written."""
+        """Return the bytes to write for ``image``."""
         return image.data
 
     def put(self, part: Part, start: int, rows: Iterable[Buffer]) -> None:
-        """Write rows ``start`` on of ``part``."""
+        """Write rows of ``part``, beginning with its row ``start``."""
         self.write(part.first + start, rows)
 
     def write(self, first: int, rows: Iterable[Buffer]) -> None:
-        """Write rows ``first`` on. (Not through a map: on a full disk a store into a map kills the process.)"""
+        """Write rows from ``first`` on. Not by a memory map: on a full disk, writing to one kills the process."""
         with naming(self.path), self.path.open("r+b") as file:
             file.seek(self.place(first))
             for row in rows:
                 file.write(row)
 
     def map(self) -> np.ndarray:
-        """All rows, to read, mapped."""
+        """Return all rows, memory-mapped for reading."""
         return np.load(self.path, mmap_mode="r", allow_pickle=False)
 
     def found(self, part: Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
-        """The ``num`` rows of ``part`` as they are on the disk; ``lengths`` are for JPEGs only."""
+        """Return the ``num`` rows of ``part`` that are on disk; ``lengths`` are used by JPEGs only."""
         return (image.data for image in self.map()[part.first : part.first + num])
 
     def join(self, part: Part, num: int) -> Buffer:
-        """The bytes of the ``num`` rows of ``part``, which are in place."""
+        """Return the bytes of the ``num`` rows of ``part``, which are in their final position already."""
         return self.map()[part.first : part.first + num].data
 
     def close_holes(self, runs: Sequence[tuple[int, int]]) -> None:
-        """Move rows up so that the ``runs`` (first row, how many), in order, leave nothing between them or behind."""
+        """Move rows so that the ``runs`` (first row, number of rows), in order, are contiguous; truncate the file."""
         images, to = self.map(), 0
         for first, num in runs:
             if first != to:
@@ -97,9 +97,9 @@ class RowFile:
 
 @dataclass(frozen=True)
 class JpegFile:
-    """The image file of one modality where JPEG is stored: each part's rows in a file of its own, then joined in order.
+    """The JPEG file of one modality. Each part writes its rows to a file of its own; these are then joined in order.
 
-    So an image is on the disk twice until the pack is finished, and whatever interrupts the joining, it begins anew.
+    Until the pack is finished, each image is on disk twice. Joining starts again after an interruption.
     """
 
     path: Path
@@ -108,65 +108,68 @@ class JpegFile:
     quality: int
 
     def header(self, num: int) -> bytes:
-        """Nothing stands before the rows."""
+        """Return b"": there is no header."""
         return b""
 
     def need(self) -> int:
-        """About how many bytes of disk are yet to be taken, at quality 95."""
+        """Estimate the disk space in bytes that is still needed, at quality 95."""
         parts = self.path.parent.parent.glob(f"part-*.{self.path.name}")
         taken = sum(path.stat().st_size for path in parts) + (self.path.stat().st_size if self.path.exists() else 0)
         return max(0, 2 * self.num * math.prod(self.shape) // LIKELY_RATIO - taken)
 
     def create(self) -> None:
-        """Make the file anew, empty: joining begins."""
+        """Create an empty file, to which parts are joined."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.write_bytes(b"")
 
     def stored(self, image: np.ndarray) -> Buffer:
-        """``image`` as it is written."""
+        """Return the bytes to write for ``image``."""
         return encode(image, self.quality)
 
     def part_file(self, part: Part) -> Path:
-        """Where the rows of ``part`` wait to be joined."""
+        """Return the file of the rows of ``part``."""
         return part.path.with_suffix(f".{self.path.name}")
 
     def put(self, part: Part, start: int, rows: Iterable[Buffer]) -> None:
-        """Write rows ``start`` on of ``part``; rows must come in order."""
+        """Write rows of ``part``, beginning with its row ``start``; call in order."""
         path = self.part_file(part)
         with naming(path), path.open("ab" if start else "wb") as file:
             for row in rows:
                 file.write(row)
 
     def found(self, part: Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
-        """The ``num`` rows of ``part``, of ``lengths`` bytes each, as they are on the disk."""
+        """Yield the ``num`` rows of ``part`` that are on disk; each has one of ``lengths`` bytes."""
         if num:
             with self.part_file(part).open("rb") as file:
                 yield from map(file.read, lengths)
 
     def join(self, part: Part, num: int) -> Buffer:
-        """Append the rows of ``part`` to those of the parts before it, and give their bytes."""
+        """Append the rows of ``part`` to those of earlier parts, and return their bytes."""
         jpegs = self.part_file(part).read_bytes() if num else b""
         with naming(self.path), self.path.open("ab") as file:
             file.write(jpegs)
         return jpegs
 
     def close_holes(self, runs: Sequence[tuple[int, int]]) -> None:
-        """There are none."""
+        """Do nothing: joined rows have no holes."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Items ``items[0]`` up to ``items[1]``, whose rows begin at ``first``; done where its file says so and is right."""
+    """Items ``items[0]`` up to (excluding) ``items[1]``; their rows begin at ``first``."""
 
     path: Path
     items: tuple[int, int]
     first: int
     stamp: str | None = None
-    """Of the files that its items are read from, if they are files."""
+    """Digest of the stamps of the files that the items are read from, if any."""
 
     def read(self) -> dict[str, Any]:
-        """columns, damaged, lost, crc and bytes (modality -> sum and, of JPEGs, length of each row); ValueError if it is
-        not there, or of other rows or of files that have changed since."""
+        """Return what the part's file says: columns, damaged, lost, and by modality crc and bytes (JPEG) of each row.
+
+        Raises:
+            ValueError: If the file does not exist, or is about other rows or about files that have changed.
+        """
         known = read_json(self.path, "a part of an unfinished pack")
         if (known["items"], known["first"], known.get("stamp")) != ([*self.items], self.first, self.stamp):
             raise ValueError(f"{self.path} is of other rows or files: delete it and run the same command again")

@@ -1,4 +1,4 @@
-"""A pack written anew in shards, for ``data/streaming.py`` to read: to a folder, or to any store fsspec knows."""
+"""Writes a pack as shards for ``data/streaming.py``, to a folder or any store that fsspec supports."""
 
 from __future__ import annotations
 
@@ -18,21 +18,25 @@ from mvitac.system.progress import shown, work
 
 
 def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, quiet: bool = False) -> int:
-    """Write ``pack`` to ``url`` in shards of at most ``shard_mb`` MB, all modalities together, and return their number.
+    """Write ``pack`` to ``url`` in shards and return their number.
 
-    pack.json comes last, so what was interrupted is no pack and is written again. ValueError if there is a pack, or if
-    nothing can be written there.
+    pack.json is written last, so an interrupted call leaves no valid pack and can be repeated.
+
+    Args:
+        pack: The pack to write.
+        url: A folder, or a URL that fsspec supports.
+        shard_mb: Largest size of a shard in MB, all modalities together.
+        seed: Random seed for the order of touch groups.
+        quiet: Show no progress bar.
+
+    Raises:
+        ValueError: If ``url`` has a pack already or cannot be written.
     """
     if not shard_mb > 0:
         raise ValueError(f"shard_mb {shard_mb}: give a positive number of megabytes")
     system, place = reach(url)
-    parts = deal_rows(pack, int(shard_mb * 1e6), seed)
-    digests = {}
-
-    def put(name: str, data: bytes) -> None:
-        system.pipe_file(f"{place}/{name}", data)
-        digests[name] = hashlib.sha256(data).hexdigest()
-
+    parts = assign_rows(pack, int(shard_mb * 1e6), seed)
+    digests: dict[str, str] = {}
     try:
         if system.exists(f"{place}/pack.json"):
             raise ValueError(f"{url} holds a pack already: choose another place, or delete it first")
@@ -40,27 +44,30 @@ def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, q
         with shown(quiet=quiet), work("writing shards", len(parts), "shards") as advance:
             for number, rows in enumerate(parts):
                 for modality in pack.spec.modalities:
-                    put(shard_name(number, modality, pack.store), _stored(pack, modality, rows))
+                    name, data = shard_name(number, modality, pack.store), _stored(pack, modality, rows)
+                    system.pipe_file(f"{place}/{name}", data)
+                    digests[name] = hashlib.sha256(data).hexdigest()
                 advance()
         buffer = io.BytesIO()
         pq.write_table(pack.table.take(pa.array(np.concatenate(parts))), buffer)
-        put("samples.parquet", buffer.getvalue())
+        system.pipe_file(f"{place}/samples.parquet", buffer.getvalue())
+        digests["samples.parquet"] = hashlib.sha256(buffer.getvalue()).hexdigest()
         rest = {key: value for key, value in pack.meta.items() if key != "digest"}
         meta = {**rest, "format": SHARDED, "pack": pack.digest, "shards": [len(rows) for rows in parts]}
         meta = {**meta, "seed": seed, "digests": digests}
         system.pipe_file(f"{place}/pack.json", json.dumps({**meta, "digest": digest(meta)}, indent=1).encode())
     except (ValueError, OSError, KeyboardInterrupt):
         raise
-    except Exception as error:  # every kind of store has its own
+    except Exception as error:  # each kind of store raises its own
         raise ValueError(f"{url} cannot be written ({brief(error)})") from None
     return len(parts)
 
 
-def deal_rows(pack: Pack, limit: int, seed: int) -> list[np.ndarray]:
-    """The rows of each shard, ascending, at most ``limit`` bytes of images each (but one row at least).
+def assign_rows(pack: Pack, limit: int, seed: int) -> list[np.ndarray]:
+    """Return the rows of each shard, ascending, with at most ``limit`` bytes of images (but at least one row).
 
-    First what is pre-trained on, so that training reads nothing else, then val, then test. Touch groups come in random
-    order; a group is cut only if it is larger than a shard.
+    Shards of train and unlabelled rows come first, then val, then test, so that training reads no others. Touch groups
+    are in random order; only a group larger than a shard is divided.
     """
     sizes = np.sum([_bytes_per_row(pack, modality) for modality in pack.spec.modalities], axis=0)
     side = np.select([np.isin(split := pack.column("split"), ("train", "unlabelled")), split == "val"], [0, 1], 2)
@@ -89,7 +96,7 @@ def _bytes_per_row(pack: Pack, modality: str) -> np.ndarray:
 
 
 def _stored(pack: Pack, modality: str, rows: np.ndarray) -> bytes:
-    """``rows`` as a pack's image file holds them."""
+    """Return the content of the image file of ``rows``."""
     images = pack.images[modality]
     if isinstance(images, Jpegs):
         return b"".join(images.jpeg(row) for row in rows.tolist())

@@ -1,12 +1,12 @@
-"""A pack in shards, read from a URL: whole shards come, in order and ahead of time, into a local folder of bounded size.
+"""Reads a pack in shards from a URL: whole shards are fetched in advance into a local cache of limited size.
 
-    <url>/pack.json                 as a pack's, with the rows of each shard
+    <url>/pack.json                 as a pack's, with the number of rows of each shard
           samples.parquet           as a pack's, in the order of the shards
           shard-00000.vision.npy    uint8 [n, size, size, 3]; or .jpegs, as in a pack
           shard-00000.touch.npy     ...
 
-Rows of one touch are in one shard if they fit, in random order otherwise, so any few shards are a sample of all
-(``data/sharding.py`` writes them). To its reader it is a ``Pack``: same table, same images by row. No torch here.
+Touch groups are in random order and each in one shard (if it fits), so any few shards are a random sample
+(``data/sharding.py`` writes them). A ``StreamedPack`` has the interface of ``Pack``. This module does not import torch.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from mvitac.registry import from_json
 from mvitac.system.files import brief, check_place, digest_file
 
 NUM_FETCHING = 4
-"""Files on their way at a time."""
+"""Number of files fetched at a time."""
 HEADER = 128
-"""Bytes before the rows of a .npy; numpy leaves room in it for any number of them."""
+"""Bytes of a .npy header; numpy pads it to this length for any number of rows."""
 
 
 def reach(url: str) -> tuple[Any, str]:
-    """The fsspec file system of ``url`` and the place in it; ValueError if there is no such kind of place."""
+    """Return the fsspec file system of ``url`` and the path in it; ValueError if fsspec does not know the protocol."""
     try:
         system, place = fsspec.url_to_fs(url)
     except ImportError as error:
@@ -53,14 +53,18 @@ def shard_name(number: int, modality: str, store: str) -> str:
 
 
 class StreamedPack(Pack):
-    """The pack in shards at ``url``."""
+    """The pack in shards at a URL."""
 
     format: ClassVar[str] = SHARDED
 
     def __init__(self, url: str, cache: Path, *, limit: int, window: int) -> None:
-        """Open ``url``, with at most ``limit`` bytes of shards in the folder ``cache``. Every file is checked when it comes.
+        """Open ``url``. Each file is verified after it is fetched.
 
-        ``window``: shards whose rows training mixes. ValueError if two such windows do not fit into the cache.
+        Args:
+            url: Location of the shards.
+            cache: Folder for fetched shards.
+            limit: Largest size of the cache in bytes; two windows must fit.
+            window: Number of shards whose rows training mixes at a time.
         """
         self.url, self.window, self._limit = url, window, limit
         self._fetched: list[int] = []
@@ -70,7 +74,7 @@ class StreamedPack(Pack):
         known, given = folder / "pack.json", folder / "given.json"
         self._fetch("pack.json", given, missing="make one with `mvitac data shard PACK URL`")
         same = known.is_file() and known.read_bytes() == given.read_bytes()
-        for path in folder.iterdir():  # of another pack, or cut short
+        for path in folder.iterdir():  # of another pack, or incomplete
             if path != given and (not same or path.suffix == ".part"):
                 path.unlink()
         given.replace(known)
@@ -79,12 +83,14 @@ class StreamedPack(Pack):
         try:
             super().__init__(folder, verify=False)
         except ValueError as error:
-            (folder / "samples.parquet").unlink(missing_ok=True)  # else it would stay when the one at the URL is mended
+            (folder / "samples.parquet").unlink(
+                missing_ok=True
+            )  # else it would remain after the one at the URL is repaired
             raise ValueError(str(error).replace(str(folder), url)) from None
 
     @property
     def fetched(self) -> int:
-        """Bytes of images that came from ``url`` so far."""
+        """Bytes of images fetched from ``url`` so far."""
         return sum(self._fetched)
 
     @functools.cached_property
@@ -94,7 +100,7 @@ class StreamedPack(Pack):
     def expect(self, rows: np.ndarray) -> None:
         numbers = self.shards[rows]
         first = np.full(len(self._counts), len(rows))
-        first[numbers[::-1]] = np.arange(len(rows))[::-1]  # of several, the last to be written stays: the first row
+        first[numbers[::-1]] = np.arange(len(rows))[::-1]  # the last assignment wins: the first row of each shard
         coming = [number for number in np.argsort(first, kind="stable").tolist() if first[number] < len(rows)]
         self._cache.expect([shard_name(n, m, self.store) for n in coming for m in self.spec.modalities])
 
@@ -117,22 +123,19 @@ class StreamedPack(Pack):
                 f" give --data.cache-gb {need / 1e9 + 0.0005:.3f} per process on a machine, or a smaller --data.window"
             )
 
-        def load(name: str) -> Images:
-            return self._load(name, files[name], rows[name])
-
-        self._cache = Cache(self.path, sizes, self._limit, load)
+        self._cache = Cache(self.path, sizes, self._limit, lambda name: self._load(name, files[name], rows[name]))
         return {
             m: Shards(self._shape(m, self.num), starts, functools.partial(self._shard, m)) for m in self.spec.modalities
         }
 
     def _lengths(self, modality: str, starts: np.ndarray) -> np.ndarray:
-        """[number of shards] int64: bytes of each file."""
+        """Return int64 [number of shards], the bytes of each file."""
         if self.store == "jpeg":
             return np.add.reduceat(self.column(f"bytes_{modality}").astype(np.int64), starts[:-1])
         return HEADER + np.diff(starts) * int(np.prod(self._shape(modality, 1)))
 
     def _shard(self, modality: str, number: int) -> Images:
-        """The images of shard ``number``; who reads one shard after another finds the next one under way."""
+        """Return the images of shard ``number``; when shards are read in sequence, the next one is fetched in advance."""
         after = shard_name(number + 1, modality, self.store) if number + 1 < len(self._counts) else None
         return self._cache.get(shard_name(number, modality, self.store), after)
 
@@ -153,7 +156,7 @@ class StreamedPack(Pack):
     def _read(self, path: Path, modality: str, rows: range) -> Images:
         if self.store == "jpeg":
             return self._jpegs(modality, path, slice(rows.start, rows.stop))
-        # Not np.load: Python's parser, which it gives the header to, failed once where threads used it together.
+        # Not np.load, which parses the header with Python's parser: that failed once in several threads.
         return np.memmap(path, np.uint8, "r", HEADER, self._shape(modality, len(rows)))
 
     def _fetch(self, name: str, path: Path, missing: str = "it is damaged, make it again") -> None:
@@ -162,13 +165,13 @@ class StreamedPack(Pack):
             self._system.get_file(f"{self._place}/{name}", str(part))
         except FileNotFoundError:
             raise ValueError(f"no {name} at {self.url}: {missing}") from None
-        except Exception as error:  # every kind of store has its own
+        except Exception as error:  # each kind of store raises its own
             raise ValueError(f"{self.url}/{name} cannot be read ({brief(error)})") from None
         part.replace(path)
 
 
 class Shards(Lazy):
-    """The rows of all shards of one modality: those of a shard are read together."""
+    """The images of one modality in all shards. Rows of the same shard are read together."""
 
     def __init__(self, shape: tuple[int, int, int, int], starts: np.ndarray, shard: Callable[[int], Images]) -> None:
         super().__init__(shape)
@@ -184,21 +187,27 @@ class Shards(Lazy):
 
 
 class Cache:
-    """Files in a folder of bounded size: what is expected is loaded by threads and stays, the rest goes, oldest first."""
+    """A folder of limited size. Threads load the expected files; others are deleted, least recently used first."""
 
     def __init__(self, folder: Path, sizes: dict[str, int], limit: int, load: Callable[[str], Images]) -> None:
-        """``load`` fetches a file into ``folder`` if it is not there, and opens it. ``limit`` >= all that is expected
-        plus the largest of ``sizes``."""
+        """Create a cache.
+
+        Args:
+            folder: The folder, used by this process only.
+            sizes: File name -> bytes.
+            limit: Largest total size in bytes.
+            load: Fetches a file into ``folder``, if it is not there, and opens it.
+        """
         self._folder, self._sizes, self._limit, self._load = folder, sizes, limit, load
         self._mutex, self._pool = threading.Lock(), ThreadPoolExecutor(NUM_FETCHING, "shards")
         self._kept: set[str] = set()
         self._next: str | None = None
-        # Files here, in the order of their last use, or on their way; None: left by an earlier process, to be looked at.
+        # Files here or being fetched, by last use. None: left by an earlier process, not yet verified.
         self._held: dict[str, Future[Images] | None] = {p.name: None for p in folder.iterdir() if p.name in sizes}
         self._make_room(0)
 
     def expect(self, names: Iterable[str]) -> None:
-        """Keep or load the first of ``names``, as many as fit; what else has not begun to come does not."""
+        """Keep or load as many of the first ``names`` as fit; cancel other files that are not being fetched yet."""
         room, expected = self._limit - max(self._sizes.values()), []
         for name in names:
             room -= self._sizes[name]
@@ -213,8 +222,10 @@ class Cache:
                 self._start(name)
 
     def get(self, name: str, after: str | None = None) -> Images:
-        """The images in file ``name``, waited for; where nothing is expected, and ``name`` is what came ``after`` the last
-        one asked for, the one ``after`` it begins to come."""
+        """Wait for file ``name`` and return its images.
+
+        If nothing is expected and files are read in sequence, the next file ``after`` is fetched in advance.
+        """
         while True:
             with self._mutex:
                 future = self._start(name)
@@ -223,7 +234,7 @@ class Cache:
                 self._next = after or name
             try:
                 return future.result()
-            except CancelledError:  # another thread expects something else
+            except CancelledError:  # another thread called expect()
                 continue
             except BaseException:
                 with self._mutex:
@@ -246,13 +257,13 @@ class Cache:
             future = self._held.pop(name)
             if future and not future.cancel():
                 wait([future])
-            (self._folder / name).unlink(missing_ok=True)  # who has it mapped may still read it
+            (self._folder / name).unlink(missing_ok=True)  # a process that has mapped it can still read it
             room += self._sizes[name]
 
 
 def _own_folder(cache: Path) -> tuple[Path, FileLock]:
-    """A folder in ``cache`` for this process alone, as long as the lock lives; those of ended processes are deleted."""
-    gc.collect()  # of this process's own packs, those that nobody uses any more: they hold locks
+    """Return a folder in ``cache`` for this process, and its lock; delete the folders of processes that ended."""
+    gc.collect()  # packs of this process that are no longer used hold locks
     cache.mkdir(parents=True, exist_ok=True)
     own: tuple[Path, FileLock] | None = None
     for number in itertools.count():
@@ -269,9 +280,9 @@ def _own_folder(cache: Path) -> tuple[Path, FileLock]:
         else:
             folder.mkdir(exist_ok=True)
             own = folder, lock
-    raise AssertionError("there are enough numbers")
+    raise AssertionError("unreachable: the numbers are unlimited")
 
 
 def share_of(cache_gb: float) -> int:
-    """Bytes of ``cache_gb`` that are this process's: torchrun says how many there are on the machine."""
+    """Return this process's part of ``cache_gb`` in bytes (torchrun sets the number of processes per machine)."""
     return int(cache_gb * 1e9) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))

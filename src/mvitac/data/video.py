@@ -1,9 +1,8 @@
-"""Listed frames of a video file, each decoded once, in one forward pass.
+"""Reads chosen frames of a video file, each decoded once, in one forward pass.
 
-Frame i is the i-th in display order, from 0: what seeking a player to frame i shows. Its place is taken from the
-container's own table of packets, never from a time multiplied by a nominal rate; the decoder starts at the last key frame
-before a stretch of wanted frames and skips what lies between stretches, so that a few touches in an hour of video cost
-their own frames and not the hour. Memory is bounded by the decoder's. No torch here: packing workers import it.
+Frame i is the i-th in display order, from 0. Its position is read from the container's packet table, not computed from a
+nominal frame rate. The decoder starts at the last key frame before a run of wanted frames and skips the packets between
+runs, so a few touches in an hour of video are cheap. Packing workers import this module, so it does not import torch.
 """
 
 from __future__ import annotations
@@ -31,97 +30,127 @@ from mvitac.system.files import brief
 
 @dataclass(frozen=True)
 class Packets:
-    """The packets that the decoder needs, in the order in which they are stored and decoded.
+    """The packet table of a video, in the order in which packets are stored and decoded.
 
-    Those that an edit list cuts off (a trim without re-encoding) are decoded, since others refer to them, but not shown:
-    they are no frames.
+    Packets cut off by an edit list (a trim without re-encoding) are decoded, because others refer to them, but not
+    displayed, so they do not count as frames.
     """
 
     dts: np.ndarray
     """[P] int64 decoding times."""
     places: np.ndarray
-    """[P] int64 where they are in the file."""
+    """[P] int64 positions in the file."""
     keys: np.ndarray
     """[K] int64 ascending numbers of the packets at which decoding can start."""
     before: np.ndarray
-    """[P + 1] int64 how many frames are stored before each packet, and in all."""
+    """[P + 1] int64 number of frames stored before each packet, and in total."""
     shape: tuple[int, int]
-    """Height and width of the frames, as the container says."""
+    """Height and width of the frames according to the container."""
 
     @property
     def num(self) -> int:
-        """How many frames are shown."""
+        """Number of displayed frames."""
         return int(self.before[-1])
 
     def start_of(self, frame: int) -> int:
-        """Number in ``keys`` of the last key packet before which no more than ``frame`` frames are stored."""
+        """Return the index in ``keys`` of the last key packet with at most ``frame`` frames stored before it."""
         return max(0, int(np.searchsorted(self.before[self.keys], frame, side="right")) - 1)
 
 
 def num_frames(path: str | Path) -> int:
-    """How many frames the file promises; ValueError or OSError if it is no whole video."""
+    """Return the number of frames according to the container; ValueError or OSError if it is not a complete video."""
     return _packets(path).num
 
 
 def frame_shape(path: str | Path) -> tuple[int, int]:
-    """Height and width of the frames, as the file promises; ValueError or OSError if it is no whole video."""
+    """Return height and width of the frames; ValueError or OSError if it is not a complete video."""
     return _packets(path).shape
 
 
 def frames(
     path: str | Path, wanted: Iterable[int], size: int | None = None, *, lost: dict[int, str] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """The ``wanted`` frames in ascending order, as (i, uint8 RGB [H, W, 3]), squashed to [size, size, 3] if given.
+    """Yield the ``wanted`` frames in ascending order as (i, uint8 RGB [H, W, 3]).
 
-    A frame that the file does not hold or that is damaged raises ValueError; with ``lost`` it is left out and its reason
-    is put there instead. OSError if the file cannot be read at all.
+    Args:
+        path: The video.
+        wanted: Frame numbers, from 0.
+        size: Resize frames to [size, size, 3].
+        lost: Receives the reason for each frame that is missing or damaged; without it, such a frame is an error.
+
+    Raises:
+        ValueError: If a frame is missing or damaged and ``lost`` is not given.
+        OSError: If the file cannot be read.
     """
-    pending = sorted({int(i) for i in wanted}, reverse=True)  # the next one is the last
-    if pending and pending[-1] < 0:
-        raise ValueError(f"{path}: frame {pending[-1]} is wanted: frames are counted from 0")
-    packets = _packets(path)
-
-    def lose(why: str = "is beyond the end of what can be read: the file is cut off, fetch it again") -> None:
-        frame = pending.pop()
-        if frame >= packets.num:
-            why = f"is wanted, the video ends after frame {packets.num - 1}: is it the right one, and whole?"
-        if lost is None:
-            raise ValueError(f"{path}: frame {frame} {why}")
-        lost[frame] = why
-
+    pending = _Pending(path, wanted, lost)
     with _opened(path) as (container, stream):
-        shrink = VideoReformatter()  # keeps its tables from frame to frame
+        reformatter = VideoReformatter()  # keeps its tables from frame to frame
         key = 0
         while pending:
-            if pending[-1] >= packets.num:
-                lose()
+            if pending.next >= pending.packets.num:
+                pending.lose()
                 continue
-            key = max(key, packets.start_of(pending[-1]))
-            run = _Run(container, stream, packets, key)
-            if run.first > pending[-1] and key:  # the key frame is shown after the frame that it was to lead to
-                run = _Run(container, stream, packets, key - 1)
+            key = max(key, pending.packets.start_of(pending.next))
+            run = _Run(container, stream, pending.packets, key)
+            if run.first > pending.next and key:  # the key frame is displayed after the frame that depends on it
+                run = _Run(container, stream, pending.packets, key - 1)
             for number, frame in run.frames():
-                while pending and pending[-1] < number:
-                    lose(f"cannot be decoded ({run.trouble or 'nothing came out'}): fetch the video again")
-                if pending and pending[-1] == number:
-                    if run.trouble:
-                        lose(f"cannot be decoded ({run.trouble}): fetch the video again")
-                    else:
-                        pending.pop()
-                        yield number, _rgb(shrink, frame, size)
-                if not pending:
-                    break
-                ahead = packets.start_of(pending[-1])
-                if ahead > key and packets.keys[ahead] > run.fed + 1:  # nearer to what is wanted next
+                if pending.take(number, run.trouble):
+                    yield number, _rgb(reformatter, frame, size)
+                if not pending or pending.is_nearer_from(key, run.fed):
                     break
             else:
                 while pending:
-                    lose()
+                    pending.lose()
 
 
-def _rgb(shrink: VideoReformatter, frame: VideoFrame, size: int | None) -> np.ndarray:
-    """Bilinear, as Pillow does it when shrinking (every source pixel counts), but straight from the decoder's planes."""
-    made = shrink.reformat(
+class _Pending:
+    """The wanted frames of a video that have not been reached yet."""
+
+    def __init__(self, path: str | Path, wanted: Iterable[int], lost: dict[int, str] | None) -> None:
+        self._path, self._lost = path, lost
+        self._numbers = sorted({int(i) for i in wanted}, reverse=True)  # the next one is the last
+        if self._numbers and self.next < 0:
+            raise ValueError(f"{path}: frame {self.next} is wanted: frames are counted from 0")
+        self.packets = _packets(path)
+
+    def __bool__(self) -> bool:
+        return bool(self._numbers)
+
+    @property
+    def next(self) -> int:
+        return self._numbers[-1]
+
+    def take(self, number: int, trouble: str) -> bool:
+        """Return whether frame ``number`` is wanted and good; frames before it, and it if ``trouble``, are lost."""
+        while self._numbers and self.next < number:
+            self.lose(f"cannot be decoded ({trouble or 'nothing came out'}): fetch the video again")
+        if not self._numbers or self.next != number:
+            return False
+        if trouble:
+            self.lose(f"cannot be decoded ({trouble}): fetch the video again")
+            return False
+        self._numbers.pop()
+        return True
+
+    def is_nearer_from(self, key: int, fed: int) -> bool:
+        """Return whether the next frame is reached sooner from a later key packet than from packet ``fed``."""
+        ahead = self.packets.start_of(self.next)
+        return ahead > key and self.packets.keys[ahead] > fed + 1
+
+    def lose(self, why: str = "is beyond the end of what can be read: the file is cut off, fetch it again") -> None:
+        """Give up the next frame."""
+        frame = self._numbers.pop()
+        if frame >= self.packets.num:
+            why = f"is wanted, the video ends after frame {self.packets.num - 1}: is it the right one, and whole?"
+        if self._lost is None:
+            raise ValueError(f"{self._path}: frame {frame} {why}")
+        self._lost[frame] = why
+
+
+def _rgb(reformatter: VideoReformatter, frame: VideoFrame, size: int | None) -> np.ndarray:
+    """Resize bilinearly as Pillow does (every source pixel counts), but directly from the decoder's planes."""
+    made = reformatter.reformat(
         frame,
         width=size or frame.width,
         height=size or frame.height,
@@ -132,19 +161,19 @@ def _rgb(shrink: VideoReformatter, frame: VideoFrame, size: int | None) -> np.nd
 
 
 class _Run:
-    """One start of the decoder, at key packet number ``key`` of ``packets``; ``frames`` numbers what comes out."""
+    """Decodes from key packet number ``key`` of ``packets`` to the end of the file."""
 
     def __init__(self, container: InputContainer, stream: VideoStream, packets: Packets, key: int) -> None:
         self._context, self._packets = stream.codec_context, packets
         self._context.flush_buffers()
         self.fed = int(packets.keys[key])
-        """Number of the packet handed to the decoder last."""
+        """Number of the packet given to the decoder last."""
         self.trouble = ""
-        """What is wrong with the stream from here to the next key frame, if anything."""
-        self._hurt = 0  # when the damaged frame is displayed
+        """Error in the stream that affects frames up to the next key frame; "" = none."""
+        self._hurt = 0  # display time of the damaged frame
         self._demuxed = _from(container, stream, int(packets.dts[self.fed]))
-        # Pictures shown before a key frame may be stored after it, but before all others: they refer to what came before
-        # the key frame and belong to the start before this one. How many there are says which frame the key frame is.
+        # Frames displayed before a key frame may be stored directly after it. They refer to packets before the key
+        # frame, so they belong to the previous run. Their number determines the frame number of the key frame.
         self._ahead: list[Packet] = []
         for packet in self._demuxed:
             self._ahead.append(packet)
@@ -153,31 +182,29 @@ class _Run:
         self._shown = _shown(self._ahead[0]) if self._ahead else 0
         leading = sum(_shown(p) < self._shown and not p.is_discard for p in self._ahead)
         self.first = int(packets.before[self.fed]) + leading
-        """Which frame the key frame is, or if it is cut off the first one after it."""
+        """Frame number of the key frame or, if that is cut off, of the first frame after it."""
 
     def frames(self) -> Iterator[tuple[int, VideoFrame]]:
-        """(frame number, frame) in display order, from the key frame to the end of the file."""
-        due: list[int] = []  # times of the frames fed, from the key frame on, in display order
+        """Yield (frame number, frame) in display order, from the key frame to the end of the file."""
+        due: list[int] = []  # display times of the frames fed, from the key frame on
         for packet in self._all():
             if packet is not None:
                 self.fed += packet is not self._ahead[0]
                 if not self._is_next(packet):
-                    self._note("the table of its frames and what is there disagree", _shown(packet))
+                    self._note("its packet table and its packets disagree", _shown(packet))
                 if _shown(packet) >= self._shown and not packet.is_discard:
                     insort(due, _shown(packet))
             for frame in self._decoded(packet):
                 if frame.pts is not None and frame.pts >= self._shown:
-                    # Counted among the packets, so that a frame the decoder drops shifts no other.
+                    # Numbered by the packets, so that a frame dropped by the decoder does not shift the others.
                     yield self.first + bisect_left(due, frame.pts), frame
 
     def _is_next(self, packet: Packet) -> bool:
-        """Whether ``packet`` is the one that ``fed`` counts: after damage a demuxer may resume at a later one, unsaid."""
+        """Return whether ``packet`` is number ``fed``: after damage, a demuxer may silently skip packets."""
         if self.fed >= len(self._packets.places) or packet.pos is None:
             return False
-        return packet.pos - int(self._packets.places[self.fed]) in (
-            0,
-            8,
-        )  # with or without the header of an AVI's chunk
+        # With or without the header of an AVI chunk.
+        return packet.pos - int(self._packets.places[self.fed]) in {0, 8}
 
     def _all(self) -> Iterator[Packet | None]:
         yield from self._ahead
@@ -185,7 +212,7 @@ class _Run:
             yield from self._demuxed
         except FFmpegError as error:
             self._note(_reason(error), sys.maxsize)
-        yield None  # what the decoder still holds
+        yield None  # flush the decoder
 
     def _decoded(self, packet: Packet | None) -> Iterator[VideoFrame]:
         try:
@@ -205,7 +232,7 @@ class _Run:
 
 
 def _shown(packet: Packet) -> int:
-    """When a packet's frame is displayed, in the stream's own time units."""
+    """Return the display time of a packet's frame, in the stream's time base."""
     time = packet.pts if packet.pts is not None else packet.dts
     if time is None:
         raise ValueError("its frames carry no times: convert it, e.g. with ffmpeg -i IN -c:v copy OUT.mp4")
@@ -213,7 +240,7 @@ def _shown(packet: Packet) -> int:
 
 
 def _from(container: InputContainer, stream: VideoStream, dts: int) -> Iterator[Packet]:
-    """The packets from the one with time ``dts`` on."""
+    """Yield the packets from the one with decoding time ``dts``."""
     container.seek(dts, stream=stream, backward=True)
     found = False
     for packet in container.demux(stream):
@@ -224,14 +251,14 @@ def _from(container: InputContainer, stream: VideoStream, dts: int) -> Iterator[
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """The file and its video stream; errors name the file and say what to do."""
+    """Open a file and its video stream; errors name the file and say what to do."""
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise ValueError(f"{path} holds no video: give another file")
             stream = container.streams.video[0]
             stream.codec_context.thread_count = 1  # packing has a process per core
-            # Damage must be noticed, not painted over.
+            # Report damage instead of concealing it.
             stream.codec_context.options = {"err_detect": "explode+crccheck+bitstream+buffer"}
             yield container, stream
     except FFmpegError as error:
@@ -253,7 +280,7 @@ def _packets(path: str | Path) -> Packets:
 
 @functools.lru_cache(maxsize=8)
 def _read_packets(path: str, size: int, changed: int) -> Packets:
-    """The packet table: mp4 and a whole AVI carry one; of other files every packet is visited, none decoded."""
+    """Read the packet table. Mp4 and complete AVI files store one; in other files, all packets are visited."""
     with _opened(path) as (container, stream):
         shape = (stream.codec_context.height, stream.codec_context.width)
         table = stream.index_entries
@@ -267,7 +294,7 @@ def _read_packets(path: str, size: int, changed: int) -> Packets:
     dts, places = (np.array([row[i] for row in found], np.int64) for i in (0, 1))
     keys = np.flatnonzero([key for _, _, key, _ in found])
     if (np.diff(dts) <= 0).any() and before[-1] < len(dts):
-        raise ValueError(f"{path} is put together from pieces by an edit list: encode it anew, ffmpeg -i IN OUT.mp4")
+        raise ValueError(f"{path} is put together from pieces by an edit list: encode it again, ffmpeg -i IN OUT.mp4")
     if (np.diff(dts) <= 0).any() or not len(keys):
         raise ValueError(f"{path} has frames out of order or no key frame: it is damaged, or convert it to mp4")
     return Packets(dts, places, keys, before, shape)

@@ -1,6 +1,6 @@
-"""Datasets, one file each. Importing this package imports every file in it, and so registers them all.
+"""Datasets, one file (or folder) each. Importing this package imports and registers all of them.
 
-No torch here: packing workers import it.
+Packing workers import this package, so it does not import torch.
 """
 
 from mvitac.datasets.base import DatasetConfig

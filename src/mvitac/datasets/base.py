@@ -1,4 +1,4 @@
-"""The dataset contract: a config that says where samples come from; everything else reads the pack made of them."""
+"""The base class of dataset configs. A config gives a source of samples; all other code reads the pack made from it."""
 
 from __future__ import annotations
 
@@ -14,35 +14,44 @@ from mvitac.registry import Registered
 from mvitac.system.files import cache_dir, check_place, digest
 
 KEEPING = ("size", "workers", "store", "quality")
-"""Options of every dataset that say how its images are kept, not which they are."""
+"""Options of every dataset that affect how images are stored, not which images they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetConfig(Registered, ABC):
-    """Base of every dataset's config. Adding a dataset is one file: a ``Source`` and a config naming it."""
+    """Base class of dataset configs. A new dataset is one file with a ``Source`` and a config."""
 
     local: ClassVar[tuple[str, ...]] = ("workers",)
-    """Options that decide nothing of the outcome."""
+    """Options that do not affect the result."""
+    phased: ClassVar[bool] = False
+    """Whether rows of a touch group show phases of a grasp (before, during, after) instead of repeated touches."""
 
     size: int = 256
-    """Side in pixels at which images are stored; crops are cut from it (paper: 256)."""
+    """Side of the stored images in pixels; crops are taken from them (paper: 256)."""
     workers: int = 0
-    """Processes that read or simulate while packing; 0 = one per core."""
+    """Number of processes for packing; 0 = one per core."""
     store: Store = "raw"
-    """Images as raw pixels, read at the speed of memory, or as jpeg, a fraction of the disk, decoded in every step."""
+    """Store images as raw pixels, which are fast to read, or as jpeg, which needs less disk and is decoded in every step."""
     quality: int = QUALITY
-    """Of JPEG, 1 to 100; at 95 a pixel is off by 1 or 2 of 255 levels. Colours stay in full resolution (4:4:4)."""
+    """JPEG quality, 1 to 100. At 95, pixels differ by 1 or 2 of 255 levels. Colours keep full resolution (4:4:4)."""
 
     def __post_init__(self) -> None:
         check_request(self.size, self.workers, store=self.store, quality=self.quality)
 
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        """Fields that do not change the outcome of a run: local options, and how raw pixels would be compressed."""
+        return (*self.local, "store", "quality") if self.store == "raw" else self.local
+
     @abstractmethod
     def source(self) -> Source:
-        """Where the samples come from; ValueError if it is not there."""
+        """Return the source of samples; ValueError if the data does not exist."""
 
     def open(self, *, quiet: bool = False) -> Pack:
-        """The pack of this dataset, made in the cache (see ``files.cache_dir``) the first time, and anew when its files
-        have changed."""
+        """Return the pack of this dataset. It is built in the cache (``files.cache_dir``) if it does not exist.
+
+        If files of the dataset have changed, a new pack is built.
+        """
         source = self.source()
         kept = stored_as(self.store, self.quality)
         stamps = source.stamps()

@@ -1,24 +1,24 @@
-"""``--data folder``: anybody's images, named by a manifest or laid out in class folders.
+"""``--data folder``: your own images, listed in a manifest or arranged in class folders.
 
 A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are relative to its own folder, or absolute:
 
     vision,touch,material,object,split
     vision/0001.jpg,touch/0001.jpg,wood,table_3,train
 
-A path may name a **video**: column ``frame`` (or ``touch_frame``, ``vision_frame``, ...) then holds the frame's number,
-counted from 0; every video is decoded once, and is one group unless a column says the groups.
+A path may be a **video**; column ``frame`` (or ``touch_frame``, ``vision_frame``, ...) then holds the frame number, from
+0. Each video is decoded once, and is one group unless a column gives the groups.
 
-**Class folders** need no manifest. Files are paired by their path below the modality's folder, without the suffix:
+**Class folders** need no manifest. Files are paired by their path inside the modality's folder, without the suffix:
 
-    <root>/vision/<class>/<name>.jpg            <root>/touch/<class>/<name>.png          every file its own group
-    <root>/vision/<class>/<group>/<name>.jpg    ...                                      or grouped by a folder
-    <root>/train/vision/<class>/...             <root>/test/vision/<class>/...           or split by a folder above
+    <root>/vision/<class>/<name>.jpg            <root>/touch/<class>/<name>.png          each file is its own group
+    <root>/vision/<class>/<group>/<name>.jpg    ...                                      grouped by folder
+    <root>/train/vision/<class>/...             <root>/test/vision/<class>/...           split by folder
     <root>/left/<class>/...                     <root>/right/<class>/...                 two sensors instead of touch
     <root>/<class>/<name>.jpg                   one modality (see ``pictures``)
 
-They read as the manifest that they amount to, with columns vision, touch (or left, right), label, group and, where the
-folders split, split. Everything that can be wrong with a manifest is said before the first image is decoded; rows are
-counted from 1, the header not counted.
+Class folders are equivalent to a manifest with columns vision, touch (or left, right), label, group and, if there are
+split folders, split. A manifest is checked completely before the first image is decoded. Rows are counted from 1, without
+the header.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from mvitac.datasets.table.table import RowsConfig
 
 @dataclass(frozen=True, kw_only=True)
 class FolderConfig(RowsConfig):
-    """An image folder, or a manifest naming vision path, touch path, labels, group and split."""
+    """A folder of images, or a manifest with vision path, touch path, labels, group and split."""
 
     name: ClassVar[str] = "folder"
 
     path: Path = Path("data")
-    """A manifest (.csv, .parquet, .jsonl), a folder with a manifest.* in it, or a folder of class folders."""
+    """A manifest (.csv, .parquet, .jsonl), a folder with a manifest.*, or a folder of class folders."""
     pictures: Literal["touch", "vision"] = "touch"
-    """What plain class folders (<root>/<class>/*.jpg) show."""
+    """Modality of plain class folders (<root>/<class>/*.jpg)."""
 
     def manifest(self) -> Manifest:
         file = find_manifest(self.path)

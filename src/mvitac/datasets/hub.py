@@ -1,8 +1,8 @@
-"""``--data hub``: image tables as the Hugging Face hub serves them, parquet with columns struct<bytes, path>.
+"""``--data hub``: image datasets of the Hugging Face hub, as parquet with columns struct<bytes, path>.
 
-    data/train-00000-of-00002.parquet   data/test-00000-of-00001.parquet      the part before the first - is the split
+    data/train-00000-of-00002.parquet   data/test-00000-of-00001.parquet      the text before the first - is the split
 
-Class numbers whose names stand in the file's own metadata (ClassLabel) get those names.
+Class numbers are replaced by the class names in the file's metadata (ClassLabel).
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ import pyarrow.parquet as pq
 from mvitac.datasets.table.image_refs import ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.system.files import digest
+from mvitac.system.files import brief, digest
 
 SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class HubConfig(RowsConfig):
-    """Parquet files with images inside (columns struct<bytes, path>), as datasets on the Hugging Face hub have them."""
+    """Parquet files that contain images (columns struct<bytes, path>), as on the Hugging Face hub."""
 
     name: ClassVar[str] = "hub"
 
     path: Path = Path("data")
-    """A parquet file, or a folder of them (searched in depth)."""
+    """A parquet file, or a folder of them (searched recursively)."""
 
     def manifest(self) -> Manifest:
         files = sorted(self.path.rglob("*.parquet")) if self.path.is_dir() else [self.path]
@@ -52,7 +52,7 @@ class HubConfig(RowsConfig):
         if any(sides) and nameless and not self.split and "split" not in names:
             raise ValueError(
                 f"{self.path}: the name of {nameless[0]} says no split, others do: begin it with train-, validation- or"
-                " test-, take it away, or split=by-group deals all rows anew"
+                " test-, remove it, or split=by-group assigns all rows to splits"
             )
         for column, places in found.items():
             if len(places) < len(rows):
@@ -61,7 +61,7 @@ class HubConfig(RowsConfig):
 
 
 def _read(file: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]]) -> list[str]:
-    """Add the rows of ``file`` and where their images lie; the names of its image columns."""
+    """Add the rows of ``file`` and the references of its images; return the names of its image columns."""
     try:
         opened = pq.ParquetFile(file)
         images = [field.name for field in opened.schema_arrow if _is_image(field.type)]
@@ -78,7 +78,7 @@ def _read(file: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef
             for column in images:
                 _mark_gaps(opened, group, column, found[column], num)
     except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"{file} is not a parquet file ({' '.join(str(error).split())[:120]})") from None
+        raise ValueError(f"{file} is not a parquet file ({brief(error)})") from None
     return images
 
 
@@ -89,19 +89,19 @@ def _is_image(kind: pa.DataType) -> bool:
 
 
 def _mark_gaps(opened: pq.ParquetFile, group: int, column: str, places: list[ImageRef | None], num: int) -> None:
-    """None for rows whose image is null."""
+    """Replace the references of null images by None."""
     leaves = [opened.schema.column(i).path for i in range(len(opened.schema.names))]
     leaf = next(i for i, path in enumerate(leaves) if path in (column, f"{column}.bytes"))
     nulls = opened.metadata.row_group(group).column(leaf).statistics
     if nulls is not None and nulls.has_null_count and nulls.null_count == 0:
-        return  # no need to read the images for it
+        return  # known without reading the images
     for place, value in enumerate(opened.read_row_group(group, columns=[column]).column(0)):
         if not value.is_valid:
             places[len(places) - num + place] = None
 
 
 def _classes(schema: pa.Schema) -> dict[str, list[str]]:
-    """Column -> class names by number, from the metadata the hub's library leaves."""
+    """Return column -> class names, from the metadata of Hugging Face's datasets library."""
     try:
         features: dict[str, Any] = json.loads((schema.metadata or {})[b"huggingface"])["info"]["features"]
     except (KeyError, ValueError):
@@ -111,5 +111,5 @@ def _classes(schema: pa.Schema) -> dict[str, list[str]]:
 
 def _text(value: Any, names: list[str] | None) -> str:
     if names and isinstance(value, int):
-        return names[value] if 0 <= value < len(names) else ""  # -1 is the hub's "no label"
+        return names[value] if 0 <= value < len(names) else ""  # -1: no label
     return text_of(value)

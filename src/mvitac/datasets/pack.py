@@ -1,4 +1,4 @@
-"""Packs as datasets: a folder on disk (``pack``) or shards behind a URL (``stream``)."""
+"""Packs as datasets: a folder on disk (``pack``) or shards at a URL (``stream``)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class PackConfig(DatasetConfig):
     """The pack's folder."""
 
     score_on: Literal["test", "val"] = "test"
-    """val: split val stands in for test, and test is out of sight: for choosing a recipe by `mvitac compare`, so that its
-    test scores stay unseen until it is chosen."""
+    """val: use split val as the test split and hide test, to choose a recipe by `mvitac compare` without its test
+    scores."""
 
     def source(self) -> Source:
         raise ValueError(f"{self.path} is a pack already: use it with --data pack, there is nothing to pack")
@@ -35,32 +35,27 @@ class PackConfig(DatasetConfig):
         if self.score_on == "val":
             if not len(pack.rows("val")):
                 raise ValueError(f"{self.path} has no split val to score on: leave out --data.score-on")
-            for column in {"split", *(task.split for task in pack.spec.tasks)}:
-                pack.table = _shifted(pack.table, column)
+            for name in {"split", *(task.split for task in pack.spec.tasks)}:
+                column = [{"test": "hidden", "val": "test"}.get(split, split) for split in pack.column(name)]
+                pack.table = pack.table.set_column(pack.table.schema.get_field_index(name), name, pa.array(column))
         return pack
-
-
-def _shifted(table: pa.Table, column: str) -> pa.Table:
-    """``table`` with val called test in ``column``, and test called hidden."""
-    new = [{"test": "hidden", "val": "test"}.get(split, split) for split in table.column(column).to_pylist()]
-    return table.set_column(table.schema.get_field_index(column), column, pa.array(new))
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamConfig(DatasetConfig):
-    """Shards written by ``mvitac data shard``, fetched whole and in sequence as they are needed."""
+    """Shards written by ``mvitac data shard``, which are fetched when needed."""
 
     name: ClassVar[str] = "stream"
     local: ClassVar[tuple[str, ...]] = (*DatasetConfig.local, "cache", "cache_gb")
 
     url: str = "shards"
-    """Where the shards are: a folder, file:///..., s3://bucket/path (needs mvitac[s3]), or whatever fsspec opens."""
+    """Location of the shards: a folder, file:///..., s3://bucket/path (needs mvitac[s3]), or any URL fsspec supports."""
     cache: Path | None = None
-    """Folder for the shards that are in use; default: "shards" in the cache of packs. A fast local disk."""
+    """Folder for fetched shards, on a fast local disk; default: "shards" in the cache of packs."""
     cache_gb: float = 8.0
-    """What it may hold, all processes of a machine together; a set that fits is fetched once."""
+    """Size of the cache in GB, for all processes of a machine together. A dataset that fits is fetched once."""
     window: int = 8
-    """Shards whose rows each process mixes at a time: batches are drawn from these, while as many again are on their way."""
+    """Number of shards from which each process draws batches, while the same number is fetched in advance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

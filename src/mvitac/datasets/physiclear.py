@@ -1,12 +1,12 @@
-"""``--data physiclear``: presses and slides of a GelSight Mini, rated for how they feel, by Yu et al. (RSS 2024).
+"""``--data physiclear``: videos of a GelSight Mini with ratings of how objects feel, by Yu et al. (RSS 2024).
 
-As ``git clone https://github.com/clear-nus/octopi`` brings it:
+Layout of ``git clone https://github.com/clear-nus/octopi``:
 
     dataset/<object>_<k>.mov            one touch per video; it begins without contact
     utils/constants.py                  MATERIALS, HARDNESS_RANK, ROUGHNESS_RANK, TEXTURE_RANK: physiclear_<object> -> label;
     (later src/utils/constants.py)      TRAIN_OBJECTS, VAL_OBJECTS, TEST_OBJECTS: the owners' split
 
-The labels are read from the owners' file, as data: nothing of it is run.
+The labels are read from the owners' Python file without running it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.table.video_times import num_frames, spread
+from mvitac.system.files import brief
 
 LABELS = {
     "material": "MATERIALS",
@@ -36,17 +37,17 @@ class PhysiclearConfig(RowsConfig):
     name: ClassVar[str] = "physiclear"
 
     path: Path = Path("octopi")
-    """The clone."""
+    """Folder of the clone."""
     frames: int = 8
-    """Frames of each video."""
+    """Number of frames per video."""
     span: tuple[float, float] = (0.3, 0.6)
-    """The stretch of each video they are spread over, as shares of its length: it begins and ends without contact."""
+    """Part of each video to take frames from, as fractions of its length: videos begin and end without contact."""
     title: str | None = "physiclear"
     labels: tuple[str, ...] = tuple(LABELS)
     group: str | None = "object"
     touch_group: str | None = "video"
     split: str | None = "by-group"
-    """by-group: unseen objects; owners_split: theirs, with 7 objects in test."""
+    """by-group: test on unseen objects; owners_split: the owners' split, with 7 objects in test."""
     licence: str = "none stated"
     source_url: str = "https://github.com/clear-nus/octopi"
 
@@ -56,7 +57,7 @@ class PhysiclearConfig(RowsConfig):
             raise ValueError(f"frames {self.frames}: give 1 to 1000 per video")
         if not 0 <= self.span[0] <= self.span[1] <= 1:
             raise ValueError(
-                f"span {self.span[0]} {self.span[1]}: give two shares of the length, 0 <= first <= last <= 1"
+                f"span {self.span[0]} {self.span[1]}: give two fractions of the length, 0 <= first <= last <= 1"
             )
 
     def manifest(self) -> Manifest:
@@ -80,7 +81,7 @@ class PhysiclearConfig(RowsConfig):
 
 
 def _constants(root: Path) -> dict[str, Any]:
-    """The literal values that the owners' constants.py gives to the names we use."""
+    """Read the literal values of the constants that are used from the owners' constants.py."""
     file = next((f for f in (root / "utils/constants.py", root / "src/utils/constants.py") if f.is_file()), None)
     if file is None:
         raise ValueError(f"{root} has no utils/constants.py, where the labels are: clone it whole")
@@ -91,7 +92,7 @@ def _constants(root: Path) -> dict[str, Any]:
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id in wanted:
                 found[node.targets[0].id] = ast.literal_eval(node.value)
     except (SyntaxError, ValueError) as error:
-        raise ValueError(f"{file} cannot be read as labels ({' '.join(str(error).split())})") from None
+        raise ValueError(f"{file} cannot be read as labels ({brief(error)})") from None
     for name in sorted(wanted - found.keys()):
-        raise ValueError(f"{file} says nothing of {name}: check out the version the paper was published with")
+        raise ValueError(f"{file} does not define {name}: check out the version the paper was published with")
     return found

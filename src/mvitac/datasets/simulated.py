@@ -1,14 +1,15 @@
-"""The embedded default: simulated touches of materials and simulated grasps (``sim/``), split by instance and by object.
+"""Simulated touches of materials and simulated grasps (``sim/``), split by instance and by object.
 
-Nothing here is comparable with the paper's numbers; it is what lets every claim of this project be re-run with no data.
+They are the default data: every experiment runs without a download. Results are not comparable with the paper's.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+import tyro
 
 from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
@@ -21,16 +22,16 @@ LICENCE = "Apache-2.0 (made by this package)"
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedConfig(DatasetConfig):
-    """What both simulators share."""
+    """Options of both simulators."""
 
     num: int = 6000
-    """How many pairs (materials) or grasps of three phases each (grasps) to simulate."""
+    """Number of pairs (materials) or of grasps with three phases each (grasps)."""
     seed: int = 0
-    """World seed: another seed is another set of instances and objects."""
+    """Random seed of all instances and objects."""
     size: int = 72
-    """Side in pixels at which images are rendered and stored."""
+    """Side of the rendered and stored images in pixels."""
     held_out_sensor: bool = False
-    """Use the one sensor that is otherwise never used, to test transfer."""
+    """Use the sensor that is otherwise never used, to test transfer to a new sensor."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -46,14 +47,14 @@ class SimulatedConfig(DatasetConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialsConfig(SimulatedConfig):
-    """Simulated touches of 20 material classes; labels category, hard/soft, rough/smooth; split by instance."""
+    """Simulated touches of 20 material classes, labelled by category, hard/soft and rough/smooth; split by instance."""
 
     name: ClassVar[str] = "materials"
 
     touches: int = 5
-    """Touches per instance, each at another place, force, sensor and lamp."""
-    difference: bool = False
-    """Store touch minus the same sensor before contact, halved, plus one half (no contact is mid-gray)."""
+    """Touches per instance, each with its own position, force, sensor and lamp."""
+    difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
+    """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,7 +66,7 @@ class MaterialsConfig(SimulatedConfig):
 
 
 class Materials(Source):
-    """Item i is touch (i // 20) % touches of instance i // (20 touches) of class i % 20, so a larger num only appends."""
+    """Item i is touch (i // 20) % touches of instance i // (20 touches) of class i % 20: a larger num only appends."""
 
     def __init__(self, config: MaterialsConfig) -> None:
         self.config = config
@@ -91,7 +92,8 @@ class Materials(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         known = self.config._fingerprint(materials.VERSION)
-        return known if self.config.difference else {k: v for k, v in known.items() if k != "difference"}  # as ever
+        # "difference" is omitted if False, to keep old digests valid.
+        return known if self.config.difference else {k: v for k, v in known.items() if k != "difference"}
 
     def _address(self, item: int) -> tuple[int, int, int]:
         num_classes, touches = len(materials.CLASSES), self.config.touches
@@ -113,7 +115,7 @@ class Materials(Source):
         if self.config.difference:
             pressed = difference(pressed, made.pop("background"))
         group = f"{category:02d}-{instance:04d}"
-        # Of every 20 instances of a class, 4 test and 3 choose: instances are independent draws, so any fixed rule will do.
+        # Of 20 instances of a class, 4 are in test and 3 in val. Instances are independent, so any fixed rule is fair.
         split = "test" if instance % 20 in (2, 7, 12, 17) else "val" if instance % 20 in (5, 10, 15) else "train"
         columns = {"id": f"{group}-{touch:02d}", "group": group, "touch_group": group, "split": split, **labels, **made}
         return [Sample(vision=vision, touch=pressed, columns=columns)]
@@ -121,19 +123,20 @@ class Materials(Source):
 
 @dataclass(frozen=True, kw_only=True)
 class GraspsConfig(SimulatedConfig):
-    """Simulated two-finger grasps of 106 objects, before, during and after the lift; label success; split by object."""
+    """Simulated two-finger grasps of 106 objects, before, during and after the lift, labelled by success."""
 
     name: ClassVar[str] = "grasps"
+    phased: ClassVar[bool] = True
 
     num: int = 5300
-    """How many grasps; each gives three rows (before, during, after)."""
+    """Number of grasps; each gives three rows (before, during, after)."""
 
     def source(self) -> Source:
         return Grasps(self)
 
 
 class Grasps(Source):
-    """Item i is grasp i // 106 of object i % 106; touch is both gels stacked on channels (6), as in the paper."""
+    """Item i is grasp i // 106 of object i % 106. Touch is both gels stacked on channels (6), as in the paper."""
 
     def __init__(self, config: GraspsConfig) -> None:
         self.config = config
@@ -143,7 +146,7 @@ class Grasps(Source):
             name="grasps",
             vision_channels=3,
             touch_channels=6,
-            # 'after' is taken when the outcome shows; only 'during', fingers closed before the lift, may be asked.
+            # 'after' shows the outcome, so only 'during' (fingers closed, before the lift) has the label.
             tasks=(Task(name="success", classes=("failure", "success"), only={"phase": "during"}),),
             group_by="object",
             controls={"contact only": ("contact_left", "contact_right")},

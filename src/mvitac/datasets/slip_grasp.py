@@ -1,12 +1,12 @@
-"""``--data slip_grasp``: grasps that hold or slip, one GelSight and a camera, by Li et al. (ICRA 2018).
+"""``--data slip_grasp``: grasps that hold or slip, with one GelSight and a camera, by Li et al. (ICRA 2018).
 
-As ``git clone https://github.com/wkoa/slip_detection`` brings it:
+Layout of ``git clone https://github.com/wkoa/slip_detection``:
 
     data/object004_result.dat           a grasp per line: width in mm, outcome in words, 1 held or 0 slipped, first, last
                                         and key frame of its recording, name of its folder, infix of its files
     data/object004/040_40_mm/external_imgw040_40_s010_00003368.jpg         the camera at frame 3368, 640 x 480
                              gelsight_imgw040_40_s010_00003368.jpg         the GelSight at the same frame
-                             gelsight_lab_imgw...                          a colour conversion of it, not read
+                             gelsight_lab_imgw...                          a colour conversion; not used
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from pathlib import Path
 from typing import ClassVar
 
 from mvitac.datasets.table.manifest import Manifest, in_clone
-from mvitac.datasets.table.splits import folds
+from mvitac.datasets.table.splits import add_folds
 from mvitac.datasets.table.table import RowsConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlipGraspConfig(RowsConfig):
-    """Grasp success from one GelSight and a camera (github.com/wkoa/slip_detection): predict from seq <= 4."""
+    """Grasp success from one GelSight and a camera (github.com/wkoa/slip_detection), predicted from seq <= 4."""
 
     name: ClassVar[str] = "slip_grasp"
 
     path: Path = Path("slip_detection")
-    """The clone."""
+    """Folder of the clone."""
     title: str | None = "slip_grasp"
     labels: tuple[str, ...] = ("success",)
     group: str | None = "object"
     touch_group: str | None = "grasp"
     split: str | None = "fold1"
-    """fold1, fold2, ...: each leaves another object out; or by-group."""
+    """fold1, fold2, ...: leave one object out; or by-group."""
     label_only: tuple[str, ...] = ("seq<=4",)
-    """Late frames of a failed grasp show the object sliding: by default only the five up to the key frame are asked."""
+    """Late frames of a failed grasp show the object sliding; by default only the five before the key frame are labelled."""
     controls: tuple[str, ...] = ("width=width_mm", "width in sweep=width_in_sweep")
     licence: str = "MIT (the repository's LICENSE)"
     source_url: str = "https://github.com/wkoa/slip_detection"
@@ -48,14 +48,12 @@ class SlipGraspConfig(RowsConfig):
         for file in sorted(root.glob("object*_result.dat")):
             rows += _grasps(root, file)
         objects = [row["object"] for row in rows]
-        for column, sides in folds(objects, objects, len(set(objects)), val_every=1).items():
-            for row, side in zip(rows, sides, strict=True):
-                row[column] = side
+        add_folds(rows, objects, len(set(objects)), val_every=1)
         return Manifest.of(root, rows)
 
 
 def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
-    """Every pair of every grasp of one object."""
+    """Return the pairs of all grasps of one object."""
     name = file.name[len("object") : -len("_result.dat")]
     rows: list[dict[str, str]] = []
     widths: dict[str, float] = {}
@@ -80,9 +78,9 @@ def _grasps(root: Path, file: Path) -> list[dict[str, str]]:
         widths[grasp] = float(width)
         for frame, images in sorted(pairs.items()):
             known = {"object": name, "grasp": grasp, "width_mm": width, "success": success}
-            away = frame - int(key)  # recordings begin five frames before the key frame, even if those were lost
+            away = frame - int(key)  # recordings begin five frames before the key frame, even if some are lost
             counted = {"frame_rel_key": str(away), "seq": str(away + 5), "frame": str(frame)}
             rows.append({"vision": "", "touch": "", **images, **known, **counted})
-    for row in rows:  # the outcome was driven by a sweep of the width: a control must know where in it a grasp lies
+    for row in rows:  # the width was swept to change the outcome, so its position in the sweep is a control
         row["width_in_sweep"] = f"{widths[row['grasp']] - sum(widths.values()) / len(widths):.3f}"
     return rows

@@ -1,12 +1,12 @@
-"""``--data slip_gsmini``: slip between two GelSight Minis on a gripper, no camera, by Parag and Misimi.
+"""``--data slip_gsmini``: slip with two GelSight Minis on a gripper, no camera, by Parag and Misimi.
 
-As ``git clone https://github.com/amitparag/Incipient-Slip-Detection`` brings it, the two fingers of one shake, 25 fps:
+Layout of ``git clone https://github.com/amitparag/Incipient-Slip-Detection`` (both fingers of one shake, 25 fps):
 
     docs/**/base_data_for_training/<object>/exp_num_<n>/camera_0.avi  camera_2.avi  slip.txt (empty: it slipped)
     docs/**/base_data_for_validation/...                                            (our reading of the layout)
 
-More than half of the folders are copies of others, some with slip.txt and some without. Folders are told apart by the
-content of their videos; where copies disagree, the recording keeps no label and has label_conflict = 1.
+More than half of the folders are copies of others, some with slip.txt and some without. Folders are identified by the
+content of their videos. If copies disagree, the recording has no label and label_conflict = 1.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import ClassVar
 
 from mvitac.datasets.table.manifest import Manifest, in_clone
-from mvitac.datasets.table.splits import folds
+from mvitac.datasets.table.splits import add_folds
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.table.video_times import num_frames, spread
 from mvitac.system.files import digest_file
 
 FINGERS = {"left": "camera_0.avi", "right": "camera_2.avi"}
 ALIASES = {"bag_of_peanuts": "bag_peanuts"}
-"""Two names of one object must not be on two sides of a split."""
+"""Names of the same object, which must not be in different splits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,15 +34,15 @@ class SlipGSMiniConfig(RowsConfig):
     name: ClassVar[str] = "slip_gsmini"
 
     path: Path = Path("Incipient-Slip-Detection")
-    """The clone."""
+    """Folder of the clone."""
     frames: int = 12
-    """Frames of each recording, spread evenly from its first to its last."""
+    """Number of frames per recording, evenly spaced from the first to the last."""
     title: str | None = "slip_gsmini"
     labels: tuple[str, ...] = ("slip",)
     group: str | None = "object"
     touch_group: str | None = "experiment"
     split: str | None = "fold1"
-    """fold1, fold2 or fold3: whole objects, each tested once; or by-group."""
+    """fold1, fold2 or fold3: each object is tested in one of them; or by-group."""
     controls: tuple[str, ...] = ("recording length=n_frames",)
     licence: str = "BSD-2-Clause (the repository's LICENSE)"
     source_url: str = "https://github.com/amitparag/Incipient-Slip-Detection"
@@ -71,13 +71,11 @@ class SlipGSMiniConfig(RowsConfig):
         for row in rows:
             often.setdefault(row["object"], []).append(int(row["slip"] or 0))
         strata = [f"{sum(often[row['object']]) / len(often[row['object']]):.2f}" for row in rows]
-        for column, sides in folds([row["object"] for row in rows], strata, 3).items():
-            for row, side in zip(rows, sides, strict=True):
-                row[column] = side
+        add_folds(rows, strata, 3)
         return Manifest.of(root, rows)
 
     def _recording(self, root: Path, folders: list[Path]) -> list[dict[str, str]]:
-        """The rows of one recording, which lies in each of ``folders``."""
+        """Return the rows of one recording, of which each of ``folders`` is a copy."""
         folder = folders[0]
         slips = {(copy / "slip.txt").exists() for copy in folders}
         name = min(ALIASES.get(copy.parent.name, copy.parent.name) for copy in folders)

@@ -1,11 +1,11 @@
-"""``--data vt60``: ten categories of things, photographed and touched by a TacTip, by Corradi et al.
+"""``--data vt60``: ten categories of objects, photographed and touched by a TacTip, by Corradi et al.
 
-As ``git clone https://github.com/Exhor/deep_visuotactile_classification`` brings it, 640 x 480:
+Layout of ``git clone https://github.com/Exhor/deep_visuotactile_classification`` (images of 640 x 480):
 
     code/data/vt60/vision/<01_category>/<01>/IMG_inst_5_img_10_validframeID_62.jpg
     code/data/vt60/touch/<01_category>/<01>/touch_1_img_99_name_stapler_greyred_at_42094_5976_25275.jpg   (robot's x y z)
 
-Photos and touches were not taken together: a pair is **weak**, the k-th touch of a thing with its (k mod n)-th photo.
+Photos and touches were not taken together. A pair is **weak**: the k-th touch of an object with its (k mod n)-th photo.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from pathlib import Path
 from typing import ClassVar
 
 from mvitac.datasets.table.manifest import Manifest, in_clone
-from mvitac.datasets.table.splits import folds
+from mvitac.datasets.table.splits import add_folds
 from mvitac.datasets.table.table import RowsConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class VT60Config(RowsConfig):
-    """Category of 60 things from weak pairs of photo and TacTip (github.com/Exhor/deep_visuotactile_classification)."""
+    """Category of 60 objects from weak pairs of photo and TacTip (github.com/Exhor/deep_visuotactile_classification)."""
 
     name: ClassVar[str] = "vt60"
 
     path: Path = Path("deep_visuotactile_classification")
-    """The clone."""
+    """Folder of the clone."""
     title: str | None = "vt60"
     labels: tuple[str, ...] = ("category",)
     group: str | None = "object"
     touch_group: str | None = "object"
     split: str | None = "fold1"
-    """fold1, fold2 or fold3: unseen things of known categories, each tested once; or by-group."""
+    """fold1, fold2 or fold3: unseen objects of known categories, each tested in one of them; or by-group."""
     licence: str = "none stated"
     source_url: str = "https://github.com/Exhor/deep_visuotactile_classification"
 
@@ -53,14 +53,12 @@ class VT60Config(RowsConfig):
                 pose = dict(zip("xyz", at.groups() if at else ("", "", ""), strict=True))
                 rows.append({**images, "category": thing.split("/")[0], "object": thing, "seq": str(k), **pose})
         strata = [row["category"] for row in rows]
-        for column, sides in folds([row["object"] for row in rows], strata, 3).items():
-            for row, side in zip(rows, sides, strict=True):
-                row[column] = side
+        add_folds(rows, strata, 3)
         return Manifest.of(root, rows)
 
 
 def _by_number(folder: Path) -> list[Path]:
-    """The images of ``folder``, by the number after img_, then by name."""
+    """Return the images of ``folder``, sorted by the number after img_, then by name."""
 
     def key(path: Path) -> tuple[int, str]:
         found = re.search(r"img_(\d+)", path.name)

@@ -1,9 +1,11 @@
-"""``--data webdataset``: tar files whose members share a name up to the first dot (https://github.com/webdataset/webdataset).
+"""``--data webdataset``: tar files of samples (https://github.com/webdataset/webdataset).
 
-    shard-000.tar:  0001.vision.jpg  0001.touch.png  0001.json        two images and what is known of them
+Members with the same name up to the first dot are one sample:
+
+    shard-000.tar:  0001.vision.jpg  0001.touch.png  0001.json        two images and their metadata
     shard-001.tar:  0002.jpg  0002.cls  ...                           one image (see ``pictures``) and its class
 
-Images stay in their tar and are read from there; .json gives a column per scalar, .cls and .txt one each.
+Images are read from inside the tar. A .json gives a column per scalar, .cls and .txt one column each.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from mvitac.data.images import IMAGES
 from mvitac.datasets.table.image_refs import ImageRef, TarMember
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.system.files import digest
+from mvitac.system.files import brief, digest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,7 @@ class WebDatasetConfig(RowsConfig):
     path: Path = Path("data.tar")
     """A .tar, or a folder of them."""
     pictures: Literal["touch", "vision"] = "touch"
-    """What images without a name of their own (0001.jpg, not 0001.touch.jpg) show."""
+    """Modality of images without a name of their own (0001.jpg, not 0001.touch.jpg)."""
 
     def manifest(self) -> Manifest:
         shards = sorted(self.path.glob("*.tar")) if self.path.is_dir() else [self.path]
@@ -49,7 +51,7 @@ class WebDatasetConfig(RowsConfig):
         return Manifest(self.path, self.path, names, rows, digest([rows, columns]), found)
 
     def _index(self, shard: Path, samples: dict[str, dict[str, str]], places: dict[str, dict[str, ImageRef]]) -> None:
-        """Add the members of ``shard``, which lie in it as they are: it must not be compressed."""
+        """Add the members of ``shard``, which must not be compressed."""
         try:
             with tarfile.open(shard, "r:") as tar:
                 for member in tar:
@@ -72,13 +74,11 @@ class WebDatasetConfig(RowsConfig):
                         text = file.read().decode() if file else ""
                         row.update(_known(text) if last == "json" else {last: text.strip()})
         except (tarfile.TarError, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise ValueError(
-                f"{shard} cannot be read as a tar that is not compressed ({' '.join(str(error).split())[:120]})"
-            ) from None
+            raise ValueError(f"{shard} cannot be read as an uncompressed tar ({brief(error)})") from None
 
 
 def _known(text: str) -> dict[str, str]:
-    """The scalars of a JSON object as text."""
+    """Return the scalars of a JSON object as text."""
     value = json.loads(text)
     if not isinstance(value, dict):
         return {}

@@ -17,7 +17,7 @@ from mvitac.data.spec import Task
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import parts
+from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.scores import score
 from mvitac.model import Model, load
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
@@ -47,7 +47,7 @@ def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
 def _fit_readout(model: Model, pack: Pack, task: Task, source: str, modalities: list[str]) -> LinearProbe | None:
     """The linear probe of one task on the features of ``modalities``; None without labelled rows in train and test."""
     try:
-        rows = parts(pack, task, source)
+        rows = split_rows(pack, task, source)
     except ValueError:
         return None
     labels = pack.column(f"label_{task.name}").astype(int)

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 import torch
 
 from mvitac.data.pack import Pack, has_difference
-from mvitac.model import Images, Model, load
+from mvitac.model import ImageInput, Model, load
 from mvitac.registry import unknown
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.locks import hold_lock
@@ -115,7 +115,7 @@ def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
     if "touch" in names and model.spec.difference and not has_difference(pack):
         raise ValueError(
             f"{pack.path} has touch as the sensor gives it, the model was trained on difference images: pack the data"
-            " with --difference"
+            " with --subtract-background"
         )
     if not names:
         raise ValueError(f"{pack.path} has {', '.join(pack.spec.modalities)}, the model {', '.join(model.encoders)}")
@@ -231,12 +231,12 @@ class Index:
     def find(
         self,
         model: Model,
-        images: Images,
+        images: ImageInput,
         source: str,
         target: str,
         k: int = 5,
         *,
-        background: Images | None = None,
+        background: ImageInput | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """The nearest indexed images of modality ``target`` to ``images`` of modality ``source``.
 

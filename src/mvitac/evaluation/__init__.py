@@ -1,1 +1,1 @@
-"""What frozen features are worth: probes, controls, intervals."""
+"""Evaluation of frozen features: probes, controls, confidence intervals."""

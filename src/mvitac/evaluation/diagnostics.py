@@ -1,6 +1,6 @@
-"""Is it learning or collapsing? Plain numbers from features: spread, rank, alignment, gap, kNN, retrieval.
+"""Measures of feature quality and collapse: spread, rank, alignment, modality gap, kNN accuracy, retrieval.
 
-Shapes: features [N, D] of one modality, row i of vision and row i of touch being a pair.
+Shapes: features [N, D] of one modality. Row i of vision and row i of touch are a pair.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 def spread(z: Float[Tensor, "N D"]) -> float:
-    """Mean over dimensions of the std of L2-normalised features, times sqrt(D): about 1 = spread, 0 = collapsed.
+    """Mean per-dimension std of L2-normalised features, times sqrt(D): about 1 = spread out, 0 = collapsed.
 
     Source: https://arxiv.org/abs/2011.10566 (SimSiam, section 4.1).
     """
@@ -33,7 +33,7 @@ def rank_me(z: Float[Tensor, "N D"]) -> float:
 
 
 def alignment(a: Float[Tensor, "N D"], b: Float[Tensor, "N D"]) -> float:
-    """Mean squared distance of paired normalised embeddings (0 = paired ones agree, 2 = orthogonal).
+    """Mean squared distance of paired normalised embeddings (0 = pairs agree, 2 = orthogonal).
 
     Source: https://arxiv.org/abs/2005.10242 (Wang and Isola).
     """
@@ -49,7 +49,7 @@ def uniformity(z: Float[Tensor, "N D"]) -> float:
 
 
 def modality_gap(a: Float[Tensor, "N D"], b: Float[Tensor, "M D"]) -> float:
-    """Distance of the two modalities' mean normalised embeddings (0 = mixed, up to 2).
+    """Distance between the mean normalised embeddings of two modalities (0 = same mean, at most 2).
 
     Source: https://arxiv.org/abs/2203.02053 (Liang et al., section 2).
     """
@@ -63,7 +63,7 @@ def knn_accuracy(
     test_labels: Int[Tensor, " M"],
     k: int = 20,
 ) -> float:
-    """Share of ``test`` rows whose label wins among the ``k`` nearest ``train`` rows, votes weighted exp(cosine / .07).
+    """kNN accuracy: the ``k`` nearest ``train`` rows vote with weight exp(cosine / .07).
 
     Source: https://arxiv.org/abs/1805.01978 (Wu et al., section 3.4).
     """
@@ -75,7 +75,7 @@ def knn_accuracy(
 
 
 def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Tensor, "G D"]:
-    """Mean normalised embedding of each of the G groups numbered 0 .. G-1, itself normalised."""
+    """Mean normalised embedding of each group 0 .. G-1, normalised again."""
     sums = torch.zeros(int(groups.max()) + 1, z.shape[1]).index_add_(0, groups, F.normalize(z.float(), dim=1))
     return F.normalize(sums, dim=1)
 
@@ -83,16 +83,16 @@ def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Ten
 def retrieval_ranks(
     query: Float[Tensor, "N D"], gallery: Float[Tensor, "N D"], groups: Int[Tensor, " N"]
 ) -> Int[Tensor, " N"]:
-    """Rank (0 = first) of each query row's own group among all groups, a group being its mean gallery embedding.
+    """Rank (0 = first) of each query's own group. A group is represented by its mean gallery embedding.
 
-    One gallery entry per group makes chance exact: R@k by guessing is k / number of groups.
+    With one gallery entry per group, chance level R@k is exactly k / number of groups.
     """
     similarity = F.normalize(query.float(), dim=1) @ group_means(gallery, groups).T
     own = similarity.gather(1, groups[:, None])
-    # Ties count against the query: constant embeddings must not retrieve.
+    # Ties count against the query, or constant embeddings would score.
     return (similarity >= own).sum(1) - 1
 
 
 def recall_at(ranks: Int[Tensor, " N"], ks: Sequence[int] = (1, 5, 10)) -> dict[str, float]:
-    """R@k: share of queries whose own group is among the first k."""
+    """R@k: fraction of queries whose own group is among the first k."""
     return {f"R@{k}": float((ranks < k).float().mean()) for k in ks}

@@ -1,4 +1,4 @@
-"""A probing session: finished runs and their controls probed together, in one result that tables and reports read."""
+"""Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any, Literal
 from mvitac.data.pack import Pack
 from mvitac.data.spec import Task
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.controls import controls_of, start_weights
-from mvitac.evaluation.probe import PROBES, Probe, cross_modal, parts, probe_model
+from mvitac.evaluation.controls import Records, controls_of, start_weights
+from mvitac.evaluation.probe import PROBES, Probe, cross_modal, probe_model, split_rows
 from mvitac.evaluation.scores import summarise
 from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
@@ -23,23 +23,23 @@ from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
 
 END_TO_END = ", end to end"
-"""Added to a source's name where its own classifiers are scored, which it trained along with its encoders."""
+"""Suffix of a source's name for the scores of its own classifiers, trained along with its encoders."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeConfig:
-    """What to probe, and which controls to put beside it."""
+    """What to probe, and whether to score controls."""
 
     probes: tuple[Probe, ...] = ("linear",)
-    """linear: logistic regression, C chosen on held-out groups of train; paper: the paper's Adam probe; knn: 20 nearest."""
+    """linear: logistic regression, C chosen on held-out groups of train. paper: the paper's Adam probe. knn: 20 nearest."""
     tasks: tuple[str, ...] = ()
-    """Tasks to probe; none given = all."""
+    """Tasks to probe. Default: all."""
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
-    """none given = all the data has."""
+    """Modalities to probe. Default: all of the data."""
     controls: bool = True
-    """Also score majority, untrained trunk, pixels, border, and the dataset's own controls."""
+    """Also score the controls: majority class, untrained trunk, pixels, border, and the dataset's own."""
     imagenet: Path | None = None
-    """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
+    """File with ImageNet weights of the trunk, for the frozen-ImageNet control."""
 
     def __post_init__(self) -> None:
         for name, values in (("probe", self.probes), ("task", self.tasks), ("modality", self.modalities)):
@@ -51,60 +51,50 @@ class ProbeConfig:
 
 
 def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None) -> dict[str, Any]:
-    """Probe finished runs (seeds of one method, or several methods, on one dataset) and their controls.
+    """Probe finished runs and their controls, and write each run's own scores to its probe.json.
 
-    Returns {"data", "pack", "records": [...], "retrieval": [...], "summary": {...}}, and leaves each run's own part in
-    its probe.json. ``pack`` probes on other data than the run was trained on.
+    Example:
+        >>> result = probe_runs([Path("runs/first")], ProbeConfig(probes=("linear", "knn")))
+        >>> result["summary"]["category"]["touch"]["mvitac"]["mean"]
+
+    Args:
+        paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
+        session: What to probe.
+        pack: Other data to probe on. Default: the data the runs were trained on.
+
+    Returns:
+        A dict with "data", "pack", "group_by", "notes", "classes", "records", "retrieval" and "summary".
+
+    Raises:
+        ValueError: If a path is no run, a run is given twice, or the runs and the data do not fit together.
     """
-    if not paths:
-        raise ValueError("give at least one run's folder")
-    for path in paths:
-        if path.is_file():
-            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
-        if [p.resolve() for p in paths].count(path.resolve()) > 1:
-            raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
+    _check_paths(paths)
     models = [load(path) for path in paths]
     names = names_of(paths, models)
     packs = [pack or model.run.data.open() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError(
-            "these runs were trained on different data: probe them apart, or give one pack for all with --on"
+            "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
         )
     pack = packs[0]
     tasks, modalities = chosen(pack, session)
-    for path, model in zip(paths, models, strict=True):
-        check_place(path / "probe.json")
-        for modality in pack.spec.modalities:
-            if model.spec.channels(modality) != pack.spec.channels(modality):
-                raise ValueError(
-                    f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
-                    f" it was trained on {model.spec.name!r}"
-                )
+    _check_models(paths, models, pack)
     for task in tasks:
         for modality in modalities:
-            parts(pack, task, modality)
-    if session.controls:  # fetched now, so that one that cannot be had is not found out at the end
+            split_rows(pack, task, modality)
+    if session.controls:  # load these weights first: missing ones should not surface at the end
         for weights in start_weights([m.run for m in models], session.imagenet):
             build_trunk(replace(models[0].run.encoder, weights=weights), 3)
-    records: list[dict[str, Any]] = []
-    retrieval: list[dict[str, Any]] = []
-
-    def one(path: Path, model: Model, source: str) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        own = {"source": source, "seed": model.run.seed, "run": str(path)}
-        mine = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
-        for record in mine:
-            record["source"] += END_TO_END if record["probe"] == "own" else ""
-        found = [{**own, **r} for r in cross_modal(model, pack)]
-        write_json(
-            path / "probe.json", {"data": pack.spec.name, "pack": pack.digest, "records": mine, "retrieval": found}
-        )
-        return mine, found
-
+    records: Records = []
+    retrieval: Records = []
     num = len(models) * len(tasks) * len(modalities) * len(session.probes)
     with work("fitting probes", num, "probes"):
-        scored = in_threads(lambda each: one(*each), list(zip(paths, models, names, strict=True)))
-    for mine, found in scored:
-        records += mine
+        scored = in_threads(
+            lambda each: _probe_run(*each, pack, tasks, modalities, session),
+            list(zip(paths, models, names, strict=True)),
+        )
+    for own, found in scored:
+        records += own
         retrieval += found
     if session.controls:
         runs, specs = [m.run for m in models], [m.spec for m in models]
@@ -123,9 +113,54 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
     }
 
 
+def _check_paths(paths: Sequence[Path]) -> None:
+    if not paths:
+        raise ValueError("give at least one run's folder")
+    for path in paths:
+        if path.is_file():
+            raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
+        if [p.resolve() for p in paths].count(path.resolve()) > 1:
+            raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
+
+
+def _check_models(paths: Sequence[Path], models: Sequence[Model], pack: Pack) -> None:
+    """Check that each model can embed this data and that its probe.json can be written."""
+    for path, model in zip(paths, models, strict=True):
+        check_place(path / "probe.json")
+        for modality in pack.spec.modalities:
+            if model.spec.channels(modality) != pack.spec.channels(modality):
+                raise ValueError(
+                    f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
+                    f" it was trained on {model.spec.name!r}"
+                )
+
+
+def _probe_run(
+    path: Path,
+    model: Model,
+    source: str,
+    pack: Pack,
+    tasks: Sequence[Task],
+    modalities: Sequence[str],
+    session: ProbeConfig,
+) -> tuple[Records, Records]:
+    """Probe and retrieval records of one run, also written to its probe.json."""
+    own = {"source": source, "seed": model.run.seed, "run": str(path)}
+    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
+    for record in records:
+        record["source"] += END_TO_END if record["probe"] == "own" else ""
+    found = [{**own, **r} for r in cross_modal(model, pack)]
+    kept = {"data": pack.spec.name, "pack": pack.digest, "records": records, "retrieval": found}
+    write_json(path / "probe.json", kept)
+    return records, found
+
+
 def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
-    """What each run is called: its method, and its recipe where these differ, and its folder where runs of one such name
-    differ in more than their seed. ValueError if two differ in nothing: they would count as two seeds."""
+    """Names of the runs: the method, the recipe if recipes differ, and the folder if runs of one name differ further.
+
+    Raises:
+        ValueError: If two runs are the same, since they would count as two seeds.
+    """
     several = len({model.run.recipe for model in models}) > 1
     names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]
     alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> settings -> seed -> folder
@@ -146,15 +181,14 @@ def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
 
 
 def _settings(path: Path, model: Model) -> str:
-    """Whose seeds belong together: all settings but the seed, and the data by its content, wherever it lies."""
+    """Digest of all settings but the seed, and of the data by content. Runs that share it are seeds of one method."""
     record = load_run(path)[1] if (path / "run.json").exists() else {}
     data = record.get("pack") or to_json(model.run.data)
     return digest([replace(model.run, seed=0, data=PackConfig()).digest(), data])
 
 
 def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
-    """A name for each of these groups of folders: the folder it shares, or its own; the least of the path that tells them
-    apart."""
+    """Shortest distinct names of groups of folders: from the folder that a group shares, else from all of its folders."""
     whole = [[path.resolve() for path in group] for group in groups]
     shared = [Path(os.path.commonpath(group)) for group in whole]
     listed = [[place] for place in shared] if len(set(shared)) == len(groups) else whole
@@ -164,7 +198,7 @@ def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
 
 
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[Task], list[str]]:
-    """The tasks and modalities of ``session`` on this data; ValueError names what it lacks."""
+    """The tasks and modalities that ``session`` asks for; ValueError if the data lacks one."""
     known = {task.name: task for task in pack.spec.tasks}
     if not known:
         raise ValueError(f"dataset {pack.spec.name!r} has no labels: nothing to probe")
@@ -176,5 +210,5 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[Task], list[str]]:
         if modality not in have:
             raise unknown("modality", modality, have)
     if not session.probes:
-        raise ValueError(f"no probes asked for: choose from {', '.join(PROBES)}")
+        raise ValueError(f"no probe given: choose from {', '.join(PROBES)}")
     return [known[name] for name in session.tasks or known], list(session.modalities or have)

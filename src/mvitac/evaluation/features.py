@@ -1,4 +1,4 @@
-"""Features of a pack's rows by a frozen model, computed once: kept in the cache by weights, data and rows."""
+"""Features of a pack's rows from a frozen model, with a cache on disk."""
 
 from __future__ import annotations
 
@@ -25,13 +25,16 @@ def pack_features(
     bf16: bool = False,
     advance: Callable[[int], object] = lambda num: None,
 ) -> Tensor:
-    """Features [len(rows), D] of pack rows, as ``Model.features``, in chunks on the model's device; back on the CPU.
+    """Compute ``Model.features`` of pack rows in chunks on the model's device.
 
-    ``advance`` is told how many rows each chunk has, once it is done.
+    ``advance`` is called after each chunk with the number of its rows.
+
+    Returns:
+        Features [len(rows), D] on the CPU.
     """
     device = next(model.parameters()).device
     if device.type == "cpu":
-        keep_freed_memory()  # else every activation is mapped anew: twice the time and more on a virtual machine
+        keep_freed_memory()  # else every activation is mapped again: over twice the time on a virtual machine
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
@@ -41,27 +44,26 @@ def pack_features(
 
 
 def sample(rows: np.ndarray, num: int) -> np.ndarray:
-    """At most ``num`` of ``rows``, in their order, the same ones at every call.
+    """Draw at most ``num`` of ``rows`` at random; returns the same rows, in order, on every call.
 
-    By chance: packs take their classes in turn, and every n-th row would be of the same few.
+    Rows cycle through the classes, so a fixed stride would miss most of them.
     """
     return np.sort(np.random.default_rng(0).choice(rows, min(num, len(rows)), replace=False))
 
 
 def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:
-    """Features [len(rows), D] float32, computed once and cached by weights, data, rows and side (``Model.features``)."""
+    """Features [len(rows), D] float32, cached on disk by weights, data, rows and image size (``Model.features``)."""
     device = next(model.parameters()).device
     sides = model.run.augment
-    side = (
-        [sides.size] if for_heads and sides.size != sides.eval_size else []
-    )  # the usual one is in the weights' digest
+    # The weights' digest covers eval_size already.
+    side = [sides.size] if for_heads and sides.size != sides.eval_size else []
     key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type, *side])
     path = cache_dir() / "features" / f"{key[:32]}.npy"
     if path.exists():
         try:
             return np.load(path, allow_pickle=False)
         except (ValueError, EOFError, OSError):
-            path.unlink()  # damaged: compute it again
+            path.unlink()  # damaged file: compute the features again
     with work(f"reading {modality} features", len(rows), "images") as advance:
         values = pack_features(model, pack, modality, rows, for_heads=for_heads, advance=advance).numpy()
     write_atomic(path, lambda file: np.save(file, values))

@@ -1,13 +1,13 @@
-"""What features are worth when things are worse: few labels, noisy images, one modality missing at test time; or made to
-look better, by a split that leaks.
+"""Stress tests of features: few labels, noisy images, a modality missing at test time, and a split that leaks.
 
-All by the linear probe, as further records under their own probe names (``STRESSES``). Compare within one name only, but for
-the two of ``LEAK``: their difference is what a split by frames adds to one by groups.
+Each is scored by logistic regression and recorded under its own probe name (``STRESSES``). Compare scores within one
+name only. The exception is the pair in ``LEAK``: its difference is what a split by frames adds to a split by groups.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,88 +16,125 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.data.spec import Task
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import ProbeSplit, fit_probe, parts, probe_features, score_rows
+from mvitac.evaluation.probe import ProbeSplit, fit_probe, names_in, probe_features, score_rows, split_rows
 from mvitac.model import Model
 
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}
-"""Share of the labelled train rows and of the val rows a probe sees; at least one row of each class."""
+"""Fraction of the labelled training and validation rows that a probe sees; at least one row per class."""
 NOISE = "noisy images"
 NOISE_LEVELS = 20.0
-"""Standard deviation of the noise on each 8-bit channel of test images."""
+"""Standard deviation of the noise added to each 8-bit channel of test images."""
 MISSING = {"vision": "vision missing", "touch": "touch missing"}
-"""modality -> name; a probe on both modalities meets test rows whose features of this one are train's mean."""
+"""modality -> name. The probe uses both modalities; in test rows, features of this one are replaced by their mean."""
 DROPOUT = "modality dropout"
-"""A probe on both that learned from every row three times, whole and with each modality missing; its scores with both
-there, and under "modality dropout, vision missing" and the like."""
+"""A probe on both modalities, fitted on every row three times: whole, and with each modality missing. It is scored with
+both present and, under names such as "modality dropout, vision missing", with one missing."""
 LEAK = {"unseen groups": False, "groups seen in training": True}
-"""name -> whether half of every test group's rows are learned from, in place of as many rows of train; scored is the other
-half both times, so that the same rows show what a split by frames or touches is worth in points."""
+"""name -> whether half of each test group's rows replace as many training rows. Both score the other half."""
 PREPARED = {lost: f"{DROPOUT}, {name}" for lost, name in MISSING.items()}
 STRESSES = (*SHARES, NOISE, *MISSING.values(), DROPOUT, *PREPARED.values(), *LEAK)
 
+Scores = Iterator[tuple[str, dict[str, Any]]]
+"""(name of the stress, scores)."""
+
+
+@dataclass(frozen=True)
+class _Case:
+    """One task and modality of a model, with clean features [train + val + test rows, D] by modality."""
+
+    pack: Pack
+    task: Task
+    rows: ProbeSplit
+    clean: dict[str, np.ndarray]
+    seed: int
+
+    def joined(self) -> np.ndarray:
+        return np.concatenate(list(self.clean.values()), axis=1)
+
+    def fit(self, x: np.ndarray, rows: ProbeSplit) -> Callable[[np.ndarray], dict[str, Any]]:
+        """Fit logistic regression; returns a function from features of the test rows to scores."""
+        predict, extra = fit_probe(x, self.pack, self.task, rows, "linear", self.seed)
+        return lambda z: {**score_rows(self.pack, self.task, rows.test, predict(z)), **extra}
+
+    def probe(self, keep: np.ndarray, rows: ProbeSplit) -> dict[str, Any]:
+        return probe_features(self.joined()[keep], self.pack, self.task, rows, "linear", self.seed)
+
 
 def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]) -> list[dict[str, Any]]:
-    """Records of every stress, task and modality that ``model`` has; the same draws of rows and noise for every model
-    of one seed, so that differences are paired."""
+    """Records of every stress for each task and modality that ``model`` has an encoder for.
+
+    Rows and noise are drawn alike for all models of one seed, so that differences are paired.
+    """
     seed, records = model.run.seed, []
     noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
     for task, modality in ((task, modality) for task in tasks for modality in modalities):
-        names = list(pack.spec.modalities) if modality == "both" else [modality]
+        names = names_in(modality, pack)
         if not set(names) <= set(model.encoders):
             continue
-        rows = parts(pack, task, modality)
-        learned = np.concatenate([rows.train, rows.val])
-        clean = {m: features(model, pack, m, np.concatenate([learned, rows.test])) for m in names}
+        rows = split_rows(pack, task, modality)
+        case = _Case(pack, task, rows, {m: features(model, pack, m, rows.all) for m in names}, seed)
         for m in names:
             known = noisy.setdefault(m, {})
             new = np.array([row for row in rows.test if int(row) not in known], np.int64)
             if len(new):
                 known.update(zip(new.tolist(), _noisy_features(model, pack, m, new, seed), strict=True))
-
-        def add(kind: str, result: dict[str, Any], task: Task = task, modality: str = modality) -> None:
-            records.append({"task": task.name, "modality": modality, "probe": kind, **result})
-
-        x = np.concatenate([clean[m] for m in names], axis=1)
-        for kind, share in SHARES.items():
-            keep, few = _few(rows, pack.labels(task.name), share, seed)
-            add(kind, probe_features(x[keep], pack, task, few, "linear", seed))
-        for kind, leaks in LEAK.items():
-            keep, halved = _halved(rows, pack.column("group"), leaks, seed)
-            if len(halved.test):
-                add(kind, probe_features(x[keep], pack, task, halved, "linear", seed))
-
-        num = len(learned)
-        predict, extra = fit_probe(x[:num], pack, task, rows, "linear", seed)
         test = np.concatenate([np.stack([noisy[m][int(row)] for row in rows.test]) for m in names], axis=1)
-        add(NOISE, {**score_rows(pack, task, rows.test, predict(test)), **extra})
-        if modality != "both":
-            continue
-        blind = {lost: _without(lost, clean, num) for lost in MISSING}
-        for lost, kind in MISSING.items():
-            add(kind, {**score_rows(pack, task, rows.test, predict(blind[lost][num:])), **extra})
-        whole = [x, *blind.values()]
-        prepared = np.concatenate([z[: len(rows.train)] for z in whole] + [z[len(rows.train) : num] for z in whole])
-        thrice = ProbeSplit(np.tile(rows.train, 3), np.tile(rows.val, 3), rows.test)
-        predict, extra = fit_probe(prepared, pack, task, thrice, "linear", seed)
-        for kind, z in zip((DROPOUT, *PREPARED.values()), whole, strict=True):
-            add(kind, {**score_rows(pack, task, rows.test, predict(z[num:])), **extra})
+        for scores in (_fewer_or_leaked(case), _worse_images(case, test), _dropout(case)):
+            for kind, result in scores:
+                records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
 
 
+def _fewer_or_leaked(case: _Case) -> Scores:
+    """Few labels, and the two splits of ``LEAK``."""
+    for kind, share in SHARES.items():
+        yield kind, case.probe(*_few(case.rows, case.pack.labels(case.task.name), share, case.seed))
+    for kind, leaks in LEAK.items():
+        keep, halved = _halved(case.rows, case.pack.column("group"), leaks, case.seed)
+        if len(halved.test):
+            yield kind, case.probe(keep, halved)
+
+
+def _worse_images(case: _Case, noisy: np.ndarray) -> Scores:
+    """Noisy test images, and for a probe on both modalities one of them missing."""
+    num = len(case.rows.fitted)
+    score = case.fit(case.joined()[:num], case.rows)
+    yield NOISE, score(noisy)
+    if len(case.clean) == 2:
+        for lost, kind in MISSING.items():
+            yield kind, score(_without(lost, case.clean, num)[num:])
+
+
+def _dropout(case: _Case) -> Scores:
+    """Modality dropout, for a probe on both modalities."""
+    if len(case.clean) < 2:
+        return
+    rows, num, split = case.rows, len(case.rows.fitted), len(case.rows.train)
+    whole = [case.joined(), *(_without(lost, case.clean, num) for lost in MISSING)]
+    prepared = np.concatenate([z[:split] for z in whole] + [z[split:num] for z in whole])
+    score = case.fit(prepared, ProbeSplit(np.tile(rows.train, 3), np.tile(rows.val, 3), rows.test))
+    for kind, z in zip((DROPOUT, *PREPARED.values()), whole, strict=True):
+        yield kind, score(z[num:])
+
+
 def _without(lost: str, clean: dict[str, np.ndarray], num: int) -> np.ndarray:
-    """Features of both modalities [N, D], those of ``lost`` everywhere the mean of the first ``num`` rows."""
+    """Features of both modalities [N, D], those of ``lost`` replaced by the mean of its first ``num`` rows."""
     return np.concatenate(
         [np.broadcast_to(z[:num].mean(0), z.shape) if m == lost else z for m, z in clean.items()], axis=1
     )
 
 
 def _few(rows: ProbeSplit, labels: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, ProbeSplit]:
-    """Places to keep in [train, val, test], and the parts that are left: ``share`` of train and of val, all of test."""
+    """Keep ``share`` of the training and validation rows, and all test rows.
+
+    Returns:
+        Positions to keep in [train, val, test], and the rows that are left.
+    """
     rng = np.random.default_rng([seed, round(1000 * share)])
 
     def some(part: np.ndarray) -> np.ndarray:
         order = rng.permutation(len(part))
-        _, first = np.unique(labels[part[order]], return_index=True)  # one of each class, then whatever comes
+        _, first = np.unique(labels[part[order]], return_index=True)  # one of each class, then any
         rest = np.setdiff1d(np.arange(len(part)), first)
         wanted = max(len(first), round(share * len(part)))
         return np.sort(order[np.concatenate([first, rest])[:wanted]])
@@ -109,8 +146,10 @@ def _few(rows: ProbeSplit, labels: np.ndarray, share: float, seed: int) -> tuple
 
 
 def _halved(rows: ProbeSplit, groups: np.ndarray, leaks: bool, seed: int) -> tuple[np.ndarray, ProbeSplit]:
-    """Places to keep in [train, val, test], and the parts that are left: half the rows of each test group are scored; the
-    other half is learned from if it ``leaks``, in place of as many rows of train. A group of one row takes no part."""
+    """Score half the rows of each test group; if ``leaks``, the other half replaces as many training rows.
+
+    Groups of one row are left out. Returns as ``_few``.
+    """
     rng = np.random.default_rng([seed, 2])
     given, scored = [], []
     for name in np.unique(groups[rows.test]):
@@ -118,15 +157,14 @@ def _halved(rows: ProbeSplit, groups: np.ndarray, leaks: bool, seed: int) -> tup
         half = len(mine) // 2
         given += mine[:half].tolist()
         scored += mine[half:].tolist() if half else []
-    if len(given) > len(rows.train):  # no more than there are to replace
+    if len(given) > len(rows.train):  # no more than can be replaced
         given = rng.permutation(given)[: len(rows.train)].tolist()
     train = np.arange(len(rows.train))
     val, test = len(train) + np.arange(len(rows.val)), len(train) + len(rows.val)
     if leaks:
         train = np.concatenate([rng.permutation(train)[len(given) :], test + np.array(given, np.int64)])
     keep = np.concatenate([train, val, test + np.array(scored, np.int64)])
-    everything = np.concatenate([rows.train, rows.val, rows.test])
-    return keep, ProbeSplit(everything[train], rows.val, rows.test[scored])
+    return keep, ProbeSplit(rows.all[train], rows.val, rows.test[scored])
 
 
 def _noisy_features(model: Model, pack: Pack, modality: str, rows: np.ndarray, seed: int) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""What predictions are worth: scores by test group, their intervals, and differences between methods on the same groups.
+"""Scores of predictions, their confidence intervals, and differences between methods.
 
-A record is one probe of one source on one task: ``score`` writes its ``group_sizes`` and ``group_correct``, and every
-interval resamples those groups (near-copies of one another inside, independent of one another outside) and the seeds.
+A record is one probe of one source on one task. ``score`` counts correct rows per test group. Every interval resamples
+these groups and the seeds: rows within a group are near-copies, groups are independent.
 """
 
 from __future__ import annotations
@@ -13,16 +13,26 @@ import numpy as np
 from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
 
 NUM_DRAWS = 2000
-"""Bootstrap draws behind every interval."""
+"""Number of bootstrap draws of every interval."""
 
 
 def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_classes: int) -> dict[str, Any]:
-    """Scores of one probe on test rows; ``groups`` are the rows' group numbers, for intervals."""
+    """Score class probabilities [N, K] against labels ``y`` [N].
+
+    Args:
+        y: True labels.
+        probabilities: Class probabilities.
+        groups: Group number of each row, for intervals.
+        num_classes: K.
+
+    Returns:
+        Accuracy, balanced accuracy, macro F1, AUROC (two classes only), the confusion matrix and counts per group.
+    """
     guess = probabilities.argmax(1)
     present = np.unique(y)
     num_groups = int(groups.max()) + 1
     auroc = None
-    no_division: dict[str, Any] = {"zero_division": 0}  # a class that is never guessed has precision 0
+    no_division: dict[str, Any] = {"zero_division": 0}  # a class that is never predicted has precision 0
     if num_classes == 2 and len(present) == 2:
         auroc = float(roc_auc_score(y, probabilities[:, 1]))
     return {
@@ -38,10 +48,10 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
 
 
 def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Records of cross-validation folds, whose test groups differ, as records of all groups together.
+    """Pool the records of cross-validation folds, whose test groups differ, into records of all groups.
 
-    Only what every fold has scored. Accuracy is that of all rows; AUROC, F1 and balanced accuracy, which cannot be taken
-    over probes fitted apart, are means over the folds that have them.
+    Keeps only what every fold has scored. Accuracy is over all rows. AUROC, F1 and balanced accuracy are means over the
+    folds that have them, since the folds' probes were fitted separately.
     """
     keys = ("source", "seed", "task", "modality", "probe")
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
@@ -69,10 +79,15 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 
 def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
-    """Mean accuracy over runs and its 95 % interval, by a two-level bootstrap over test groups and over seeds.
+    """Mean accuracy over runs and its 95 % interval, by a two-level bootstrap over test groups and seeds.
 
-    All records must score the same test groups. Groups (not rows) are drawn, since rows of a group are near-copies.
-    One group says nothing about others: its interval is all of 0 to 1.
+    Groups are drawn, not rows, since rows of a group are near-copies. With a single group the interval is 0 to 1.
+
+    Args:
+        records: One record per seed, all on the same test groups.
+
+    Returns:
+        Mean, lower end and upper end, in 0 .. 1.
     """
     sizes = np.array(records[0]["group_sizes"], float)
     correct = np.array([r["group_correct"] for r in records], float)  # [S, G]
@@ -88,11 +103,18 @@ def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
 def paired_difference(
     ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]
 ) -> tuple[float, float, float, float]:
-    """Accuracy of ``ours`` minus that of ``theirs`` over the same test groups: mean, 95 % interval, two-sided p.
+    """Difference in accuracy between two methods on the same test groups, by a paired bootstrap.
 
-    Bootstrap over test groups, the same ones drawn for both, and over seeds: together where both have the same seeds
-    (equal seeds share batches and views), apart otherwise. p is twice the share of draws on the other side of zero, and no
-    less than ``least_p``. One group says nothing about others: p is 1.
+    Test groups are drawn jointly for both methods. Seeds are drawn jointly if both have the same seeds, which share
+    batches and views, and independently otherwise.
+
+    Args:
+        ours: Records of one method, one per seed.
+        theirs: Records of the method to subtract.
+
+    Returns:
+        Mean difference, lower and upper end of its 95 % interval, and the two-sided p: twice the fraction of draws on
+        the other side of zero, at least ``least_p``. With a single group p is 1.
     """
     sizes = np.array(ours[0]["group_sizes"], float)
     assert all(list(r["group_sizes"]) == list(sizes) for r in (*ours, *theirs)), "scored on different test rows"
@@ -112,21 +134,20 @@ def paired_difference(
 
 
 def least_p(num_groups: int) -> float:
-    """The least p that ``paired_difference`` can say: that of a sign test over the groups, and of its draws."""
+    """Smallest p of ``paired_difference``: limited by a sign test over the groups and by the number of draws."""
     return max(2 / (NUM_DRAWS + 1), 2.0 ** (1 - num_groups))
 
 
 def _drawn_groups(num: int, rng: np.random.Generator) -> np.ndarray:
-    """[draws, G]: how often each group is drawn."""
+    """How often each group is drawn, [draws, G]."""
     return np.stack([np.bincount(g, minlength=num) for g in rng.integers(0, num, (NUM_DRAWS, num))])
 
 
 def _means(correct: np.ndarray, sizes: np.ndarray, seeds: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """[draws]: accuracy over the drawn groups (``weights``) and ``seeds``, of ``correct`` [S, G] of ``sizes`` [G] rows.
+    """Accuracy of each draw, [draws], from ``correct`` [S, G] of ``sizes`` [G] rows.
 
-    Means of n things drawn with replacement vary by (n - 1) / n of what means of n other things would: little for 240
-    groups, a third for 3 seeds. So each level's deviations are stretched by sqrt(n / (n - 1)) (Davison and Hinkley 1997,
-    section 3.8).
+    A bootstrap of n items underestimates their variance by the factor (n - 1) / n: little for 240 groups, a third for 3
+    seeds. So each level's deviations are scaled by sqrt(n / (n - 1)) (Davison and Hinkley 1997, section 3.8).
     """
     num_seeds, num_groups = correct.shape
     per_seed = weights @ correct.T / np.maximum(weights @ sizes, 1)[:, None]  # [draws, S]
@@ -139,18 +160,24 @@ def _means(correct: np.ndarray, sizes: np.ndarray, seeds: np.ndarray, weights: n
     return correct.sum() / num_seeds / sizes.sum() + stretched
 
 
-def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
-    """task -> modality -> method or control -> mean, low, high, seeds (accuracy; see ``interval``).
+Cell = tuple[str, str, str]
+"""(task, modality, source)."""
 
-    A source that was not probed by ``probe`` (majority, pixels, ...) shows the one probe it has.
-    """
+
+def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[dict[str, Any]]]:
+    """Records of ``probe`` grouped by cell. A source without that probe (majority, pixels, ...) keeps the one it has."""
     asked = {record["source"] for record in records if record["probe"] == probe}
-    gathered: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    found: dict[Cell, list[dict[str, Any]]] = {}
     for record in records:
         if record["probe"] == probe or record["source"] not in asked:
-            gathered.setdefault((record["task"], record["modality"], record["source"]), []).append(record)
+            found.setdefault((record["task"], record["modality"], record["source"]), []).append(record)
+    return found
+
+
+def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
+    """Accuracy as task -> modality -> method or control -> mean, low, high and seeds (``by_cell``, ``interval``)."""
     summary: dict[str, Any] = {}
-    for (task, modality, source), found in gathered.items():
+    for (task, modality, source), found in by_cell(records, probe).items():
         mean, low, high = interval(found)
         seeds = [record["seed"] for record in found if record["seed"] is not None]
         cell = {"mean": mean, "low": low, "high": high, "seeds": seeds}

@@ -1,17 +1,18 @@
-"""``mvitac compare``: a plan -> runs -> one result. What is finished is skipped, what was cut is resumed.
+"""``mvitac compare``: lay out the jobs of a plan, and collect the finished runs into one result.
 
-    <out>/plan.json                      what was asked for
-          runs/<row>/seed<k>/            a run like any other, with scores.json in place of its checkpoint
-          controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet where asked
-          result.json  table.*           the tables (``paper_tables``)
+    <out>/plan.json                      the plan
+          runs/<row>/seed<k>/            a run as ``mvitac pretrain`` leaves it, with scores.json but no checkpoint
+          controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet if asked
+          result.json  table.*           the tables (``table_formats``)
 
-A run whose loss stops being a number is a result too: it is kept as failed.json and told in the table.
+Finished runs are skipped and interrupted ones resumed. A run whose loss became NaN or infinite is a result too: it is
+kept as failed.json and named below the table.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import Task
-from mvitac.evaluation.controls import controls_of
+from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work, seconds_of
 from mvitac.experiments.plan import Plan, Row, slug
@@ -32,17 +33,26 @@ from mvitac.run import Run, load_run
 from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.provenance import provenance
-from mvitac.training.loop import check_same
 from mvitac.training.sampler import training_rows
+from mvitac.training.setup import check_same
 from mvitac.training.views import gel_mirror
 
 
 def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str = "auto") -> Work:
-    """The jobs of ``plan`` on the data of its rows, seeds outermost; ValueError if not one row is possible, or if ``out``
-    holds other runs.
+    """The jobs of ``plan``, ordered by seed and then by row.
 
-    Rows that need what the data lacks (labels, a camera) and rows that are the same run as an earlier one are left out. A
-    row may read the same samples in another way (difference images of touch), not other samples.
+    Rows that need what the data lacks (labels, a camera) and rows equal to an earlier one are left out. A row may read
+    the same samples differently (difference images of touch), but not other samples.
+
+    Args:
+        plan: The plan; its data must be set.
+        pack: The plan's data.
+        out: Folder of the comparison.
+        session: How to score each run.
+        device: Device of every run.
+
+    Raises:
+        ValueError: If no row is possible, or ``out`` holds other runs.
     """
     assert plan.data is not None
     chosen(pack, session)
@@ -53,40 +63,44 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     for row in plan.rows:
         if row.label in pack.spec.controls:
             raise ValueError(f"row {row.label!r} has the name of a control of this data: give it another label")
-        if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
-            left_out[row.label] = f"dataset {plan.data.name!r} has no {', '.join(missing)}"
-            continue
-        run = plan.run(row, plan.data, 0)
         try:
-            own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
-            run.check(own.spec, len(training_rows(run, own)), own.size)
-            gel_mirror(run, own, torch.device("cpu"))
-            run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+            own, key = _check_row(plan, row, pack)
         except ValueError as error:
             left_out[row.label] = str(error)
             continue
-        if (key := run.without_idle(own.spec).digest()) in seen:
+        if key in seen:
             left_out[row.label] = f"the same run as {seen[key]!r} under recipe {plan.recipe!r}"
             continue
         seen[key] = row.label
         possible.append((row, own))
     if not possible:
         raise ValueError(f"plan {plan.name!r} has no row that this data allows: {next(iter(left_out.values()))}")
-    jobs = [
-        Job(row.label, replace(plan.run(row, plan.data, seed), device=device), place, session, plan.stress)
-        for seed in range(plan.seeds)
-        for row, _ in possible
-        for place in (out / "runs" / slug(row.label) / f"seed{seed}",)
-    ]
-    packs = {row.label: own for row, own in possible}
-    for job in jobs:
-        if (job.out / "run.json").exists():
-            check_same(job.run, packs[job.label], job.out)
+    jobs = []
+    for seed in range(plan.seeds):
+        for row, own in possible:
+            run = replace(plan.run(row, plan.data, seed), device=device)
+            job = Job(row.label, run, out / "runs" / slug(row.label) / f"seed{seed}", session, plan.stress)
+            if (job.out / "run.json").exists():
+                check_same(job.run, own, job.out)
+            jobs.append(job)
     return Work(plan, pack, jobs, left_out)
 
 
+def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
+    """The pack that a row reads, and the digest of its settings; ValueError if the data does not allow the row."""
+    assert plan.data is not None
+    if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
+        raise ValueError(f"dataset {plan.data.name!r} has no {', '.join(missing)}")
+    run = plan.run(row, plan.data, 0)
+    own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
+    run.check(own.spec, len(training_rows(run, own)), own.size)
+    gel_mirror(run, own, torch.device("cpu"))
+    run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+    return own, run.without_idle(own.spec).digest()
+
+
 def _same_samples(own: Pack, pack: Pack) -> Pack:
-    """``own``, if it holds the samples of ``pack`` on the same sides, with the same labels."""
+    """Return ``own`` if it has the samples, splits and labels of ``pack``."""
     for name in ("id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)):
         if name not in own.table.column_names or not np.array_equal(own.column(name), pack.column(name)):
             raise ValueError(
@@ -96,29 +110,19 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
 
 
 def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
-    """Everything the tables are made of, from the finished runs; ValueError if there is none."""
-    finished = [job for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
-    failed = {
-        job.name: read_json(job.out / "failed.json", "a failure")["error"]
-        for job in work.jobs
-        if (job.out / "failed.json").exists()
-    }
+    """Collect the finished runs and the controls into the result that tables are made from.
+
+    Raises:
+        ValueError: If no run is finished.
+    """
+    failed = {job.name: job.failure for job in work.jobs if job.failure}
+    finished = [job for job in work.jobs if job.done and not job.failure]
     if not finished:
         lost = "; ".join(f"{name}: {error}" for name, error in failed.items())
-        raise ValueError(f"no run of {out} is finished: nothing to tell yet{f' ({lost})' if lost else ''}")
-    records: list[dict[str, Any]] = []
-    retrieval: list[dict[str, Any]] = []
-    for job in finished:
-        scores = read_json(job.out / "scores.json", "a run's scores")
-        method = job.run.method.name
-        worse = read_json(job.out / "stress.json", "a run's stress")["records"] if job.stress else []
-        for record in scores["records"] + worse:
-            records.append({**record, "source": job.label + record["source"].removeprefix(method)})
-        retrieval += [{**found, "source": job.label} for found in scores["retrieval"]]
+        raise ValueError(f"no run of {out} is finished: nothing to show yet{f' ({lost})' if lost else ''}")
+    scored = [_scores(job) for job in finished]
     controls, found = _controls(work, out, session)
     runs = [load_run(job.out) for job in finished]
-    made = [record for _, record in runs]
-    rows = {row.label: row for row in work.plan.rows}
     return {
         "plan": to_json(work.plan),
         "data": work.pack.spec.name,
@@ -126,43 +130,56 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "group_by": work.pack.spec.group_by,
         "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
         "leaks": leaks(work.pack, chosen(work.pack, session)[0]),
-        "records": records + controls,
-        "retrieval": retrieval + found,
-        "rows": [label for label in rows if label not in work.left_out],
+        "records": [record for records, _ in scored for record in records] + controls,
+        "retrieval": [record for _, retrieval in scored for record in retrieval] + found,
+        "rows": [row.label for row in work.plan.rows if row.label not in work.left_out],
         "left_out": work.left_out,
         "failed": failed,
         "unfinished": [job.name for job in work.jobs if not job.done],
         "cost": [cost(label, [j for j in finished if j.label == label], work.pack) for label in _labels(finished)],
         "device": describe(pick_device(work.jobs[0].run.device)),
-        "run_commits": list(dict.fromkeys(record.get("commit") for record in made)),
-        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for record in made)),
+        "run_commits": list(dict.fromkeys(record.get("commit") for _, record in runs)),
+        "run_devices": list(dict.fromkeys(record.get("device", "unknown device") for _, record in runs)),
         "run_precisions": {job.name: precision_of(*run) for job, run in zip(finished, runs, strict=True)},
         **provenance(),
     }
 
 
-def _labels(jobs: Sequence[Job]) -> Iterator[str]:
-    yield from dict.fromkeys(job.label for job in jobs)
+def _scores(job: Job) -> tuple[Records, Records]:
+    """Probe and retrieval records of a finished job, named by its row."""
+    scores = read_json(job.out / "scores.json", "a run's scores")
+    records = scores["records"]
+    if job.stress:
+        records = records + read_json(job.out / "stress.json", "a run's stress")["records"]
+    method = job.run.method.name
+    named = [{**record, "source": job.label + record["source"].removeprefix(method)} for record in records]
+    return named, [{**found, "source": job.label} for found in scores["retrieval"]]
 
 
-def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The controls beside the reference row, made once."""
+def _labels(jobs: Sequence[Job]) -> list[str]:
+    return list(dict.fromkeys(job.label for job in jobs))
+
+
+def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Records]:
+    """The controls of the reference row's runs, kept in controls.json."""
     if not session.controls:
         return [], []
-    beside = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
-    key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in beside]])
+    runs = [job.run for job in work.jobs if job.label == work.plan.reference] or [work.jobs[0].run]
+    key = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), [run.digest() for run in runs]])
     path = out / "controls.json"
     if path.exists() and (kept := read_json(path, "the controls"))["key"] == key:
         return kept["records"], kept["retrieval"]
     tasks, modalities = chosen(work.pack, session)
-    records, retrieval = controls_of(beside, work.pack, tasks, modalities, session.probes, session.imagenet)
+    records, retrieval = controls_of(runs, work.pack, tasks, modalities, session.probes, session.imagenet)
     write_json(path, {"key": key, "records": records, "retrieval": retrieval})
     return records, retrieval
 
 
 def leaks(pack: Pack, tasks: Sequence[Task]) -> str:
-    """A sentence for each split of ``tasks`` of which groups (instances, objects, recordings) lie in train and in test, and
-    for each of their own whose test rows were pre-trained on; "" if there is none."""
+    """Describe leaks of each split that ``tasks`` use: groups in both train and test, and test rows used in pre-training.
+
+    Returns an empty string if there is none.
+    """
     groups, said = pack.column("group").astype(str), []
     for column in dict.fromkeys(("split", *(task.split for task in tasks))):
         train, test = (pack.rows(split, by=column) for split in ("train", "test"))
@@ -177,7 +194,7 @@ def leaks(pack: Pack, tasks: Sequence[Task]) -> str:
 
 
 def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
-    """Steps, pairs, images and median seconds of one run of a row, and its peak GPU memory where it was measured."""
+    """Steps, pairs, images, median seconds and (if measured) peak GPU memory of one run of a row."""
     run = jobs[0].run
     rows = len(training_rows(run, pack))
     method = run.method.build(pack.spec, replace(run.encoder, weights=SCRATCH))
@@ -197,19 +214,19 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
 
 
 def pairs_of(run: Run, views: int, pack: Pack) -> str:
-    """What the method is told belongs together, which decides more than most methods do (``Run.positives``)."""
+    """Which rows form a positive pair (``Run.positives``). This matters more than the choice of most methods."""
     other = run.positives != "same-image" if views > 1 else run.positives == "same-touch-pairs"
     several = len(np.unique(pack.touch_groups)) < pack.num
     return "two rows of a touch" if other and several else "one row"
 
 
 def forecast(work: Work) -> list[str]:
-    """The plan in words: runs, what is finished, steps and pairs, and the time left where finished runs tell it."""
+    """Lines that describe the plan: runs, steps, pairs, what is finished, and the time left if any run is finished."""
     rows = {label: next(job for job in work.jobs if job.label == label) for label in _labels(work.jobs)}
     num = len({job.fold for job in work.jobs})
     folds = f" x {num} folds" if num > 1 else ""
     lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
-    known = [seconds_of(job.out) for job in work.jobs if job.done and not (job.out / "failed.json").exists()]
+    known = [seconds_of(job.out) for job in work.jobs if job.done and not job.failure]
     for label, job in rows.items():
         num = len(training_rows(job.run, work.pack))
         steps = job.run.num_steps(num)

@@ -1,7 +1,6 @@
-"""Cross-validation: a plan's rows on each fold of its data, and the folds' test groups as one result.
+"""Cross-validation: run a plan on each fold of its data, and pool the folds' test groups into one result.
 
-Runs and controls lie in a folder per fold; the tables are of all folds' test groups pooled (``scores.pool``). A plan
-without folds is one fold without a name.
+Each fold has its own folder of runs and controls. A plan without folds is one fold with an empty name.
 """
 
 from __future__ import annotations
@@ -13,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from mvitac.data.pack import Pack
+from mvitac.data.spec import Task
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.evaluation.probe import MIN_GALLERY
 from mvitac.evaluation.scores import pool
@@ -24,25 +25,18 @@ from mvitac.system.files import digest
 
 
 def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "auto") -> list[Work]:
-    """The work of every fold of ``plan``, or of the plan; ValueError if two folds test the same group.
+    """The work of every fold of ``plan``. A row that one fold does not allow is left out of all.
 
-    A row that one fold does not allow is left out of all: its other folds could not be pooled.
+    Raises:
+        ValueError: If two folds test the same group, or no row is left.
     """
     works: list[Work] = []
     tested: dict[tuple[str, str], str] = {}
     for fold, part in plan.in_folds():
         assert part.data is not None
         pack = part.data.open()
-        groups = pack.column("group").astype(str)
-        for side in dict.fromkeys(("split", *(task.split for task in chosen(pack, session)[0]))) if fold else ():
-            own = "" if side == "split" else f" (column {side})"
-            for group in np.unique(groups[pack.rows("test", by=side)]).tolist():
-                if (side, group) in tested:
-                    raise ValueError(
-                        f"folds {tested[side, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}: each"
-                        " group must be tested once"
-                    )
-                tested[side, group] = fold
+        if fold:
+            _check_tested_once(fold, pack, chosen(pack, session)[0], tested)
         work = lay_out(part, pack, out / fold, session, device)
         works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
     left_out = {label: reason for work in works for label, reason in work.left_out.items()}
@@ -54,22 +48,35 @@ def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "au
     return works
 
 
+def _check_tested_once(fold: str, pack: Pack, tasks: Sequence[Task], tested: dict[tuple[str, str], str]) -> None:
+    """Add the test groups of ``fold`` to ``tested``: (split column, group) -> fold."""
+    groups = pack.column("group").astype(str)
+    for column in dict.fromkeys(("split", *(task.split for task in tasks))):
+        own = "" if column == "split" else f" (column {column})"
+        for group in np.unique(groups[pack.rows("test", by=column)]).tolist():
+            if (column, group) in tested:
+                raise ValueError(
+                    f"folds {tested[column, group]!r} and {fold!r} both test {pack.spec.group_by} {group!r}{own}: each"
+                    " group must be tested once"
+                )
+            tested[column, group] = fold
+
+
 def together(works: Sequence[Work]) -> Work:
-    """The jobs of all folds as one work, seeds outermost."""
+    """The jobs of all folds as one work, ordered by seed."""
     jobs = sorted((job for work in works for job in work.jobs), key=lambda job: job.run.seed)
     return replace(works[0], jobs=jobs)
 
 
 def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeConfig) -> dict[str, Any]:
-    """``gather`` of every fold as one result: test groups pooled (``scores.pool``), cost that of the first fold."""
+    """``gather`` all folds into one result: pooled test groups (``scores.pool``), cost of the first fold."""
     results = [gather(work, out / fold, session) for work, (fold, _) in zip(works, plan.in_folds(), strict=True)]
     if len(results) == 1:
         return {**results[0], "plan": to_json(plan)}
     retrieval = [r for result in results for r in result["retrieval"] if r["num_groups"] >= MIN_GALLERY]
-
-    def all_of(key: str) -> list[Any]:
-        return list(dict.fromkeys(value for result in results for value in result[key]))
-
+    merged = {
+        key: [value for result in results for value in result[key]] for key in ("notes", "run_commits", "run_devices")
+    }
     return {
         **results[0],
         "plan": to_json(plan),
@@ -77,7 +84,7 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
         "records": pool([result["records"] for result in results]),
         "retrieval": retrieval,
         "failed": {name: error for result in results for name, error in result["failed"].items()},
-        **{key: all_of(key) for key in ("notes", "run_commits", "run_devices")},
+        **{key: list(dict.fromkeys(values)) for key, values in merged.items()},
         "run_precisions": {name: p for result in results for name, p in result["run_precisions"].items()},
         "unfinished": [name for result in results for name in result["unfinished"]],
         "leaks": "; ".join(dict.fromkeys(result["leaks"] for result in results if result["leaks"])),

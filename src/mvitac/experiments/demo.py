@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.recipes import RECIPES
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_summary
 from mvitac.run import Run
@@ -39,16 +40,17 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     pack = run.data.open()
     runs = [(replace(run, seed=run.seed + i), out / f"seed{run.seed + i}") for i in range(num_seeds)]
     steps = run.num_steps(len(pack.rows("train")))
+    say(f"recipe {run.recipe}: {(RECIPES[run.recipe].__doc__ or '').splitlines()[0]}")
     unfinished = [(seeded, path) for seeded, path in runs if not (path / "model.safetensors").exists()]
     if len(unfinished) > 1 and pick_device(run.device).type == "cpu" and (os.cpu_count() or 1) > 1:
         # Several runs of few threads get more out of the cores than one run of many (docs/speed.md).
-        say(f"2/4 pre-training {len(unfinished)} seeds side by side: {steps} steps each")
+        say(f"2/4 pre-training {len(unfinished)} seeds side by side: {steps} steps of {run.batch_size} pairs each")
         device = pick_device(run.device)
         say(describe_precision(run.precision, pick_precision(run.precision, device), device))
         train_together(unfinished, steps, console)
     for seeded, path in runs:  # what is finished is only held against what is asked for
         if not (path / "model.safetensors").exists():
-            say(f"2/4 pre-training seed {seeded.seed} (of {num_seeds}): {steps} steps")
+            say(f"2/4 pre-training seed {seeded.seed} (of {num_seeds}): {steps} steps of {run.batch_size} pairs")
         train(seeded, path, resume=True, pack=pack)
     paths = [path for _, path in runs]
     say("3/4 probing the frozen features, beside controls")

@@ -1,8 +1,7 @@
-"""Doing the runs of a comparison: one after another, several at a time, as a SLURM array, or by the same command on several
-machines; safe to kill at any instant.
+"""Run the jobs of a comparison: one by one, in parallel, as a SLURM array, or on several machines.
 
-A run whose loss stops being a number is done too: it is kept as failed.json. One that fails otherwise is told, and tried
-again by the next call.
+Jobs can be killed at any time and resume. A run whose loss became NaN or infinite counts as done and is kept as
+failed.json. A run that fails otherwise is reported, and the next call tries it again.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from mvitac.training.sampler import training_rows
 
 @dataclass(frozen=True)
 class Job:
-    """One run of one row: where it goes, and how it is scored."""
+    """One run of one row: its settings, its folder, and how it is scored."""
 
     label: str
     run: Run
@@ -51,28 +50,34 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Its row and seed, and its fold where there are several."""
+        """Row, fold (if there are several) and seed."""
         return f"{self.label}, {f'{self.fold}, ' if self.fold else ''}seed {self.run.seed}"
 
     @property
     def asked(self) -> dict[str, Any]:
-        """What its scores are of, as it stands beside them."""
+        """The probes, tasks and modalities to score, as stored with the scores."""
         return to_json(
             ProbeConfig(probes=self.session.probes, tasks=self.session.tasks, modalities=self.session.modalities)
         )
 
     @property
+    def failure(self) -> str:
+        """Why the run diverged; "" if it did not."""
+        path = self.out / "failed.json"
+        return read_json(path, "a failure")["error"] if path.exists() else ""
+
+    @property
     def done(self) -> bool:
         kept = ["scores.json", *(["stress.json"] if self.stress else [])]
-        return (self.out / "failed.json").exists() or all(_scored(self.out / name) == self.asked for name in kept)
+        return bool(self.failure) or all(_scored(self.out / name) == self.asked for name in kept)
 
     def drop_checkpoint(self) -> None:
-        """Once scored, a run needs none; they are four times its weights, and hundreds of runs would fill a disk."""
+        """Delete the checkpoint. A scored run needs none, and it is four times as large as the weights."""
         (self.out / "checkpoint.pt").unlink(missing_ok=True)
 
 
 def _scored(path: Path) -> dict[str, Any] | None:
-    """What the scores in ``path`` are of; None if there are none."""
+    """``Job.asked`` of the scores in ``path``; None if there are none."""
     try:
         return _asked(path, path.stat().st_mtime_ns)
     except FileNotFoundError:
@@ -81,12 +86,12 @@ def _scored(path: Path) -> dict[str, Any] | None:
 
 @cache
 def _asked(path: Path, changed: int) -> dict[str, Any]:
-    return read_json(path, "a run's scores").get("asked", to_json(ProbeConfig()))  # older ones do not say
+    return read_json(path, "a run's scores").get("asked", to_json(ProbeConfig()))  # version 0.1.0 did not store it
 
 
 @dataclass(frozen=True)
 class Work:
-    """A plan on one dataset (one fold of it): the jobs to do, and the rows that cannot be part of it, with the reason."""
+    """A plan on one dataset (or fold): the jobs, and the rows left out with the reason."""
 
     plan: Plan
     pack: Pack
@@ -95,11 +100,14 @@ class Work:
 
 
 def do(job: Job, pack: Pack | None = None, *, quiet: bool = True, loggers: tuple[Logger, ...] = ()) -> str:
-    """Train and score one run; returns a line about it. Safe to repeat, also after a kill at any instant, and from several
-    processes at once: what one is at, the others leave to it."""
+    """Train and score one run; returns a line about it.
+
+    Safe to call again after a kill, and from several processes at once: a run that another process works on is skipped.
+    ``loggers`` are called during training, as in ``training.loop.train``.
+    """
     try:
         with hold_lock(
-            job.out, "another process is at it; this command makes the whole table once it is done", wait=False
+            job.out, "another process runs it; this command makes the whole table once it is done", wait=False
         ):
             return "finished before" if job.done else _do(job, pack, quiet, loggers)
     except Busy as busy:
@@ -131,55 +139,72 @@ def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -
     return f"{seconds_of(job.out):.0f} s of training"
 
 
-def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
-    """Do the unfinished jobs, ``num_jobs`` at a time, each on a GPU of its own where there are several.
+class _Reporter:
+    """Prints a line about each finished job, and keeps the errors of failed ones."""
 
-    ``console``, if given, shows how far they are and the time left. A job that fails is told; the first one's error is
-    raised after all others are done. ValueError if a process dies. Interrupted after Ctrl-C, when the runs under way
-    have saved their checkpoints.
-    """
-    todo = [job for job in work.jobs if not job.done]
-    for job in work.jobs:
-        if job.done and not (job.out / "failed.json").exists():
-            job.drop_checkpoint()  # of a run that was killed when it had been scored
-    errors: list[Exception] = []
+    def __init__(self, work: Work, say: Callable[[str], None]) -> None:
+        self.work, self.say = work, say
+        self.errors: list[Exception] = []
 
-    def told(job: Job, result: Callable[[], str]) -> None:
+    def __call__(self, job: Job, result: Callable[[], str]) -> None:
         try:
             line = result()
         except (Interrupted, BrokenProcessPool):
             raise
-        except Exception as error:  # the other runs need not wait for someone to mend it
-            errors.append(error)
+        except Exception as error:  # do not stop the other runs
+            self.errors.append(error)
             line = f"failed: {brief(error)}"
-        say(f"[{sum(j.done for j in work.jobs)}/{len(work.jobs)}] {job.name}: {line}")
+        jobs = self.work.jobs
+        self.say(f"[{sum(j.done for j in jobs)}/{len(jobs)}] {job.name}: {line}")
 
+
+def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
+    """Run the unfinished jobs, ``num_jobs`` at a time, each on its own GPU if there are several.
+
+    Args:
+        work: The jobs.
+        num_jobs: Number of parallel processes.
+        say: Receives a line about each job.
+        console: Shows progress and the time left; None shows nothing.
+
+    Raises:
+        Exception: The first error of a failed job, after all other jobs ran.
+        ValueError: If a process was killed.
+        Interrupted: After Ctrl-C, once the active runs have saved their checkpoints.
+    """
+    todo = [job for job in work.jobs if not job.done]
+    for job in work.jobs:
+        if job.done and not job.failure:
+            job.drop_checkpoint()  # a killed process may have left it
+    report = _Reporter(work, say)
     try:
         with shown(console, quiet=console is None) as bars:
-            pace = _Pace(work, todo, bars, num_jobs)
+            progress = _Progress(work, todo, bars, num_jobs)
             if num_jobs == 1 or len(todo) < 2:
-                for job in todo:
-                    say(f"{job.name} ...")
-                    pack = work.pack if job.run.data == work.plan.data else None
-                    look = (lambda *_, job=job: pace.look([job]),)
-                    told(job, lambda job=job, pack=pack, look=look: do(job, pack, quiet=console is None, loggers=look))
-                    pace.look([])
+                _one_by_one(work, todo, report, progress, quiet=console is None)
             else:
-                _side_by_side(work, todo, num_jobs, told, pace)
+                _side_by_side(todo, num_jobs, report, progress)
     except (KeyboardInterrupt, Interrupted):
-        raise Interrupted("stopped; the same command goes on from here") from None
+        raise Interrupted("stopped; the same command continues from here") from None
     except BrokenProcessPool:
         raise ValueError(
             f"one of {num_jobs} processes was killed, most likely for lack of memory: give fewer --jobs; the same command"
-            " goes on from here"
+            " continues from here"
         ) from None
-    if errors:
-        raise errors[0]
+    if report.errors:
+        raise report.errors[0]
 
 
-def _side_by_side(
-    work: Work, todo: Sequence[Job], num_jobs: int, told: Callable[[Job, Callable[[], str]], None], pace: _Pace
-) -> None:
+def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: _Progress, *, quiet: bool) -> None:
+    for job in todo:
+        report.say(f"{job.name} ...")
+        pack = work.pack if job.run.data == work.plan.data else None
+        loggers = (lambda *_, job=job: progress.update([job]),)
+        report(job, lambda job=job, pack=pack, loggers=loggers: do(job, pack, quiet=quiet, loggers=loggers))
+        progress.update([])
+
+
+def _side_by_side(todo: Sequence[Job], num_jobs: int, report: _Reporter, progress: _Progress) -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
     with side_by_side(num_jobs, devices) as pool:
@@ -188,53 +213,60 @@ def _side_by_side(
         while waiting:
             done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
             for future in done:
-                told(jobs[future], future.result)
-            pace.look([jobs[future] for future in waiting if future.running()])
+                report(jobs[future], future.result)
+            progress.update([jobs[future] for future in waiting if future.running()])
 
 
-class _Pace:
-    """How far the jobs of a comparison are, and when they will be done, by the speeds that their rows' logs tell."""
+class _Progress:
+    """Progress of a comparison's jobs, and the time left by the speeds in the runs' logs."""
 
     def __init__(self, work: Work, todo: Sequence[Job], bars: Bars | None, num_jobs: int) -> None:
         self.todo, self.bars, self.num_jobs = todo, bars, num_jobs
-        self.speeds: dict[str, float] = {}  # pairs per second of each row, as last seen
-        self.tasks: dict[Path, TaskID] = {}  # bars of the runs under way
+        self.speeds: dict[str, float] = {}  # label of a row -> its last speed in pairs per second
+        self.tasks: dict[Path, TaskID] = {}  # bars of the active runs
         if bars:
-            # A fold's own steps may be a few more or less.
+            # A fold may take a few steps more or less than counted here.
             self.steps = {job.out: job.run.num_steps(len(training_rows(job.run, work.pack))) for job in work.jobs}
             for job in work.jobs:
-                self._see(job)
+                self._read(job)
             self.overall = bars.add_task("all runs", total=len(todo), unit="runs", rate="")
 
-    def _see(self, job: Job) -> dict[str, Any]:
-        """What a bar shows of ``job``; its speed is kept for its row."""
-        seen = in_a_bar(last_line(job.out), self.steps[job.out], job.run.batch_size)
-        if seen["speed"]:
-            self.speeds[job.label] = seen["speed"]
-        return seen
+    def _read(self, job: Job) -> dict[str, Any]:
+        """Fields for the bar of ``job`` from its log; also keeps the speed of its row."""
+        fields = in_a_bar(last_line(job.out), self.steps[job.out], job.run.batch_size)
+        if fields["speed"]:
+            self.speeds[job.label] = fields["speed"]
+        return fields
 
-    def look(self, running: Sequence[Job]) -> None:
-        """Show where the jobs under way are now, and when all will be done."""
+    def update(self, active: Sequence[Job]) -> None:
+        """Show how far the active jobs are, and the time left for all."""
         if not self.bars:
             return
-        for path in self.tasks.keys() - {job.out for job in running}:
+        for path in self.tasks.keys() - {job.out for job in active}:
             self.bars.remove_task(self.tasks.pop(path))
         steps_done = {}
-        for job in running:
-            seen = self._see(job)
-            steps_done[job.out] = seen["completed"]
+        for job in active:
+            fields = self._read(job)
+            steps_done[job.out] = fields["completed"]
             if len(self.todo) > 1 and self.num_jobs > 1:  # a run in this process has its own bar
-                if job.out not in self.tasks:
-                    many = {"total": self.steps[job.out], "unit": "steps", "rate": "pairs", "silent": True}
-                    self.tasks[job.out] = self.bars.add_task(job.name, **many)
-                self.bars.update(self.tasks[job.out], **seen)
+                self._show(job, fields)
         todo = [job for job in self.todo if not job.done]
         part = sum(min(1, steps_done.get(job.out, 0) / self.steps[job.out]) for job in todo)
         left = self.seconds_left(todo, steps_done)
         self.bars.update(self.overall, completed=len(self.todo) - len(todo) + part, left=left)
 
+    def _show(self, job: Job, fields: dict[str, Any]) -> None:
+        assert self.bars
+        if job.out not in self.tasks:
+            options = {"total": self.steps[job.out], "unit": "steps", "rate": "pairs", "silent": True}
+            self.tasks[job.out] = self.bars.add_task(job.name, **options)
+        self.bars.update(self.tasks[job.out], **fields)
+
     def seconds_left(self, todo: Sequence[Job], steps_done: dict[Path, int]) -> float | None:
-        """Seconds of training for ``todo``, ``num_jobs`` at a time; a row without a speed gets the mean of the others'."""
+        """Seconds of training for ``todo``, ``num_jobs`` at a time; None if no speed is known.
+
+        A row without a speed gets the mean of the others.
+        """
         if not self.speeds:
             return None
         usual = fmean(1 / max(speed, 1e-9) for speed in self.speeds.values())
@@ -251,7 +283,7 @@ def _do_here(job: Job) -> str:
 
 
 def submit(work: Work, options: str) -> str:
-    """Hand the unfinished jobs to SLURM as one array by submitit and return its id; nothing waits for them here.
+    """Submit the unfinished jobs to SLURM as one array with submitit; returns at once with a line that has its id.
 
     ``options``: comma-separated name=value of submitit's ``update_parameters``, e.g. "slurm_partition=gpu,timeout_min=600".
     """
@@ -277,7 +309,7 @@ def submit(work: Work, options: str) -> str:
 
 
 def seconds_of(path: Path) -> float:
-    """Seconds of training that a run's log tells, over all its resumptions; steps lost to a kill are not in it."""
+    """Seconds of training by a run's log, over all resumptions. Steps lost to a kill are not counted."""
     total, before = 0.0, 0
     batch_size = read_json(path / "run.json", "a run's record")["run"]["batch_size"]
     for line in (path / "log.jsonl").read_text().splitlines():

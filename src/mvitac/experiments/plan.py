@@ -1,4 +1,4 @@
-"""What a comparison is, as data: rows, tasks, probes, seeds."""
+"""The description of a comparison: rows, tasks, probes, seeds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mvitac.registry import to_json, unknown
 from mvitac.run import Run
 
 Printed = dict[str, dict[str, float]]
-"""modality -> task -> top-1 % as printed in the paper."""
+"""modality -> task -> top-1 accuracy in percent as printed in the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class Row:
     method: str = "mvitac"
     """A registered method."""
     recipe: str | None = None
-    """If given, another recipe than the plan's."""
+    """A recipe other than the plan's."""
     set: dict[str, Any] = field(default_factory=dict)
     """Fields of the run to change, by dotted name, e.g. {"method.temperature": 0.2, "optim.lr": 0.03}."""
     printed: Printed = field(default_factory=dict)
@@ -39,36 +39,36 @@ class Plan:
     """What is compared with what."""
 
     name: str
-    """Names the folder of its runs."""
+    """Name of the plan."""
     rows: tuple[Row, ...]
     """The lines of the table, in order."""
     title: str = ""
     """Heading of the table."""
     reference: str = "MViTac"
-    """Label of the row that every other one is tested against."""
+    """Label of the row that all others are compared with."""
     recipe: str = "demo"
-    """The recipe of every row that names none; the same budget for all."""
+    """The recipe of all rows that name none."""
     seeds: int = 3
     """Seeds 0 .. seeds - 1."""
     set: dict[str, Any] = field(default_factory=dict)
-    """Fields to change in every row; a row's own come after them."""
+    """Fields to change in every row; a row's own changes come after."""
     data: DatasetConfig | None = None
-    """The dataset, with its name; --data overrules it."""
+    """The dataset, with its name; --data overrides it."""
     folds: tuple[str, ...] = ()
-    """Cross-validation: fields of the data that make each fold, e.g. ("split=fold1", "split=fold2"); every row runs on all
-    folds, and their test groups, which must differ, are pooled."""
+    """Cross-validation: the data fields of each fold, e.g. ("split=fold1", "split=fold2"). Every row runs on all folds.
+    The folds' test groups must differ and are pooled."""
     probes: tuple[Probe, ...] = ("linear",)
-    """How features are scored; the table shows the first."""
+    """Probes that score the features; the table shows the first."""
     tasks: tuple[str, ...] = ()
-    """Tasks to score; none given = all of the data's."""
+    """Tasks to score. Default: all of the data."""
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
-    """Modalities to score; none given = all."""
+    """Modalities to score. Default: all."""
     stress: bool = False
-    """Also score few labels, noisy test images, a modality missing at test time, a leaking split (``mvitac.evaluation.robustness``)."""
+    """Also run stress tests: few labels, noisy images, a missing modality, a leaking split (``evaluation.robustness``)."""
     printed_on: str = ""
-    """Name of the dataset that the paper's numbers are about."""
+    """Name of the dataset of the paper's numbers."""
     printed_majority: dict[str, float] = field(default_factory=dict)
-    """task -> majority rate as printed."""
+    """task -> majority rate as printed in the paper."""
 
     def __post_init__(self) -> None:
         if not self.rows:
@@ -80,19 +80,21 @@ class Plan:
             if label in CONTROLS:
                 raise ValueError(f"row {label!r} has the name of a control: give it another label")
             if labels.count(label) > 1:
-                raise ValueError(f"row {label!r} is there twice: give each row its own label")
+                raise ValueError(f"row {label!r} is given twice: give each row its own label")
         if len({slug(label) for label in labels}) < len(labels):
-            raise ValueError(f"plan {self.name!r}: labels differ only in signs that a folder's name cannot hold")
+            raise ValueError(
+                f"plan {self.name!r}: some labels differ only in punctuation, which folder names drop: rename one"
+            )
         for fold in self.folds:
             if self.folds.count(fold) > 1:
-                raise ValueError(f"fold {fold!r} is there twice: its test groups would count twice")
+                raise ValueError(f"fold {fold!r} is given twice: give it once")
             for pair in fold.split(","):
                 setting(pair, "fold")
         if self.reference not in labels:
             raise unknown("reference row", self.reference, labels)
 
     def only(self, labels: Sequence[str]) -> Plan:
-        """The plan with the rows of these labels and the reference; all rows if none is given."""
+        """The plan with only these rows and the reference; all rows if none is given."""
         known = [row.label for row in self.rows]
         for label in labels:
             if label not in known:
@@ -101,11 +103,11 @@ class Plan:
         return replace(self, rows=tuple(row for row in self.rows if row.label in wanted))
 
     def in_folds(self) -> list[tuple[str, Plan]]:
-        """A plan for each fold, with its name; the plan itself, without a name, where there are none."""
+        """(name, plan) of each fold; the plan itself with an empty name if it has no folds."""
         if not self.folds:
             return [("", self)]
         assert self.data is not None
-        whole = recipe(self.recipe, self.data)  # not a row's run: what a row alone changes in its data stays its own
+        whole = recipe(self.recipe, self.data)  # the data of the plan, without changes of single rows
         parts = [
             {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
         ]
@@ -121,7 +123,7 @@ class Plan:
         return [(name, replace(self, data=data, folds=())) for name, data in zip(names, datas, strict=True)]
 
     def run(self, row: Row, data: DatasetConfig, seed: int) -> Run:
-        """The whole run of one row and seed; ValueError names a field that does not exist or fit."""
+        """The run of one row and seed; ValueError if a field does not exist or its value does not fit."""
         try:
             base = with_method(recipe(row.recipe or self.recipe, data), row.method)
             return replace(changed(base, {**self.set, **row.set}), seed=seed)
@@ -130,12 +132,12 @@ class Plan:
 
 
 def slug(label: str) -> str:
-    """A label as the name of a folder."""
+    """A label as a folder name."""
     return "-".join("".join(c if c.isalnum() or c in ".=" else " " for c in label.lower()).split())
 
 
 def changed(run: Run, changes: Mapping[str, Any]) -> Run:
-    """``run`` with fields changed by dotted name, values as in JSON."""
+    """``run`` with fields changed by dotted name; values as in JSON."""
     value = to_json(run)
     for name, new in changes.items():
         *path, last = name.split(".")
@@ -154,7 +156,7 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
 
 
 def setting(text: str, what: str = "--set") -> tuple[str, Any]:
-    """``field=value`` as a pair; the value is JSON where it can be, else text."""
+    """Parse ``field=value``. The value is JSON if it parses as such, else text."""
     name, equals, value = text.partition("=")
     if not equals or not name:
         example = "split=fold1" if what == "fold" else "steps=100 or method.temperature=0.2"

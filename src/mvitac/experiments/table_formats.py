@@ -5,15 +5,16 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mvitac.evaluation.scores import least_p
+from mvitac.evaluation.scores import by_cell, least_p
 from mvitac.experiments.plan import Plan
-from mvitac.experiments.table import Cell, Line, _by_cell, lines_of, stresses_of
+from mvitac.experiments.table import Cell, Line, lines_of, stresses_of
 from mvitac.registry import from_json
-from mvitac.report.tables import MODALITY_ORDER, PROBE_NAMES, retrieval_means
+from mvitac.report.figures import Dot, comparison, to_png
+from mvitac.report.tables import PROBE_NAMES, RETRIEVAL, percent, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
 
@@ -28,12 +29,20 @@ def write_tables(result: dict[str, Any], out: Path) -> list[Path]:
     return [out / name for name in ("table.md", "table.tex", "table.csv", "table.png", "result.json")]
 
 
+def _plan(result: dict[str, Any]) -> Plan:
+    return from_json(Plan, result["plan"], "plan")
+
+
+def _tasks(lines: Sequence[Line]) -> list[str]:
+    return list(dict.fromkeys(task for line in lines for task in line.cells))
+
+
 # -- Markdown ---------------------------------------------------------------------------------------------------------
 
 
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """The whole comparison as Markdown: what it is, the table, retrieval, cost."""
-    plan: Plan = from_json(Plan, result["plan"], "plan")
+    """The whole comparison as Markdown: what was compared, the table, stress tests, AUROC, retrieval and cost."""
+    plan = _plan(result)
     shown = any(cell.printed is not None for line in lines for cell in line.cells.values())
     text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, shown), ""]
     text += _table(lines, plan.reference, shown)
@@ -43,95 +52,32 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     return "\n".join(text).rstrip() + "\n"
 
 
+def _pipes(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -> list[str]:
+    """A Markdown table. The first ``words`` columns are left-aligned, the others right-aligned."""
+    rule = "|---" * words + "|---:" * (len(heads) - words) + "|"
+    return [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(row)} |" for row in rows), ""]
+
+
+def _first_cells(line: Line) -> list[str]:
+    """The row's name and modality; controls are in italics."""
+    return [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
+
+
 def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
-    """Lines as a Markdown table, with the printed numbers if ``shown``."""
+    """Lines as a Markdown table, with the paper's numbers if ``shown``."""
     tasks = _tasks(lines)
     heads = ["", "modality"]
     for task in tasks:
         heads += [f"{task} %", *(["printed"] if shown else []), f"to {reference}"]
-    text = [f"| {' | '.join(heads)} |", f"|---|---{'|---:' * (len(heads) - 2)}|"]
+    rows = []
     for line in lines:
-        row = [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
+        row = _first_cells(line)
         for task in tasks:
             cell = line.cells.get(task)
-            row += [_score(cell), *([_printed(cell)] if shown else []), _gap(cell)]
-        text.append(f"| {' | '.join(row)} |")
-    return [*text, ""]
-
-
-def _tasks(lines: Sequence[Line]) -> list[str]:
-    return list(dict.fromkeys(task for line in lines for task in line.cells))
-
-
-def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
-    steps = {(c["steps"], c["pairs"]) for c in result["cost"]}
-    if len(steps) == 1:
-        num, pairs = next(iter(steps))
-        budget = f"equal budget: every run saw {pairs} pairs in {num} steps"
-    else:
-        budget = "budgets differ (see cost)"
-    if len({c["pairs_of"] for c in result["cost"]}) > 1:
-        budget += ", **pairs are not from the same rows (see cost)**"
-    seeds = max((c["seeds"] for c in result["cost"]), default=0)
-    least = least_p(max((len(record["group_sizes"]) for record in result["records"]), default=1))
-    text = [
-        f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
-        f" {budget}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
-        f" {_made(result)}.",
-        f"95 % intervals and p: bootstrap over test {result['group_by']}s and seeds; p of the difference to {plan.reference}"
-        f" on the same test rows, {least:.3f} the least it can say, not corrected for the number of rows. Controls are"
-        " in italics.",
-    ]
-    if plan.folds:
-        unseen = "" if result["leaks"] else ", by encoders and probes that never saw it"
-        text.append(
-            f"{len(plan.folds)} fold{'s' * (len(plan.folds) > 1)}: every test {result['group_by']} is scored once{unseen}."
-        )
-    if shown:
-        text.append(
-            f'"printed" is the paper\'s number on {plan.printed_on}'
-            + ("." if _papers(result, plan) else ", which is other data: compare orders, never values.")
-        )
-    text += [f"Note: {note}." for note in _notes(result)]
-    if result["leaks"]:
-        text.append(f"**LEAK: {result['leaks']}.**")
-    text += [f"Diverged: {name} ({error})." for name, error in result["failed"].items()]
-    text += [f"Left out: {label} ({reason})." for label, reason in result["left_out"].items()]
-    if result["unfinished"]:
-        text.append(f"**Not finished: {', '.join(result['unfinished'])}.**")
-    return [line for part in text for line in (part, "")][:-1]
-
-
-def _notes(result: dict[str, Any]) -> list[str]:
-    """What must be said beside the table: the data's own notes, and which runs computed in another precision than most."""
-    runs: dict[str, str] = result.get("run_precisions", {})  # by name; older results do not say
-    most, *others = [precision for precision, _ in Counter(runs.values()).most_common()] or [""]
-    told = [f"{', '.join(f'{name!r}' for name in runs if runs[name] == other)} in {other}" for other in others]
-    return [
-        *result.get("notes", ()),
-        *([f"the networks of {' and of '.join(told)}, those of all other runs in {most}"] if told else []),
-    ]
-
-
-def _made(result: dict[str, Any]) -> str:
-    """By which code, on what: the runs', and the tables' where that is another; older results know the tables' alone."""
-
-    def short(commit: str | None) -> str:
-        return f"{commit[:12]}{'+' * commit.endswith('+')}" if commit else "unknown"  # +: with changes
-
-    tables = short(result["commit"])
-    runs = list(dict.fromkeys(short(commit) for commit in result.get("run_commits", ()))) or [tables]
-    code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
-    return ", ".join([code, *(result.get("run_devices") or [result["device"]])])
-
-
-def _papers(result: dict[str, Any], plan: Plan) -> bool:
-    """Whether the paper's numbers are about this data, whose name may go on with its split: touch-and-go (official)."""
-    return result["data"].split(" ")[0] == plan.printed_on
-
-
-def _score(cell: Cell | None) -> str:
-    return "" if cell is None else f"{100 * cell.mean:.1f} [{100 * cell.low:.1f}, {100 * cell.high:.1f}]"
+            score = percent(cell.mean, cell.low, cell.high) if cell else ""
+            row += [score, *([_printed(cell)] if shown else []), _gap(cell)]
+        rows.append(row)
+    return _pipes(heads, rows)
 
 
 def _printed(cell: Cell | None) -> str:
@@ -145,34 +91,96 @@ def _gap(cell: Cell | None) -> str:
     return f"{100 * mean:+.1f} (p {p:.3f})" if p >= 0.0015 else f"{100 * mean:+.1f} (p .001)"
 
 
+def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
+    """Paragraphs about data, budget, statistics, and everything that limits the comparison."""
+    least = least_p(max((len(record["group_sizes"]) for record in result["records"]), default=1))
+    seeds = max((c["seeds"] for c in result["cost"]), default=0)
+    text = [
+        f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
+        f" {_budget(result)}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
+        f" {_made(result)}.",
+        f"95 % intervals and p: bootstrap over test {result['group_by']}s and seeds. p is of the difference to"
+        f" {plan.reference} on the same test rows, {least:.3f} at the least, not corrected for the number of rows."
+        " Controls are in italics.",
+    ]
+    if plan.folds:
+        unseen = "" if result["leaks"] else ", by encoders and probes that never saw it"
+        folds = f"{len(plan.folds)} fold{'s' * (len(plan.folds) > 1)}"
+        text.append(f"{folds}: every test {result['group_by']} is scored once{unseen}.")
+    if shown:
+        other = "." if _papers(result, plan) else ", which is other data: compare the order of rows, not values."
+        text.append(f'"printed" is the paper\'s number on {plan.printed_on}{other}')
+    text += [f"Note: {note}." for note in _notes(result)]
+    if result["leaks"]:
+        text.append(f"**LEAK: {result['leaks']}.**")
+    text += [f"Diverged: {name} ({error})." for name, error in result["failed"].items()]
+    text += [f"Left out: {label} ({reason})." for label, reason in result["left_out"].items()]
+    if result["unfinished"]:
+        text.append(f"**Not finished: {', '.join(result['unfinished'])}.**")
+    return [line for part in text for line in (part, "")][:-1]
+
+
+def _notes(result: dict[str, Any]) -> list[str]:
+    """Notes of the data, and the runs whose precision differs from that of most runs."""
+    precisions: dict[str, str] = result.get("run_precisions", {})  # by name of the run; not in older results
+    notes = list(result.get("notes", ()))
+    if len(set(precisions.values())) > 1:
+        most, *others = [precision for precision, _ in Counter(precisions.values()).most_common()]
+        runs = {other: ", ".join(repr(name) for name in precisions if precisions[name] == other) for other in others}
+        different = " and of ".join(f"{names} in {other}" for other, names in runs.items())
+        notes.append(f"the networks of {different}, those of all other runs in {most}")
+    return notes
+
+
+def _budget(result: dict[str, Any]) -> str:
+    steps = {(c["steps"], c["pairs"]) for c in result["cost"]}
+    budget = "budgets differ (see cost)"
+    if len(steps) == 1:
+        num, pairs = next(iter(steps))
+        budget = f"equal budget: every run saw {pairs} pairs in {num} steps"
+    if len({c["pairs_of"] for c in result["cost"]}) > 1:
+        budget += ", **pairs are not from the same rows (see cost)**"
+    return budget
+
+
+def _made(result: dict[str, Any]) -> str:
+    """Commits and devices of the runs, and the commit of the tables if it differs. Results of 0.1.0 have only that one."""
+
+    def short(commit: str | None) -> str:
+        return f"{commit[:12]}{'+' * commit.endswith('+')}" if commit else "unknown"  # +: with local changes
+
+    tables = short(result["commit"])
+    runs = list(dict.fromkeys(short(commit) for commit in result.get("run_commits", ()))) or [tables]
+    code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
+    return ", ".join([code, *(result.get("run_devices") or [result["device"]])])
+
+
+def _papers(result: dict[str, Any], plan: Plan) -> bool:
+    """Whether this is the paper's data. Its name may end with a split: touch-and-go (official)."""
+    return result["data"].split(" ")[0] == plan.printed_on
+
+
 def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
-    """Area under the ROC curve of tasks with two classes, mean over seeds (and folds), with the least and the most."""
-    records = _by_cell(result["records"], plan.probes[0])
-    found: dict[tuple[str, str], dict[str, str]] = {}
+    """AUROC of tasks with two classes: mean over seeds (and folds), lowest and highest."""
+    records = by_cell(result["records"], plan.probes[0])
+    found: dict[tuple[str, ...], dict[str, str]] = {}
     for line in lines:
         for task in line.cells:
             values = [r["auroc"] for r in records[task, line.modality, line.source] if r["auroc"] is not None]
             if values and line.source != "majority":
                 spread = f" ({min(values):.2f}-{max(values):.2f})" if len(values) > 1 else ""
-                name = f"*{line.source}*" if line.control else line.source
-                row = found.setdefault((name, "" if line.modality == "none" else line.modality), {})
+                row = found.setdefault(tuple(_first_cells(line)), {})
                 row[task] = f"{sum(values) / len(values):.2f}{spread}"
     if not found:
         return []
     tasks = list(dict.fromkeys(task for row in found.values() for task in row))
-    text = [f"| AUROC | modality | {' | '.join(tasks)} |", f"|---|---{'|---:' * len(tasks)}|"]
-    text += [f"| {' | '.join([*which, *(row.get(task, '') for task in tasks)])} |" for which, row in found.items()]
-    return [*text, ""]
+    rows = [[*first, *(row.get(task, "") for task in tasks)] for first, row in found.items()]
+    return _pipes(["AUROC", "modality", *tasks], rows)
 
 
 def _retrieval(result: dict[str, Any]) -> list[str]:
-    if not result["retrieval"]:
-        return []
-    text = ["| retrieval | | R@1 % | R@5 % | R@10 % | chance R@5 % |", "|---|---|---:|---:|---:|---:|"]
-    for (source, direction), values in retrieval_means(result["retrieval"]).items():
-        numbers = " | ".join(f"{100 * values[k]:.1f}" for k in ("R@1", "R@5", "R@10", "chance R@5"))
-        text.append(f"| {source} | {direction} | {numbers} |")
-    return [*text, ""]
+    rows = retrieval_rows(result["retrieval"])
+    return _pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows) if rows else []
 
 
 def _cost(result: dict[str, Any]) -> list[str]:
@@ -195,45 +203,39 @@ NAMES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "no
 
 
 def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """A booktabs table in the paper's layout: method, modality, accuracy per task, the printed value in brackets."""
-    plan: Plan = from_json(Plan, result["plan"], "plan")
+    """A booktabs table in the paper's layout: method, modality, accuracy per task, the paper's number in brackets."""
+    plan = _plan(result)
     tasks = _tasks(lines)
-    best = {
-        (task, m): max((x.cells[task].mean for x in lines if x.modality == m and task in x.cells), default=0)
-        for task in tasks
-        for m in MODALITY_ORDER
-    }
     text = [
         r"\begin{tabular}{ll" + "r" * len(tasks) + "}",
         r"\toprule",
         " & ".join(["Method", "Modality", *(f"{_tex(t)} (\\%)" for t in tasks)]) + r" \\",
         r"\midrule",
     ]
-    controls = False
-    for line in lines:
-        if line.control and not controls:
+    for number, line in enumerate(lines):
+        if line.control and not any(earlier.control for earlier in lines[:number]):
             text.append(r"\midrule")
-            controls = True
-        row = [_tex(line.source), NAMES[line.modality]]
-        for task in tasks:
-            cell = line.cells.get(task)
-            if cell is None:
-                row.append("")
-                continue
-            half = 50 * (cell.high - cell.low)
-            number = f"{100 * cell.mean:.1f}"
-            bold = not line.control and cell.mean == best[task, line.modality]
-            number = rf"\textbf{{{number}}}" if bold else number
-            paper = f" [{100 * cell.printed:.1f}]" if cell.printed is not None else ""
-            row.append(f"{number} $\\pm$ {half:.1f}{paper}")
-        text.append(" & ".join(row) + r" \\")
+        cells = (_tex_cell(line, task, lines) for task in tasks)
+        text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if plan.printed_on:
         note += f"; in brackets: printed in the paper on {plan.printed_on}"
-    notes = [note, *(f"% Note: {said}." for said in _notes(result))]
+    notes = [note, *(f"% Note: {note}." for note in _notes(result))]
     if result["leaks"]:
         notes.append(f"% LEAK: {result['leaks']}.")
     return "\n".join([*notes, *text, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
+    """Accuracy and half of its interval; the best method of a modality is bold."""
+    cell = line.cells.get(task)
+    if cell is None:
+        return ""
+    best = max(x.cells[task].mean for x in lines if x.modality == line.modality and task in x.cells)
+    number = f"{100 * cell.mean:.1f}"
+    number = rf"\textbf{{{number}}}" if not line.control and cell.mean == best else number
+    paper = f" [{100 * cell.printed:.1f}]" if cell.printed is not None else ""
+    return f"{number} $\\pm$ {50 * (cell.high - cell.low):.1f}{paper}"
 
 
 def _tex(text: str) -> str:
@@ -243,14 +245,13 @@ def _tex(text: str) -> str:
 
 
 def comma(result: dict[str, Any]) -> str:
-    """Every cell of every probe as one CSV line, in shares; what has one probe only, as majority has, once by that."""
-    plan: Plan = from_json(Plan, result["plan"], "plan")
+    """Every cell of every probe as one CSV line, in 0 .. 1. A source with one probe (majority) appears once."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     heads = ("row", "control", "probe", "modality", "task", "accuracy", "low", "high", "seeds", "printed")
     writer.writerow((*heads, "difference", "difference_low", "difference_high", "p"))
-    tables = {**{probe: lines_of(result, probe) for probe in plan.probes}, **stresses_of(result)}
-    scored: dict[str, dict[str, None]] = {}  # source -> the probes it was scored by
+    tables = {**{probe: lines_of(result, probe) for probe in _plan(result).probes}, **stresses_of(result)}
+    scored: dict[str, dict[str, None]] = {}  # source -> its probes
     for record in result["records"]:
         scored.setdefault(record["source"], {})[record["probe"]] = None
     written: set[tuple[str, ...]] = set()
@@ -266,46 +267,13 @@ def comma(result: dict[str, Any]) -> str:
     return buffer.getvalue()
 
 
-COLOURS = {"touch": "#c1440e", "vision": "#2f6690", "both": "#3a3a3a"}
-
-
 def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
-    """A PNG: a panel per task, a line per row, a dot with its interval per modality.
-
-    Crosses are the paper's numbers, where the data is the paper's: elsewhere they would be on another scale.
-    """
-    from matplotlib.figure import Figure
-
-    plan: Plan = from_json(Plan, result["plan"], "plan")
-    tasks = _tasks(lines)
-    sources = list(dict.fromkeys(line.source for line in lines if line.modality != "none"))[::-1]
-    figure = Figure(figsize=(3.2 + 3.6 * len(tasks), 1.6 + 0.36 * len(sources)), dpi=110, layout="constrained")
-    axes = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
-    for axis, task in zip(axes, tasks, strict=True):
-        for line in lines:
-            cell = line.cells.get(task)
-            if cell is None:
-                continue
-            if line.modality == "none":
-                if line.source == "majority":
-                    axis.axvline(100 * cell.mean, color="#999999", lw=1, ls=":", label="majority")
-                continue
-            y = sources.index(line.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[line.modality]
-            axis.plot([100 * cell.low, 100 * cell.high], [y, y], color=COLOURS[line.modality], lw=1.6)
-            axis.plot(100 * cell.mean, y, "o", ms=4.5, color=COLOURS[line.modality], label=line.modality)
-            if cell.printed is not None and _papers(result, plan):
-                axis.plot(100 * cell.printed, y, "x", ms=6, color=COLOURS[line.modality], alpha=0.6, label="printed")
-        axis.set_title(task, fontsize=10, loc="left")
-        axis.set_xlabel("accuracy %", fontsize=9)
-        axis.set_yticks(range(len(sources)), sources, fontsize=9)
-        axis.set_ylim(-0.7, len(sources) - 0.3)
-        axis.grid(axis="x", color="#e5e5e5", lw=0.6)
-        axis.tick_params(length=0, labelsize=8)
-        for side in ("top", "right", "left"):
-            axis.spines[side].set_visible(False)
-    entries = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    order = [name for name in ("touch", "vision", "both", "printed", "majority") if name in entries]
-    figure.legend([entries[n] for n in order], order, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    """The table as a PNG (``figures.comparison``), with the paper's numbers if this is the paper's data."""
+    printed = _papers(result, _plan(result))
+    panels: dict[str, list[Dot]] = {}
+    for line in lines:
+        for task, cell in line.cells.items():
+            paper = cell.printed if printed else None
+            dot = Dot(line.source, line.modality, cell.mean, cell.low, cell.high, paper, line.control)
+            panels.setdefault(task, []).append(dot)
+    return to_png(comparison(panels), dpi=110)

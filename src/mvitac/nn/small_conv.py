@@ -1,8 +1,10 @@
-"""3x3 convolutions over maps of a few pixels as one matrix product: for training at small images on a CPU.
+"""3x3 convolutions over maps of a few pixels as matrix products: for training at small images on a CPU.
 
-The last stages of a ResNet at 48 px have maps of 3x3 and 2x2 pixels. oneDNN spends ten times as long on them as their
-arithmetic takes, most of it on the weights' gradient (docs/speed.md); as a product over the unrolled neighbourhoods
-(im2col) they are plain matrix products. The same sums in another order, so equal to rounding (tests/nn/test_small_conv.py).
+The last stages of a ResNet at 48 px have maps of 3x3 and 2x2 pixels. oneDNN takes up to six times as long for them as
+the arithmetic needs, and up to 56 % of that is with the zeros of the padding (docs/speed.md). Here each output pixel is a
+sum of matrix products, one for each row of the kernel, over those places of the kernel that lie on the map. Operands are
+slices of the tensors as they lie in memory; nothing is copied. The same sums in another order, so equal to the
+convolution to rounding (tests/nn/test_small_conv.py).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 MAX_PIXELS = 9
-"""Of the output map, up to which the product is the faster one."""
+"""Of the output map, up to which products are faster than the convolution."""
 
 
 class SmallMapConv2d(nn.Conv2d):
@@ -46,17 +48,17 @@ def use_products(trunk: nn.Module) -> nn.Module:
 
 
 @lru_cache
-def _neighbours(height: int, width: int, stride: int) -> tuple[int, list[tuple[int, int, int]]]:
-    """How many pixels there are out, and all (pixel out, place 0-8 in the kernel, pixel in) but those in the padding."""
+def _rows(height: int, width: int, stride: int) -> list[tuple[int, int, slice, slice]]:
+    """Every (pixel out, row of the kernel, its columns over the map, the pixels in under them)."""
     down, across = (height - 1) // stride + 1, (width - 1) // stride + 1
-    places = []
+    rows = []
     for out in range(down * across):
-        for place in range(9):
-            row = out // across * stride + place // 3 - 1
-            column = out % across * stride + place % 3 - 1
-            if 0 <= row < height and 0 <= column < width:
-                places.append((out, place, row * width + column))
-    return down * across, places
+        top, left = out // across * stride - 1, out % across * stride - 1
+        columns = slice(max(0, -left), min(3, width - left))
+        for row in range(max(0, -top), min(3, height - top)):
+            start = (top + row) * width + left
+            rows.append((out, row, columns, slice(start + columns.start, start + columns.stop)))
+    return rows
 
 
 class _Product(torch.autograd.Function):
@@ -64,32 +66,28 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, input: Tensor, weight: Tensor, stride: int) -> Tensor:
-        num, channels, height, width = input.shape
-        pixels, places = _neighbours(height, width, stride)
-        flat = input.permute(0, 2, 3, 1).reshape(num, height * width, channels)
-        columns = flat.new_zeros(num, pixels, 9, channels)
-        for out, place, pixel in places:
-            columns[:, out, place] = flat[:, pixel]
-        columns = columns.view(num * pixels, 9 * channels)
-        kernel = weight.permute(0, 2, 3, 1).reshape(len(weight), 9 * channels)
-        ctx.save_for_backward(columns, kernel)
-        ctx.shape, ctx.stride = input.shape, stride
-        result = (columns @ kernel.mT).view(num, -1, (width - 1) // stride + 1, len(weight))
-        return result.permute(0, 3, 1, 2)
+        num, _, height, width = input.shape
+        down, across = (height - 1) // stride + 1, (width - 1) // stride + 1
+        pixels = input.permute(0, 2, 3, 1).reshape(num, height * width, -1)
+        kernel = weight.permute(0, 2, 3, 1).contiguous()
+        ctx.save_for_backward(pixels, kernel)
+        ctx.shape = height, width, stride
+        result = pixels.new_zeros(num, down * across, len(kernel))
+        for out, row, columns, under in _rows(height, width, stride):
+            result[:, out].addmm_(pixels[:, under].flatten(1), kernel[:, row, columns].flatten(1).mT)
+        return result.view(num, down, across, -1).permute(0, 3, 1, 2)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        columns, kernel = ctx.saved_tensors
-        num, channels, height, width = ctx.shape
-        pixels, places = _neighbours(height, width, ctx.stride)
-        gradient = gradients[0].permute(0, 2, 3, 1).reshape(num * pixels, len(kernel))
-        of_input = of_weight = None
-        if ctx.needs_input_grad[1]:
-            of_weight = (gradient.mT @ columns).view(len(kernel), 3, 3, channels).permute(0, 3, 1, 2)
-        if ctx.needs_input_grad[0]:
-            spread = (gradient @ kernel).view(num, pixels, 9, channels)
-            flat = spread.new_zeros(num, height * width, channels)
-            for out, place, pixel in places:
-                flat[:, pixel] += spread[:, out, place]
-            of_input = flat.view(num, height, width, channels).permute(0, 3, 1, 2)
-        return of_input, of_weight, None
+        pixels, kernel = ctx.saved_tensors
+        height, width, stride = ctx.shape
+        gradient = gradients[0].permute(0, 2, 3, 1).reshape(len(pixels), -1, len(kernel))
+        of_pixels = torch.zeros_like(pixels) if ctx.needs_input_grad[0] else None
+        of_kernel = torch.zeros_like(kernel) if ctx.needs_input_grad[1] else None
+        for out, row, columns, under in _rows(height, width, stride):
+            if of_kernel is not None:
+                of_kernel[:, row, columns].flatten(1).addmm_(gradient[:, out].mT, pixels[:, under].flatten(1))
+            if of_pixels is not None:
+                of_pixels[:, under].flatten(1).addmm_(gradient[:, out], kernel[:, row, columns].flatten(1))
+        of_input = None if of_pixels is None else of_pixels.unflatten(1, (height, width)).permute(0, 3, 1, 2)
+        return of_input, None if of_kernel is None else of_kernel.permute(0, 3, 1, 2), None

@@ -1,1 +1,1 @@
-"""Reports, pictures and the explorer."""
+"""The report, contact sheets and the explorer."""

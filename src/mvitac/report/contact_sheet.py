@@ -1,7 +1,6 @@
-"""A contact sheet of a pack: a few pairs of every class or object, camera beside touch, for a person to judge.
+"""A contact sheet of a pack: a few pairs of each class or object, to check the data by eye.
 
-What to look for: do camera and touch belong together, are labels right and colours natural, is anything blank or upside
-down.
+Check that camera and touch belong together, labels are right, colours look natural, and nothing is blank or upside down.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ TASK = "label_"
 
 @dataclass(frozen=True)
 class Strip:
-    """One class or object: its name, how many rows it has, and the rows to show."""
+    """One class or object: name, number of rows and groups, and the rows to show."""
 
     name: str
     num_rows: int
@@ -34,10 +33,18 @@ class Strip:
 def strips(
     pack: Pack, by: str = "", *, split: str = "", num: int = 6, limit: int = 40, seed: int = 0
 ) -> tuple[list[Strip], int]:
-    """At most ``limit`` strips of ``num`` random rows, and how many strips there would be in all.
+    """Choose random rows of each class or object.
 
-    ``by`` is a task or a column; default the first task, else the group. Rows of other groups (of one group: of other
-    touches) come first: the others look alike.
+    Args:
+        pack: The data.
+        by: A task or a column. Default: the first task, else the group.
+        split: Only rows of this split.
+        num: Rows per strip. Rows of different groups (within one group: touches) come first.
+        limit: Largest number of strips.
+        seed: Random seed.
+
+    Returns:
+        The strips, and their number without ``limit``.
     """
     if split and split not in SPLITS:
         raise unknown("split", split, SPLITS)
@@ -70,7 +77,7 @@ def strips(
 
 
 def _spread(rows: np.ndarray, groups: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
-    """``num`` of ``rows``, one of every group before a second of any."""
+    """Draw ``num`` of ``rows``, one of every group before a second of any."""
     order = rng.permutation(len(rows))
     turns: dict[int, int] = {}
     keys = []
@@ -81,7 +88,7 @@ def _spread(rows: np.ndarray, groups: np.ndarray, num: int, rng: np.random.Gener
 
 
 def pair(pack: Pack, row: int, side: int) -> Image.Image:
-    """Row ``row`` as one picture ``side`` pixels high: camera, then each tactile sensor; a gap is a crossed-out tile."""
+    """One row as an image: camera, then each tactile sensor. A missing image is a crossed-out tile."""
     tiles = []
     for modality in pack.spec.modalities:
         image, there = pack.images[modality][row], bool(pack.has(modality)[row])
@@ -103,20 +110,20 @@ def _nothing(side: int) -> Image.Image:
 
 
 def heading(strip: Strip, pack: Pack) -> str:
-    """``wood: 48 rows, 12 objects``; an object's own strip need not count itself."""
+    """Heading such as ``wood: 48 rows, 12 objects``."""
     groups = f", {strip.num_groups} {pack.spec.group_by}s" * (strip.num_groups > 1)
     return f"{strip.name}: {strip.num_rows} row{'s' * (strip.num_rows > 1)}{groups}"
 
 
 def contents(pack: Pack) -> str:
-    """What every pair shows, left to right."""
+    """The images of a pair, from left to right."""
     sensors = pack.spec.touch_channels // 3
     touch = {0: [], 1: ["touch"], 2: ["left touch", "right touch"]}.get(sensors, [f"{sensors} touch images"])
     return ", ".join([*(["camera"] if pack.spec.vision_channels else []), *touch])
 
 
 def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96) -> Image.Image:
-    """All strips in one picture."""
+    """All strips in one image."""
     font = ImageFont.load_default(size=14)
     first = pair(pack, int(found[0].rows[0]), side)
     width = max(480, max(len(strip.rows) for strip in found) * (first.width + GAP) + GAP)
@@ -136,7 +143,7 @@ def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96
 
 
 def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128) -> str:
-    """All strips as one self-contained page; every pair with its id, group, split and labels."""
+    """All strips as one HTML page, each pair with its id, group, split and labels."""
     from mvitac.report import html
 
     tasks = {task.name: (task.classes, pack.column(f"{TASK}{task.name}")) for task in pack.spec.tasks}

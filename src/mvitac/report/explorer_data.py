@@ -1,6 +1,6 @@
-"""What the explorer shows, without the page: a run's features laid out in a plane, their neighbours, their mistakes.
+"""The data behind the explorer: a run's features in 2D, their nearest neighbours, and mistakes.
 
-Shapes: N rows of the pack that are shown, D features.
+Shapes: N rows of the pack, D features.
 """
 
 from __future__ import annotations
@@ -24,16 +24,23 @@ COLOURS = (
     *("#2490fc", "#fc783c", "#008400", "#a80048", "#fc54fc", "#604800", "#00f000", "#6c00a8", "#e4cc90", "#0c8490"),
     *("#0000f0", "#fc0c78", "#54c078", "#9c7830", "#6cccfc", "#c000c0", "#004878", "#fcb4fc", "#7848fc", "#b484b4"),
 )
-"""Twenty hues and lightnesses as far apart in OKLab as a search found (least distance .165, and .067 as seen without
-green cones), legible on white and on black; classes beyond the twentieth begin again."""
+"""Twenty colours, legible on white and black. A search kept them far apart in OKLab: distance .165 or more, .067 as
+seen without green cones. Classes beyond the twentieth repeat them."""
 
 
 class ExplorerData:
-    """One run's rows: ``rows`` [N] pack rows, ``x[modality]`` [N, D] unit features, ``guess[task]`` [N]."""
+    """One run: pack rows ``rows`` [N], unit features ``x[modality]`` [N, D], predictions ``guess[task]`` [N]."""
 
     def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
-        """At most ``limit`` rows are shown, a sample of those that lack no image. A model without probes gets them fitted on
-        ``pack``. ValueError if the pack's images do not fit the model.
+        """Compute the features; fit probes on ``pack`` if the model has none.
+
+        Args:
+            model: The model.
+            pack: The data to show.
+            limit: Show a random sample of at most this many rows that have all images.
+
+        Raises:
+            ValueError: If the pack's images do not fit the model.
         """
         names = check_pack(model, pack)
         self.model, self.pack = with_readouts(model, pack), pack
@@ -52,7 +59,7 @@ class ExplorerData:
             readout = self.model.readouts.get(f"{task}.{self.modalities[-1]}")
             if readout:
                 joined = np.concatenate([raw[m] for m in readout.question.modalities], axis=1)
-                # By name: the probe may be of other data, which has the classes in another order, or other classes.
+                # Match classes by name: the probe may be of other data.
                 known = readout.question.classes
                 names = self.classes[task] = tuple(dict.fromkeys((*self.classes[task], *known)))
                 found = readout(torch.from_numpy(joined)).argmax(1).numpy()
@@ -60,7 +67,7 @@ class ExplorerData:
         self._planes: dict[str, np.ndarray] = {}
 
     def plane(self, modality: str) -> np.ndarray:
-        """[N, 2] in [0, 1]: the two directions in which the unit features vary most (principal components)."""
+        """The first two principal components of the unit features, scaled to [0, 1]: [N, 2]."""
         if modality not in self.modalities:
             raise unknown("modality", modality, self.modalities)
         if modality not in self._planes:
@@ -68,12 +75,12 @@ class ExplorerData:
             x = x - x.mean(0)
             _, vectors = np.linalg.eigh(x.T @ x)
             xy = x @ vectors[:, -2:][:, ::-1]
-            low, high = np.percentile(xy, [0.5, 99.5], axis=0)  # a lone outlier must not squeeze the rest
+            low, high = np.percentile(xy, [0.5, 99.5], axis=0)  # ignore outliers
             self._planes[modality] = np.clip((xy - low) / np.maximum(high - low, 1e-9), 0, 1)
         return self._planes[modality]
 
     def shown(self, split: str, task: str | None, *, mistakes: bool = False) -> np.ndarray:
-        """Indices into ``rows`` of one split ("all" = every one), of ``task``'s mistakes only if asked."""
+        """Indices into ``rows`` of one split or "all"; only the mistakes of ``task`` if ``mistakes``."""
         keep = np.ones(len(self.rows), bool) if split == "all" else self.split == split
         if mistakes and task in self.guess:
             keep &= (self.labels[task] >= 0) & (self.guess[task] != self.labels[task])
@@ -106,13 +113,13 @@ class ExplorerData:
         )
 
     def neighbours(self, queries: np.ndarray, modality: str, k: int, without: int = -1) -> list[tuple[int, float]]:
-        """(index, cosine) of the k rows nearest to a unit vector [1, D]; ``without`` is left out."""
+        """(index, cosine) of the k rows nearest to a unit vector [1, D], without row ``without``."""
         index, scores = nearest(self.x[modality], queries, k + 1)
         pairs = zip(index[0].tolist(), scores[0].tolist(), strict=True)
         return [(i, s) for i, s in pairs if i != without][:k]
 
     def describe(self, i: int) -> str:
-        """One line on row ``i``: id, labels, what the probes say where they err."""
+        """One line about row ``i``: id, split, labels, and wrong predictions."""
         row = int(self.rows[i])
         parts = [str(self.pack.table.column("id")[row]), str(self.split[i])]
         for task, labels in self.labels.items():
@@ -134,7 +141,7 @@ class ExplorerData:
         return np.concatenate([image[..., c : c + 3] for c in range(0, image.shape[2], 3)], axis=1)
 
     def query(self, image: np.ndarray, modality: str, k: int) -> tuple[dict[str, Any], list[tuple[int, float]]]:
-        """(probabilities by class name by task, neighbours) of a foreign uint8 picture [H, W, 3]."""
+        """Task -> class -> probability, and the neighbours, of a new uint8 image [H, W, 3]."""
         num = self.pack.spec.channels(modality) // 3
         given = np.concatenate([image] * num, axis=2)
         pictures: dict[str, Any] = {modality: given}

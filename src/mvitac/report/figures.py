@@ -1,13 +1,14 @@
-"""The report's figures: drawn once with matplotlib, kept as PNG files and as SVG that takes its colours from the page.
+"""Figures of the report and of ``mvitac compare``, drawn with matplotlib as PNG, or as SVG with the page's colours.
 
-Every colour drawn here is one of ``COLOURS``; ``to_svg`` turns it into the CSS variable of that name, so one drawing is
-legible on a light page and on a dark one. No pyplot: nothing global, nothing to close.
+Every colour is one of ``COLOURS``. ``to_svg`` replaces it by the CSS variable of that name, so one drawing suits a light
+and a dark page. No pyplot: no global state, nothing to close.
 """
 
 from __future__ import annotations
 
 import io
 import re
+import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,37 +25,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-COLOURS: dict[str, tuple[str, str]] = {
-    "ink": ("#1d232b", "#e7eaee"),
-    "soft": ("#5a6470", "#a0aab6"),
-    "rule": ("#dde2e7", "#2d3540"),
-    "panel": ("#eef1f4", "#20272f"),
-    "blue": ("#0072b2", "#56aee8"),
-    "vermilion": ("#d55e00", "#ff8a4c"),
-    "green": ("#009e73", "#33c99d"),
-    "purple": ("#b5629a", "#e2a0cb"),
-    "amber": ("#d18f00", "#f0b840"),
-    "sky": ("#4fb0e2", "#a5dbf9"),
-    "olive": ("#8d8a1e", "#d9d45a"),
-    "brown": ("#7b5334", "#bd936d"),
-    "grey1": ("#6d7783", "#99a3af"),
-    "grey2": ("#8c95a0", "#7c8692"),
-    "grey3": ("#a8b0b9", "#626c78"),
-    "grey4": ("#c2c8cf", "#4c5661"),
-}
-"""Name -> colour on a light page, on a dark page; hues after Okabe and Ito (told apart with any colour vision)."""
-HUES = ("blue", "vermilion", "green", "amber", "purple", "sky", "olive", "brown")
-MODALITY_HUES = {"touch": "blue", "vision": "vermilion", "both": "green"}
-CONTROL_GREYS = {"imagenet": "grey1", "untrained": "grey2", "pixels": "grey3", "border": "grey4"}
+from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, colour
+
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
 
-WIDTH = 4.4
-"""Inches. At a phone's width (340 px) its 9 pt letters are still 9 px high, hence many small figures and no big one."""
+WIDTH = 3.8
+"""Inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high."""
 _STYLE: dict[Any, Any] = {
-    "text.parse_math": False,  # class names may hold a dollar sign
+    "text.parse_math": False,  # class names may contain a dollar sign
     "font.size": 9,
-    "svg.fonttype": "none",  # letters stay letters: small, sharp, in the page's own font
+    "svg.fonttype": "none",  # keep text as text, in the page's font
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
@@ -62,15 +43,10 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def colour(name: str) -> str:
-    """The colour ``name`` as drawn (its light variant)."""
-    return COLOURS[name][0]
-
-
 def _figure(title: str, height: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     axes = figure.subplots()
-    axes.set_title(shorten(title, 48), color=colour("ink"))
+    axes.set_title(shorten(title, 40), color=colour("ink"))
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(colour("rule"))
     axes.tick_params(colors=colour("soft"), length=0)
@@ -83,8 +59,8 @@ def shorten(text: str, length: int) -> str:
 
 
 def _below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
-    """A legend under the axes, where it can hide nothing."""
-    options: dict[str, Any] = {"handlelength": 1.4, "columnspacing": 1.2, "fontsize": 8.5, "handletextpad": 0.5}
+    """Put a legend below the axes, where it hides nothing."""
+    options: dict[str, Any] = {"handlelength": 1.4, "columnspacing": 1.2, "fontsize": 9, "handletextpad": 0.5}
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, labelcolor=colour("ink"), **options)
 
 
@@ -95,51 +71,123 @@ def _below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], column
 def bars(
     title: str, groups: Mapping[str, Mapping[str, Mapping[str, float]]], lines: Mapping[str, float], what: str
 ) -> Figure:
-    """Bars in percent with 95 % whiskers: group (modality or direction) -> source -> mean, low, high in 0 .. 1.
+    """Horizontal bars in percent with 95 % whiskers. Methods have their modality's colour, controls are grey.
 
-    Methods carry their modality's colour, controls are grey; ``lines`` (majority, chance) cross all groups.
+    Args:
+        title: Title of the figure.
+        groups: Group (modality or direction) -> source -> mean, low and high in 0 .. 1.
+        lines: Vertical lines across the bars of all groups, such as majority or chance.
+        what: Label of the axis.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
     figure, axes = _figure(title, 0.85 + 0.21 * num_rows)
-    y, ticks, names, top = 0.0, [], [], max([0.0, *lines.values()])
+    y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
     for number, (group, cells) in enumerate(groups.items()):
         hue = MODALITY_HUES.get(group, HUES[2 + 2 * (number % 2)])
         axes.text(0, y, group.replace("->", "→"), color=colour(hue), fontweight="bold", va="center", ha="left")
+        spans.append((y + 0.5, y + len(cells) + 0.5))
         for source, cell in cells.items():
             y += 1
-            mean, low, high = (100 * cell[k] for k in ("mean", "low", "high"))
-            axes.barh(y, mean, 0.74, color=colour(CONTROL_GREYS.get(source, hue)))
-            # whiskers with a halo, or they would drown in the dark bars
-            axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
-            axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
-            weight = "normal" if source in CONTROL_GREYS else "bold"
-            look: dict[str, Any] = {"va": "center", "fontsize": 8.5, "color": colour("ink"), "fontweight": weight}
-            axes.annotate(f"{mean:.1f}", (high, y), xytext=(5, 0), textcoords="offset points", **look)
-            ticks.append(y)
-            names.append(shorten(source, 22))
-            top = max(top, high / 100)
+            _bar(axes, y, source, cell, hue)
+            ticks[y] = shorten(source, 22)
+            top = max(top, cell["high"])
         y += 1.25
-    axes.set_yticks(ticks, names, color=colour("ink"))
+    axes.set_yticks(list(ticks), list(ticks.values()), color=colour("ink"))
     axes.set_ylim(y - 0.6, -0.7)
     axes.set_xlim(0, max(1.0, 100 * top * 1.15))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
     axes.set_axisbelow(True)
-    axes.set_xlabel(what, color=colour("soft"), fontsize=8.5)
+    axes.set_xlabel(what, color=colour("soft"), fontsize=9)
     axes.spines["left"].set_visible(False)
-    handles = []
+    labels, handles = [], []
     for number, (name, value) in enumerate(lines.items()):
-        dash = DASHES[1 + number % 3]
-        axes.axvline(100 * value, color=colour("soft"), linestyle=dash, linewidth=1.2, zorder=0.9)
-        handles.append((Line2D([], [], color=colour("soft"), linestyle=dash), f"{shorten(name, 28)} {100 * value:.1f}"))
+        look: dict[str, Any] = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3]}
+        for low, high in spans:  # not through the names of the groups
+            axes.plot([100 * value] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
+        handles.append(Line2D([], [], **look))
+        labels.append(f"{shorten(name, 28)} {100 * value:.1f}")
     if handles:
-        _below(figure, [h for h, _ in handles], [label for _, label in handles], 3)
+        _below(figure, handles, labels, 3)
     return figure
+
+
+def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, float], hue: str) -> None:
+    """One bar with its whisker and its value."""
+    mean, low, high = (100 * cell[k] for k in ("mean", "low", "high"))
+    axes.barh(y, mean, 0.74, color=colour(CONTROL_GREYS.get(source, hue)))
+    axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
+    axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
+    look: dict[str, Any] = {"va": "center", "fontsize": 9, "color": colour("ink"), "textcoords": "offset points"}
+    look["fontweight"] = "normal" if source in CONTROL_GREYS else "bold"
+    look["bbox"] = {"facecolor": colour("card"), "edgecolor": "none", "pad": 0.5}  # no line runs through the value
+    axes.annotate(f"{mean:.1f}", (high, y), xytext=(5, 0), **look)
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A score of one source at one modality ("none" = a control without features), in 0 .. 1."""
+
+    source: str
+    modality: str
+    mean: float
+    low: float
+    high: float
+    printed: float | None
+    control: bool
+
+
+@matplotlib.rc_context({**_STYLE, "font.size": 10})
+def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
+    """A panel per task, a line per source, a dot with its 95 % interval per modality.
+
+    Methods are sorted by their best score in the first task, the controls follow. Crosses are the paper's numbers.
+    """
+    dots = [dot for panel in panels.values() for dot in panel if dot.modality != "none"]
+    best: dict[tuple[bool, str], float] = {}
+    for dot in dots:
+        key = dot.control, dot.source
+        best[key] = max(best.get(key, 0.0), dot.mean if dot in next(iter(panels.values())) else 0.0)
+    rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
+    names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
+    size = (3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows))
+    figure = Figure(figsize=size, layout="constrained")
+    for axes, (task, panel) in zip(
+        figure.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels.items(), strict=True
+    ):
+        axes.set_title(task, color=colour("ink"))
+        for dot in panel:
+            _dot(axes, dot, rows)
+        axes.set_yticks(range(len(rows)), names)
+        axes.set_ylim(-0.7, len(rows) - 0.3)
+        controls = sum(control for control, _ in best)
+        axes.axhline(controls - 0.5, color=colour("soft"), linewidth=0.7)
+        axes.set_xlabel("accuracy %")
+        axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
+        axes.tick_params(length=0)
+        axes.spines[["top", "right", "left"]].set_visible(False)
+    entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
+    order = [name for name in ("touch", "vision", "both", "printed", "majority") if name in entries]
+    _below(figure, [entries[name] for name in order], order, 5)
+    return figure
+
+
+def _dot(axes: Axes, dot: Dot, rows: Sequence[str]) -> None:
+    if dot.modality == "none":
+        if dot.source == "majority":
+            axes.axvline(100 * dot.mean, color=colour("soft"), linewidth=1, linestyle=":", label="majority")
+        return
+    hue = colour(MODALITY_HUES[dot.modality])
+    y = rows.index(dot.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[dot.modality]
+    axes.plot([100 * dot.low, 100 * dot.high], [y, y], color=hue, linewidth=1.6)
+    axes.plot(100 * dot.mean, y, "o", markersize=4.5, color=hue, label=dot.modality)
+    if dot.printed is not None:
+        axes.plot(100 * dot.printed, y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
 
 
 @dataclass(frozen=True)
 class Line:
-    """One curve: ``y`` over ``x`` steps; curves of one label (seeds) share their look and one legend entry."""
+    """One curve: ``y`` over steps ``x``. Curves with the same label (seeds) share a legend entry."""
 
     label: str
     x: Sequence[float]
@@ -150,33 +198,25 @@ class Line:
 
 @matplotlib.rc_context(_STYLE)
 def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | None = None) -> Figure:
-    """Curves over the steps; ``references`` are level lines such as chance."""
+    """Curves over steps; ``references`` are horizontal lines such as chance."""
     figure, axes = _figure(title, 2.75)
     handles: dict[str, Any] = {}
-    several = len({line.label for line in lines}) < len(lines)  # seeds: thinner, so that they stay apart
+    several = len({line.label for line in lines}) < len(lines)  # seeds: thinner lines
     for line in lines:
         marker = "o" if len(line.x) < 12 else ""
-        (drawn,) = axes.plot(
-            line.x,
-            line.y,
-            line.dash,
-            color=colour(line.hue),
-            marker=marker,
-            markersize=3.2,
-            linewidth=1.2 if several else 1.8,
-        )
+        look: dict[str, Any] = {"color": colour(line.hue), "marker": marker, "markersize": 3.2}
+        (drawn,) = axes.plot(line.x, line.y, line.dash, linewidth=1.2 if several else 1.8, **look)
         handles.setdefault(line.label, drawn)
     for number, (name, value) in enumerate((references or {}).items()):
-        handles[name] = axes.axhline(
-            value, color=colour("soft"), linestyle=DASHES[1 + number % 3], linewidth=1.1, zorder=0.9
-        )
+        look = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3], "linewidth": 1.1}
+        handles[name] = axes.axhline(value, zorder=0.9, **look)
     axes.grid(axis="y", color=colour("rule"), linewidth=0.7)
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.margins(y=0.12)
     axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
-    axes.set_xlabel("step", color=colour("soft"), fontsize=8.5)
+    axes.set_xlabel("step", color=colour("soft"), fontsize=9)
     labels = [shorten(label, 30) for label in handles]
     _below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
     return figure
@@ -184,7 +224,7 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
 
 @matplotlib.rc_context(_STYLE)
 def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
-    """Row-normalised confusion of ``counts`` [true, predicted]: the diagonal (right) blue, mistakes vermilion."""
+    """Row-normalised confusion matrix of ``counts`` [true, predicted]; correct cells blue, mistakes vermilion."""
     num = len(classes)
     figure, axes = _figure(title, 3.4 if num <= 4 else 4.3)
     totals = counts.sum(1, keepdims=True)
@@ -195,7 +235,7 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
         hue = colour("blue" if true == guess else "vermilion")
         gap = 0.03 if num <= 40 else 0.0
         box = (guess - 0.5 + gap, true - 0.5 + gap)
-        # under a number never opaque: it must stay readable, in light and in dark
+        # never opaque under a number, which must stay readable on light and dark pages
         alpha = round(0.12 + (0.58 if num <= 8 else 0.88) * share, 2)
         axes.add_patch(Rectangle(box, 1 - 2 * gap, 1 - 2 * gap, facecolor=hue, alpha=alpha, edgecolor="none"))
         if num <= 8:
@@ -213,14 +253,14 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     else:
         axes.set_xticks([])
         axes.set_yticks([])
-    axes.set_xlabel("predicted", color=colour("soft"), fontsize=8.5)
-    axes.set_ylabel("true", color=colour("soft"), fontsize=8.5)
+    axes.set_xlabel("predicted", color=colour("soft"), fontsize=9)
+    axes.set_ylabel("true", color=colour("soft"), fontsize=9)
     return figure
 
 
 @matplotlib.rc_context(_STYLE)
 def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> Figure:
-    """Points [N, 2] by label [N] (-1 = unlabelled): eight hues, then the same hues with another marker."""
+    """Points [N, 2] by label [N] (-1 = unlabelled). Each further eight classes repeat the hues with another marker."""
     shown = [label for label in range(-1, len(classes)) if (labels == label).any()]
     longest = max((len(shorten(classes[label], 16)) for label in shown if label >= 0), default=0)
     columns = 4 if longest <= 10 else 3
@@ -252,13 +292,13 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
 
 @matplotlib.rc_context(_STYLE)
 def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face: str, **options: Any) -> bytes:
-    """What ``canvas`` prints of the figure, which is laid out once for all canvases (savefig would do it each time)."""
+    """Print the figure with ``canvas``. It is laid out once for all canvases; savefig would repeat that."""
     figure.set_facecolor(face)
     for axes in figure.axes:
         axes.set_facecolor("none")
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing")  # class names in scripts that matplotlib's font lacks
+        warnings.filterwarnings("ignore", "Glyph .* missing")  # class names in other scripts
         if figure.get_layout_engine() is not None:
             figure.draw_without_rendering()
             figure.set_layout_engine(None)
@@ -267,9 +307,9 @@ def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face
     return buffer.getvalue()
 
 
-def to_png(figure: Figure) -> bytes:
-    """The figure on white at 200 dpi."""
-    figure.set_dpi(200)
+def to_png(figure: Figure, dpi: int = 200) -> bytes:
+    """The figure as a PNG on white."""
+    figure.set_dpi(dpi)
     return _print(figure, FigureCanvasAgg, "white", metadata={"Software": None})
 
 
@@ -277,16 +317,16 @@ _VARIABLES = {light: f"var(--{name})" for name, (light, _) in COLOURS.items()}
 
 
 def to_svg(figure: Figure, name: str, alt: str) -> str:
-    """The figure as an <svg> for HTML: no outer references, no fixed size, the page's colours and font."""
+    """The figure as an <svg> for HTML: self-contained, scalable, with the page's colours and font."""
     metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    # The salt keeps the ids of several drawings on one page apart, and a drawing byte-identical when drawn again.
+    # The salt makes ids unique within a page and the output reproducible.
     with matplotlib.rc_context({"svg.hashsalt": name}):
         text = _print(figure, FigureCanvasSVG, "none", metadata=metadata).decode()
     box = re.search(r'viewBox="[^"]*"', text)
     assert box is not None
     body = text[text.index(">", box.end()) + 1 :]
-    body = re.sub(r"<style.*?</style>", "", body, count=1, flags=re.DOTALL)  # it would style the whole page
-    body = re.sub(r'<g id="[^"]*"', "<g", body)  # figure_1, axes_1, ... of every figure: nothing points there
+    body = re.sub(r"<style.*?</style>", "", body, count=1, flags=re.DOTALL)  # it would apply to the whole page
+    body = re.sub(r'<g id="[^"]*"', "<g", body)  # figure_1, axes_1, ...: unused, and not unique in a page
     body = re.sub(r"font-family: [^;\"]*", "font-family: var(--font)", body)
     body = re.sub(r"(font: [^;\"]*?[0-9.]+px) [^;\"]*", r"\1 var(--font)", body)
     body = re.sub(r"#[0-9a-f]{6}", lambda found: _VARIABLES.get(found[0], found[0]), body)

@@ -1,6 +1,6 @@
-"""Features to look at: a plane of them coloured by label, and what random queries find in the other modality.
+"""Pictures of features: a 2D map coloured by label, and a gallery of cross-modal retrieval.
 
-Shapes: features [N, D] of the rows looked at; embeddings in the space both modalities share [N, E], L2-normalised.
+Shapes: features [N, D] of the rows shown; L2-normalised embeddings in the space that both modalities share [N, E].
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import features, sample
+from mvitac.evaluation.probe import shared_space
 from mvitac.report import figures, html
 from mvitac.report.sections import Study
 
@@ -25,7 +26,7 @@ NUM_MAP, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
 
 @dataclass(frozen=True)
 class Found:
-    """One retrieved group, shown by its row most like the query; rows count within the test rows."""
+    """One retrieved group, shown by its row nearest to the query. Rows are indices into the test rows."""
 
     row: int
     mark: Literal["right", "same class", "wrong"]
@@ -33,7 +34,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Query:
-    """A query row, the rank (1 = first) of its own group, and the first groups found."""
+    """A query row, the rank of its own group (1 = first), and the groups found first."""
 
     row: int
     rank: int
@@ -43,9 +44,15 @@ class Query:
 def nearest_groups(
     query: Tensor, gallery: Tensor, groups: Tensor, labels: np.ndarray, rows: Sequence[int], num: int = NUM_FOUND
 ) -> list[Query]:
-    """For each of ``rows`` the ``num`` groups whose mean ``gallery`` embedding is nearest, just as retrieval is scored.
+    """Find for each of ``rows`` the ``num`` groups with the nearest mean ``gallery`` embedding, as retrieval is scored.
 
-    ``query`` and ``gallery`` [N, E]; ``groups`` [N] numbered 0 .. G-1; ``labels`` [N], -1 = none, never "same class".
+    Args:
+        query: Embeddings of the query modality [N, E].
+        gallery: Embeddings of the other modality [N, E].
+        groups: Group numbers 0 .. G-1 of the rows [N].
+        labels: Labels [N]; -1 = unlabelled, never "same class".
+        rows: The queries.
+        num: Number of groups to return per query.
     """
     similarity = query @ diagnostics.group_means(gallery, groups).T  # [N, G]
     ranks = diagnostics.retrieval_ranks(query, gallery, groups)
@@ -65,7 +72,7 @@ def nearest_groups(
 
 
 def embed_2d(values: np.ndarray) -> np.ndarray:
-    """Features [N, D] on a plane [N, 2]: PCA to 50 dimensions, then t-SNE; the same picture every time."""
+    """Map features [N, D] to [N, 2]: PCA to 50 dimensions, then t-SNE. Deterministic."""
     num = min(50, *values.shape)
     reduced = PCA(num, random_state=0).fit_transform(values)
     perplexity = min(30.0, (len(values) - 1) / 3)
@@ -73,7 +80,7 @@ def embed_2d(values: np.ndarray) -> np.ndarray:
 
 
 def feature_maps(study: Study) -> str:
-    """A plane per modality, of the first run's features."""
+    """A map per modality, of the first run's features."""
     split, rows = study.rows()
     rows = sample(rows, NUM_MAP)
     if len(rows) < 8:
@@ -88,7 +95,7 @@ def feature_maps(study: Study) -> str:
     by = f", by {task.name}" if task else ""
     intro = (
         f"{len(rows)} {split} rows{by}; features of {study.runs[0].path.name}, by PCA to 50 dimensions and t-SNE."
-        " Near means alike; distances between far clumps mean nothing."
+        " Near points are similar; distances between far clusters mean nothing."
     )
     return html.paragraph(intro) + html.grid(drawn, "grid large")
 
@@ -101,45 +108,46 @@ _SHOWN = {
 
 
 def gallery(study: Study) -> str:
-    """Random queries in both directions with the five groups found first, each marked by words and colour."""
+    """Random queries in both directions with the five groups found first, each marked by a word and a colour."""
     run = next((run for run in study.runs if len(run.model.projectors) == 2), None)
     split, rows = study.rows()
     if run is None or split != "test":
         return ""
-    model, pack = run.model, study.pack
-    device = next(model.parameters()).device
-    z = {
-        m: model.project(m, torch.from_numpy(features(model, pack, m, rows, for_heads=True)).to(device)).cpu()
-        for m in ("touch", "vision")
-    }
-    names = pack.column("group")[rows].astype(str)
+    z = shared_space(run.model, study.pack, rows)
+    names = study.pack.column("group")[rows].astype(str)
     groups = torch.from_numpy(np.unique(names, return_inverse=True)[1])
     labels = study.labels(rows)
-    classes: tuple[str, ...] = pack.spec.tasks[0].classes if pack.spec.tasks else ()
-    chosen = sample(np.arange(len(rows)), NUM_QUERIES)
-    by, halves = pack.spec.group_by, []
-
-    def shown(modality: str, row: int) -> tuple[str, str]:
-        name = str(classes[labels[row]] if labels[row] >= 0 else names[row])
-        image = html.picture(pack.images[modality][rows[row]], f"{modality} of {by} {names[row]} ({name})")
-        return image, figures.shorten(name, 24)
-
+    queries = sample(np.arange(len(rows)), NUM_QUERIES)
+    halves = []
     for asked, searched in (("touch", "vision"), ("vision", "touch")):
-        blocks = []
-        for query in nearest_groups(z[asked], z[searched], groups, labels, chosen.tolist()):
-            image, name = shown(asked, query.row)
-            cells = [
-                html.cell("asked", image, "", f"{name}; its {by} is at rank {query.rank} of {int(groups.max()) + 1}")
-            ]
-            for found in query.found:
-                css, mark = _SHOWN[found.mark]
-                image, name = shown(searched, found.row)
-                cells.append(html.cell(css, image, mark, name))
-            blocks.append(f'<div class="query">{"".join(cells)}</div>')
-        halves.append(f'<div class="card"><h3>{asked} → {searched}</h3>{"".join(blocks)}</div>')
+        found = nearest_groups(z[asked], z[searched], groups, labels, queries.tolist())
+        blocks = "".join(_query(study, rows, asked, searched, query, int(groups.max()) + 1) for query in found)
+        halves.append(f'<div class="card"><h3>{asked} → {searched}</h3>{blocks}</div>')
+    by, tasks = study.pack.spec.group_by, study.pack.spec.tasks
     intro = (
-        f"{len(chosen)} test rows drawn at random (seed 0), not picked; left the query, then the five {by}s whose mean"
-        f" embedding in the other modality is nearest, best first ({run.source}, {run.path.name})."
-        + (f" Right: the same {by}. Same class: another one of the same {pack.spec.tasks[0].name}." if classes else "")
+        f"{len(queries)} test rows drawn at random (seed 0). Left: the query. Then, best first, the five {by}s whose mean"
+        f" embedding in the other modality is nearest ({run.source}, {run.path.name})."
+        + (f" Right: the same {by}. Same class: another {by} with the same {tasks[0].name}." if tasks else "")
     )
     return html.paragraph(intro) + f'<div class="queries">{"".join(halves)}</div>'
+
+
+def _query(study: Study, rows: np.ndarray, asked: str, searched: str, query: Query, num_groups: int) -> str:
+    """One query and what it found."""
+    image, name = _picture(study, asked, rows[query.row])
+    rank = f"its {study.pack.spec.group_by} has rank {query.rank} of {num_groups}"
+    cells = [html.cell("asked", image, "", f"{name}; {rank}")]
+    for found in query.found:
+        css, mark = _SHOWN[found.mark]
+        image, name = _picture(study, searched, rows[found.row])
+        cells.append(html.cell(css, image, mark, name))
+    return f'<div class="query">{"".join(cells)}</div>'
+
+
+def _picture(study: Study, modality: str, row: int) -> tuple[str, str]:
+    """A pack row's image, and its class in the first task or its group."""
+    pack, label = study.pack, study.labels(np.array([row]))[0]
+    group = str(pack.column("group")[row])
+    name = pack.spec.tasks[0].classes[label] if label >= 0 else group
+    alt = f"{modality} of {pack.spec.group_by} {group} ({name})"
+    return html.picture(pack.images[modality][row], alt), figures.shorten(name, 24)

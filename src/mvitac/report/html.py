@@ -1,6 +1,6 @@
-"""One self-contained HTML page: the frame, its style, and the few pieces it is built of. No scripts, no network.
+"""A self-contained HTML page and the pieces it is built from. No scripts, no network.
 
-Text becomes HTML in one way only: through ``escape``. What is called ``html`` here is trusted, all else is escaped.
+All text is escaped. Only arguments named ``html``, ``svg`` or ``image`` are trusted.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from html import escape
 import numpy as np
 from PIL import Image
 
-from mvitac.report.figures import COLOURS
+from mvitac.report.palette import COLOURS
 
 _STYLE = """
-:root { color-scheme: light dark; --page: #f6f7f9; --card: #fff;
+:root { color-scheme: light dark; --page: #f6f7f9;
   --font: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
   --mono: ui-monospace, "SF Mono", "Cascadia Mono", Menlo, Consolas, "DejaVu Sans Mono", monospace; LIGHT }
-@media (prefers-color-scheme: dark) { :root { --page: #0f1318; --card: #171c23; DARK } }
+@media (prefers-color-scheme: dark) { :root { --page: #0f1318; DARK } }
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--page); color: var(--ink); font: 16px/1.55 var(--font); overflow-wrap: anywhere;
   -webkit-text-size-adjust: 100%; }
@@ -96,7 +96,9 @@ footer { margin-top: 64px; padding-top: 16px; padding-bottom: 40px; font-size: 1
   .query { grid-template-columns: repeat(5, 1fr); gap: 6px; font-size: 11px; }
   .query .asked { grid-column: 1 / -1; display: grid; grid-template-columns: 76px 1fr; gap: 10px; align-items: center;
     border-right: 0; padding-right: 0; font-size: 13px; }
-  th, td { padding: 6px 10px; }
+  table { font-size: 12px; }
+  th, td { padding: 6px; }
+  td, thead th { white-space: normal; }
   h2 { margin-top: 44px; }
   figure, .card { padding: 10px; }
 }
@@ -105,7 +107,7 @@ footer { margin-top: 64px; padding-top: 16px; padding-bottom: 40px; font-size: 1
 
 
 def html_page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: str) -> str:
-    """The whole page; ``sections`` are (anchor, heading, html). Its policy forbids any request and any script."""
+    """The whole page from sections (anchor, heading, html). Its content security policy forbids requests and scripts."""
     colours = [" ".join(f"--{name}: {pair[i]};" for name, pair in COLOURS.items()) for i in (0, 1)]
     style = _STYLE.replace("LIGHT", colours[0]).replace("DARK", colours[1])
     links = "".join(f'<a href="#{anchor}">{escape(heading)}</a>' for anchor, heading, _ in sections)
@@ -124,22 +126,22 @@ def html_page(title: str, head: str, sections: Sequence[tuple[str, str, str]], f
 
 
 def paragraph(text: str, css: str = "soft") -> str:
-    """One escaped paragraph; a per cent sign stays with its number."""
+    """A paragraph. A non-breaking space precedes each per cent sign."""
     return f'<p class="{css}">{escape(text).replace(" %", "&nbsp;%")}</p>'
 
 
 def fold(summary: str, html: str) -> str:
-    """``html`` behind a line that opens it."""
+    """``html`` folded behind ``summary``."""
     return f"<details><summary>{escape(summary)}</summary>{html}</details>"
 
 
 def grid(figures: Iterable[str], css: str = "grid") -> str:
-    """Pieces side by side, as many as fit."""
+    """Pieces side by side, as many as fit in a row."""
     return f'<div class="{css}">{"".join(figures)}</div>'
 
 
 def figure(svg: str, caption: str = "") -> str:
-    """A drawing and what to look for in it."""
+    """A drawing and its caption."""
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     return f"<figure>{svg}{below}</figure>"
 
@@ -152,9 +154,14 @@ def table(
     words: bool = False,
     label: str = "table",
 ) -> str:
-    """A table that scrolls in its own box. A row of one cell is a heading; rows named in ``muted`` step back.
+    """A table that scrolls in its own box.
 
-    ``words``: cells hold words, not numbers; they are left-aligned and wrap.
+    Args:
+        columns: Column headings.
+        rows: Rows of cells. A row of one cell is a heading.
+        muted: First cells of rows to show in grey.
+        words: Cells are text, left-aligned and wrapped, instead of numbers.
+        label: Accessible name.
     """
     head = "".join(f'<th scope="col">{escape(column)}</th>' for column in columns)
     body = []
@@ -163,14 +170,17 @@ def table(
             body.append(f'<tr class="part"><th colspan="{len(columns)}">{escape(name)}</th></tr>')
             continue
         look = ' class="muted"' if name in muted else ""
-        inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+        # On a phone a cell wraps, but not within an interval.
+        inner = "".join(
+            f"<td>{escape(cell) if words else escape(cell).replace(', ', ',&nbsp;')}</td>" for cell in cells
+        )
         body.append(f'<tr{look}><th scope="row">{escape(name)}</th>{inner}</tr>')
     box = f'<div class="scroll{" words" * words}" tabindex="0" role="region" aria-label="{escape(label)}">'
     return f"{box}<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
 
 
 def picture(image: np.ndarray, alt: str, side: int = 112) -> str:
-    """An <img> holding uint8 ``image`` [H, W, C] itself; six channels are two gels, shown side by side."""
+    """An <img> with uint8 ``image`` [H, W, C] embedded. Six channels are two sensors, shown side by side."""
     sensors = np.split(image, image.shape[2] // 3, axis=2)
     joined = Image.fromarray(np.ascontiguousarray(np.concatenate(sensors, axis=1)))
     if joined.height > side:
@@ -183,7 +193,7 @@ def picture(image: np.ndarray, alt: str, side: int = 112) -> str:
 
 
 def cell(css: str, image: str, mark: str, text: str) -> str:
-    """One picture of the gallery with its mark and its caption; ``image`` is trusted html."""
+    """One image of the gallery with its mark and caption."""
     bold = f"<b>{escape(mark)}</b>" if mark else ""
     return f'<div class="{css}">{image}{bold}<span>{escape(text)}</span></div>'
 

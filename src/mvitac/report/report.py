@@ -1,4 +1,4 @@
-"""Finished runs as one page to look at: verdict, curves, tables with controls, pictures, settings, cost. No network."""
+"""The report of finished runs as one HTML page: verdict, tables, curves, pictures, settings, cost. No network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.console import Console
 from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs
-from mvitac.evaluation.probe import cross_modal, parts
+from mvitac.evaluation.probe import cross_modal, split_rows
 from mvitac.model import load, precision_of
 from mvitac.registry import to_json
 from mvitac.report import galleries, tables
@@ -36,15 +36,25 @@ def write_report(
     pack: Pack | None = None,
     quiet: bool = False,
 ) -> Path:
-    """Write ``out``/report.html and ``out``/figures/*.png about finished runs on the same data; return the page's path.
+    """Write ``out``/report.html and ``out``/figures/*.png about finished runs on the same data.
 
-    ``result`` is what ``probe.probe_runs`` returned for these runs; without it they are probed here: logistic
-    regression, all tasks, all controls. ``pack`` is what to look at instead of the runs' own data. ValueError for runs
-    that are not finished.
+    Args:
+        paths: Folders of the runs.
+        out: Folder to write to.
+        result: What ``probe_runs`` returned for these runs. Default: probe here, with logistic regression, all tasks
+            and all controls.
+        pack: Data to show instead of the runs' own.
+        quiet: Print no progress.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        ValueError: If a run is not finished, or ``result`` is about other runs or data.
     """
     runs = open_runs([Path(path) for path in paths])
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
-        raise ValueError("these runs were trained on different data: report them apart")
+        raise ValueError("these runs were trained on different data: write one report per dataset")
     pack = pack or runs[0].run.data.open(quiet=quiet)
     if result is None:
         with shown(Console(stderr=True), quiet=quiet):
@@ -64,7 +74,7 @@ def write_report(
 
 
 def open_runs(paths: Sequence[Path]) -> list[Finished]:
-    """Load finished runs; ValueError says which folder is not one, and what to do."""
+    """Load finished runs; ValueError names a folder that is none."""
     if not paths:
         raise ValueError("give at least one run's folder")
     for path in paths:
@@ -79,7 +89,7 @@ def open_runs(paths: Sequence[Path]) -> list[Finished]:
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The lines of a log.jsonl; a missing file is an empty log, a half-written line ends it."""
+    """Entries of a log.jsonl. A missing file is an empty log; an incomplete line ends it."""
     lines = []
     for line in path.read_text().splitlines() if path.exists() else []:
         try:
@@ -93,8 +103,8 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     usable = []
     for task in pack.spec.tasks:
         try:
-            parts(pack, task, "both")
-        except ValueError:  # no labelled rows to learn from or to be scored on
+            split_rows(pack, task, "both")
+        except ValueError:  # no labelled rows to fit or to score
             continue
         usable.append(task.name)
     if usable:
@@ -106,18 +116,18 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
 
 
 def _check_scored(runs: Sequence[Finished], result: dict[str, Any]) -> None:
-    """Refuse numbers of other runs than those shown."""
+    """Check that the result is about exactly these runs."""
     scored = {Path(r["run"]).resolve() for r in [*result["records"], *result["retrieval"]] if "run" in r}
     shown = {run.path.resolve(): run.path for run in runs}
     again = "make it again with `mvitac probe --json`"
     for path in shown.keys() - scored if scored else ():
         raise ValueError(f"the probe result does not score {shown[path]}: {again}")
-    for path in scored - shown.keys():  # its means are of all its runs, and it calls them by what tells those apart
+    for path in scored - shown.keys():  # its means and names cover all of its runs
         raise ValueError(f"the probe result scores {path} too: show that run as well, or {again}")
 
 
 def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finished]:
-    """``runs`` by the names that ``result`` has for them: it may be older."""
+    """``runs`` with the names that ``result``, which may be older, has for them."""
     records = [*result["retrieval"], *result["records"]]
     names = {Path(r["run"]).resolve(): r["source"].removesuffix(END_TO_END) for r in records if "run" in r}
     return [replace(run, source=names.get(run.path.resolve(), run.source)) for run in runs]
@@ -128,22 +138,22 @@ def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finishe
 
 def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
-    drawn = {
-        "scores": ("What the frozen features are worth", evidence.probe),
+    sections = {
+        "scores": ("Scores of the frozen features", evidence.probe),
         "retrieval": ("Finding the other modality", evidence.retrieval),
         "loss": ("Loss", evidence.loss),
         "collapse": ("Learning or collapsing?", evidence.collapse),
-        "confusion": ("What is taken for what", evidence.confusions),
+        "confusion": ("Confusion", evidence.confusions),
         "map": ("A map of the features", galleries.feature_maps),
         "gallery": ("Retrieval gallery", galleries.gallery),
         "settings": ("Settings", _settings),
-        "cost": ("What it cost", _cost),
-        "again": ("Do it again", _again),
+        "cost": ("Cost", _cost),
+        "again": ("Reproduce", _again),
     }
-    sections = []
-    with work("drawing the report", len(drawn), "sections") as advance:
-        for name, (heading, draw) in drawn.items():
-            sections.append((name, heading, draw(study)))
+    drawn = []
+    with work("drawing the report", len(sections), "sections") as advance:
+        for name, (heading, draw) in sections.items():
+            drawn.append((name, heading, draw(study)))
             advance()
     spec = study.pack.spec
     notes = "".join(f" Note: {note}." for note in spec.notes)
@@ -152,7 +162,7 @@ def _page(study: Study) -> str:
         f" All intervals are 95 %, by bootstrap over test {spec.group_by}s and seeds."
         f" Written by mvitac {__version__}; this page makes no network request."
     )
-    return page.html_page(title, _head(study, title), [s for s in sections if s[2]], foot)
+    return page.html_page(title, _head(study, title), [section for section in drawn if section[2]], foot)
 
 
 def _head(study: Study, title: str) -> str:
@@ -167,7 +177,7 @@ def _head(study: Study, title: str) -> str:
         "input": ", ".join(dict.fromkeys(f"{r.run.augment.eval_size} px" for r in runs)),
     }
     items = "".join(f"<li>{escape(name)} <b>{escape(value)}</b></li>" for name, value in chips.items())
-    text = "; ".join(verdicts(study)) or "nothing is scored on this data, there is only something to look at"
+    text = "; ".join(verdicts(study)) or "nothing is scored on this data"
     text = f"{text[0].upper()}{text[1:]}."
     verdict = page.paragraph(text, "verdict")
     tiles = "".join(_tile(study, task) for task in study.result["summary"])
@@ -176,7 +186,7 @@ def _head(study: Study, title: str) -> str:
 
 
 def verdicts(study: Study) -> list[str]:
-    """One clause per main result (first task, touch -> vision), of numbers only."""
+    """One clause per main result: the first task, and retrieval from touch to vision."""
     clauses = []
     for task in list(study.result["summary"])[:1]:
         modality, own, controls = evidence.headline(study, task)
@@ -188,11 +198,11 @@ def verdicts(study: Study) -> list[str]:
         clauses.append(
             ", ".join([f"{WORDS[modality]} reaches {100 * own['mean']:.1f} % on {task}{by}", *others, *beside])
         )
-    found = tables.retrieval_means(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
+    found = tables.by_direction(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
     if found:
         clauses.append(
-            f"a touch finds its {study.pack.spec.group_by} among the first five by camera in {100 * found['R@5']:.1f} %"
-            f" (chance {100 * found['chance R@5']:.1f})"
+            f"a touch finds its {study.pack.spec.group_by} among the first five by camera in"
+            f" {100 * tables.recall(found, 'R@5'):.1f} % (chance {100 * tables.recall(found, 'chance R@5'):.1f})"
         )
     return clauses
 
@@ -202,12 +212,12 @@ def _tile(study: Study, task: str) -> str:
     below = [name for name, cell in controls.items() if cell["low"] > own["high"]]
     level = [name for name, cell in controls.items() if cell["high"] >= own["low"] and name not in below]
     found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
-    told = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
-    told = told if controls else ""
+    verdict = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
+    verdict = verdict if controls else ""
     numbers = f"{100 * own['mean']:.1f}<small> % [{100 * own['low']:.1f}, {100 * own['high']:.1f}]</small>"
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
     what = f"<h3>{escape(task)} <small>{escape(WORDS[modality] + by)}</small></h3>"
-    return f'<div class="card tile">{what}<div class="big">{numbers}</div>{told}</div>'
+    return f'<div class="card tile">{what}<div class="big">{numbers}</div>{verdict}</div>'
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -230,7 +240,7 @@ def _settings(study: Study) -> str:
     records = "".join(
         page.fold(f"{r.path / 'run.json'} in full", page.code(json.dumps(r.record, indent=1))) for r in study.runs
     )
-    differ = page.paragraph("Where the runs differ, their values stand side by side.") if len(study.runs) > 1 else ""
+    differ = page.paragraph("Where runs differ, all values are shown.") if len(study.runs) > 1 else ""
     return f"{differ}{page.grid(shown, 'pillars')}{records}"
 
 
@@ -241,7 +251,7 @@ def _plain(value: Any) -> str:
 
 
 def wall_seconds(run: Finished) -> float | None:
-    """Seconds of training by the logged speeds (steps x batch / pairs per second), or None without a usable log."""
+    """Seconds of training from the logged speeds (steps x batch size / pairs per second); None without a usable log."""
     seconds, before = 0.0, 0
     for entry in run.log:
         if "loss" in entry:
@@ -269,7 +279,7 @@ def _cost(study: Study) -> str:
             "precision": precision_of(r.run, r.record) + " (auto)" * (r.run.precision == "auto"),
             "versions": ", ".join(f"{k} {v}" for k, v in r.record.get("versions", {}).items()),
             "python": str(r.record.get("python", "")),
-            "commit": str(r.record.get("commit") or "not from a checkout"),
+            "commit": str(r.record.get("commit") or "not a git checkout"),
             "data digest": str(r.record.get("pack", "")),
             "folder": str(r.path),
         }
@@ -277,7 +287,7 @@ def _cost(study: Study) -> str:
             rows.setdefault(name, []).append(value)
     names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
     shown = page.table(["", *names], [[name, *values] for name, values in rows.items()], words=True, label="cost")
-    return page.paragraph("Wall time is estimated from the logged speeds; the last scoring is not in it.") + shown
+    return page.paragraph("Wall time is estimated from the logged speeds and excludes the final scoring.") + shown
 
 
 def _again(study: Study) -> str:

@@ -1,5 +1,5 @@
-// The explorer's map: a canvas of points to pan, zoom, hover and click. `props.value` is the JSON that landscape.points makes.
-// 100,000 points are drawn as small squares in one pass; the nearest to the pointer is found by looking at all of them.
+// The explorer's map: a canvas of points to pan, zoom, hover and click. `props.value` is the JSON of ExplorerData.points.
+// 100,000 points are drawn as small squares in one pass. The nearest to the pointer is found by a linear search.
 const canvas = element.querySelector("canvas"), tip = element.querySelector(".tip"), legend = element.querySelector(".legend");
 const count = element.querySelector(".count"), context = canvas.getContext("2d");
 let data = { x: [], y: [], colour: [], row: [], legend: [] }, view = { x: 0, y: 0, zoom: 1 }, hovered = -1, drag = null;
@@ -51,7 +51,7 @@ function draw() {
 
 function side() { return Math.min(canvas.clientWidth, canvas.clientHeight) * 0.92 * view.zoom; }
 
-function zoom(factor, event) {  // what lies under the pointer stays there
+function zoom(factor, event) {  // the point under the pointer stays there
   const box = canvas.getBoundingClientRect(), before = side();
   const px = event.clientX - box.left - canvas.clientWidth / 2, py = event.clientY - box.top - canvas.clientHeight / 2;
   view.zoom = Math.max(0.5, Math.min(200, view.zoom * factor));
@@ -86,7 +86,7 @@ async function show(event) {
   tip.style.top = `${y > canvas.clientHeight / 2 ? y - tip.offsetHeight - 12 : y + 12}px`;
 }
 
-// Pointers that are down: the mouse or a finger drags, two fingers zoom as well, about the point between them.
+// Active pointers. The mouse or one finger drags; two fingers also zoom about the point between them.
 const fingers = new Map();
 function grip() {
   const all = [...fingers.values()], mean = (key) => all.reduce((sum, f) => sum + f[key], 0) / all.length;

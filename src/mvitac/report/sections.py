@@ -1,4 +1,4 @@
-"""What finished runs have to show, section by section: scores beside controls, curves, confusion."""
+"""Sections of the report: scores and controls, retrieval, training curves, confusion matrices."""
 
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
+from mvitac.evaluation.probe import MIN_GALLERY
 from mvitac.evaluation.scores import interval, summarise
 from mvitac.model import Model
 from mvitac.report import figures, html, tables
-from mvitac.report.figures import HUES, MODALITY_HUES, Line
+from mvitac.report.figures import Line
+from mvitac.report.palette import HUES, MODALITY_HUES
 from mvitac.run import Run
 from mvitac.system.files import write_atomic
 
 WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}
-"""What a probe was given, in words."""
+"""The input of a probe, in words."""
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished run: its record (run.json), its log lines, its model, and its name beside the controls."""
+    """A finished run: its record (run.json), log lines and model, and its name in the tables."""
 
     path: Path
     run: Run
@@ -37,7 +39,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Study:
-    """Finished runs on one dataset, what ``probe.probe_runs`` made of them, and where the figures go."""
+    """Finished runs on one dataset, the result of ``probe_runs``, and the folder for figures."""
 
     runs: Sequence[Finished]
     pack: Pack
@@ -46,7 +48,7 @@ class Study:
 
     @property
     def sources(self) -> list[str]:
-        """The methods' names as the probe result calls them; every other source is a control."""
+        """Names of the methods in the probe result. Every other source is a control."""
         return list(dict.fromkeys(run.source for run in self.runs))
 
     def hue(self, run: Finished) -> str:
@@ -54,22 +56,22 @@ class Study:
         return HUES[self.sources.index(run.source) % len(HUES)]
 
     def rows(self) -> tuple[str, np.ndarray]:
-        """The split to look at and its rows: test, as the first task and retrieval score it; else what there is."""
+        """The split to show and its rows: test, as scored by the first task and by retrieval, else another."""
         only = self.pack.spec.tasks[0].only if self.pack.spec.tasks else None
         for split in ("test", "val", "train", "unlabelled"):
             rows = self.pack.rows(split, only=only, having=self.pack.spec.modalities)
             if len(rows):
                 return split, rows
-        raise ValueError(f"no rows to look at in {self.pack.path}")
+        raise ValueError(f"no rows to show in {self.pack.path}: give a pack with samples")
 
     def labels(self, rows: np.ndarray) -> np.ndarray:
-        """Labels of the first task [len(rows)], -1 where there is none."""
+        """Labels of the first task [len(rows)]; -1 = unlabelled."""
         if not self.pack.spec.tasks:
             return np.full(len(rows), -1)
         return self.pack.column(f"label_{self.pack.spec.tasks[0].name}")[rows].astype(int)
 
     def figure(self, name: str, drawing: Figure, alt: str, caption: str = "") -> str:
-        """Keep ``drawing`` as a PNG in figures/ and return it for the page."""
+        """Save ``drawing`` as a PNG in figures/ and return it as HTML."""
         safe = "".join(c if c.isalnum() else "-" for c in name.lower())
         write_atomic(self.out / "figures" / f"{safe}.png", lambda file: file.write(figures.to_png(drawing)))
         return html.figure(figures.to_svg(drawing, safe, alt), caption)
@@ -79,11 +81,11 @@ class Study:
 
 
 def probe(study: Study) -> str:
-    """Bars per task, then every number; '' where nothing is labelled."""
+    """Bars per task, then every number; '' if nothing is labelled."""
     summary, records = study.result["summary"], study.result["records"]
     if not summary:
         return ""
-    kinds: list[str] = list(dict.fromkeys(r["probe"] for r in records))  # the first one made the summary
+    kinds: list[str] = list(dict.fromkeys(r["probe"] for r in records))  # the first one is that of the summary
     names: list[str] = [tables.PROBE_NAMES.get(kind) or kind for kind in kinds]
     drawn = []
     for task, found in summary.items():
@@ -104,11 +106,9 @@ def probe(study: Study) -> str:
     ]
     columns = ("", "seed", "task", "features", "probe", "accuracy", "balanced", "macro F1", "AUROC")
     numbers.append(html.fold("Every probe with balanced accuracy, F1 and AUROC (%)", html.table(columns, rows)))
-    intro = f"A probe ({names[0]}) on frozen features, scored on {study.pack.spec.group_by}s never seen before."
+    intro = f"A probe ({names[0]}) on frozen features, scored on unseen {study.pack.spec.group_by}s."
     if {r["source"] for r in records} - set(study.sources):
-        intro += (
-            " Grey bars are controls: a trunk before training, raw pixels, the picture's border, given to a probe too."
-        )
+        intro += " Grey bars are controls: the same probe on an untrained trunk, raw pixels, and the image border."
     return html.paragraph(intro) + html.grid(drawn) + "".join(numbers)
 
 
@@ -123,35 +123,32 @@ def _scores(study: Study, summary: dict[str, Any], probe: str) -> str:
 
 
 def retrieval(study: Study) -> str:
-    """R@5 as bars beside chance, and the whole table."""
+    """R@5 as bars with chance level, and the whole table."""
     found = study.result["retrieval"]
     if not found:
-        why = (
-            "the data has one modality"
-            if len(study.pack.spec.modalities) < 2
-            else "no space that both modalities share"
-        )
-        return html.paragraph(f"Not scored: {why}.")
-    cells: dict[str, dict[str, list[Any]]] = {}
-    for record in found:
-        cells.setdefault(record["direction"], {}).setdefault(record["source"], []).append(record)
-
-    def bar(records: list[Any]) -> dict[str, float]:
+        return html.paragraph(f"Not scored: {_why_no_retrieval(study)}.")
+    groups: dict[str, dict[str, dict[str, float]]] = {}
+    for (source, direction), records in tables.by_direction(found).items():
         mean, low, high = interval(records)
-        return {"mean": mean, "low": low, "high": high}
-
-    groups = {d: {s: bar(records) for s, records in by_source.items()} for d, by_source in cells.items()}
+        groups.setdefault(direction, {})[source] = {"mean": mean, "low": low, "high": high}
     by, num = study.pack.spec.group_by, found[0]["num_groups"]
     title = f"R@5 over {num} unseen {by}s"
     drawing = figures.bars(title, groups, {"chance": found[0]["chance R@5"]}, f"own {by} among the first five, %")
     drawn = study.figure("retrieval", drawing, f"{title}, with chance; the numbers are in the table")
-    means = tables.retrieval_means(found)
-    keys = ("R@1", "R@5", "R@10", "chance R@5")
-    rows = [[s, d.replace("->", "→"), *(f"{100 * v[k]:.1f}" for k in keys)] for (s, d), v in means.items()]
-    muted = {s for s, _ in means} - set(study.sources)
-    shown = html.table(["", "query → found", *(f"{k} %" for k in keys)], rows, muted=muted, label="retrieval")
-    intro = f"Given one picture, find its {by} among {num} by the mean embedding of each in the other modality."
+    rows = [[row[0], row[1].replace("->", "→"), *row[2:]] for row in tables.retrieval_rows(found)]
+    muted = {row[0] for row in rows} - set(study.sources)
+    columns = ["", "query → found", *(f"{k} %" for k in tables.RETRIEVAL)]
+    shown = html.table(columns, rows, muted=muted, label="retrieval")
+    intro = f"Given one image, find its {by} among {num}, each represented by its mean embedding in the other modality."
     return html.paragraph(intro) + html.grid([drawn, shown], "beside")
+
+
+def _why_no_retrieval(study: Study) -> str:
+    if len(study.pack.spec.modalities) < 2:
+        return "the data has one modality"
+    if all(len(run.model.projectors) < 2 for run in study.runs):
+        return "no method here has a space that both modalities share"
+    return f"it takes {MIN_GALLERY} test {study.pack.spec.group_by}s with both modalities, and this data has fewer"
 
 
 # -- while training ---------------------------------------------------------------------------------------------------
@@ -160,102 +157,100 @@ _NOT_LOSS = ("step", "lr", "pairs_per_s", "loss", "eval")
 
 
 def loss(study: Study) -> str:
-    """The total of every run, each method's parts, and the learning rate."""
+    """The total loss of every run, the parts of each method's loss, and the learning rate."""
     series = [(r, [entry for entry in r.log if "loss" in entry]) for r in study.runs]
     series = [(r, entries) for r, entries in series if entries]
     if not series:
         return html.paragraph("The runs left no log lines.")
-
-    def lines(runs: list[tuple[Finished, list[dict[str, Any]]]], key: str, label: str, hue: str) -> list[Line]:
-        return [Line(label or r.source, *_column(entries, key), hue or study.hue(r)) for r, entries in runs]
-
-    drawn = [study.figure("loss", figures.curves("loss", lines(series, "loss", "", "")), "Total loss over the steps")]
+    total = [Line(r.source, *_column(entries, "loss"), study.hue(r)) for r, entries in series]
+    rates = [Line(r.source, *_column(entries, "lr"), study.hue(r)) for r, entries in series]
+    drawn = [study.figure("loss", figures.curves("loss", total), "Total loss over the steps")]
     for source in study.sources:
-        mine = [(r, entries) for r, entries in series if r.source == source]
-        names = [name for name in mine[0][1][0] if name not in _NOT_LOSS] if mine else []
-        if len(names) < 2:
-            continue
-        curves = [line for i, name in enumerate(names) for line in lines(mine, name, name, HUES[i % len(HUES)])]
-        batch, caption, guessing = mine[0][0].run.batch_size, "", {}
-        if set(names) <= {"vv", "tt", "vt", "tv"}:  # InfoNCE knows what guessing within the batch costs
-            guessing = {f"guessing (ln {batch})": math.log(batch)}
-            caption = "vv and tt: within vision and within touch; vt and tv: across, query first."
-        title = "parts of the loss" if len(study.sources) == 1 else f"parts of the loss, {source}"
-        drawing = figures.curves(title, curves, guessing)
-        drawn.append(study.figure(f"loss parts {source}", drawing, f"{title} over the steps", caption))
-    rates = figures.curves("learning rate", lines(series, "lr", "", ""))
-    drawn.append(study.figure("learning rate", rates, "Learning rate over the steps"))
+        drawn += _loss_parts(study, source, [(r, entries) for r, entries in series if r.source == source])
+    drawn.append(study.figure("learning rate", figures.curves("learning rate", rates), "Learning rate over the steps"))
     seeds = " One line per seed." if len(study.runs) > len(study.sources) else ""
-    return html.paragraph(f"A falling loss alone proves nothing: read it with the next section.{seeds}") + html.grid(
-        drawn
-    )
+    intro = f"A falling loss alone proves nothing: read it with the next section.{seeds}"
+    return html.paragraph(intro) + html.grid(drawn)
+
+
+def _loss_parts(study: Study, source: str, series: Sequence[tuple[Finished, list[dict[str, Any]]]]) -> list[str]:
+    """A figure of the parts of one method's loss, if it logged several."""
+    names = [name for name in series[0][1][0] if name not in _NOT_LOSS] if series else []
+    if len(names) < 2:
+        return []
+    lines = [
+        Line(name, *_column(entries, name), HUES[i % len(HUES)])
+        for i, name in enumerate(names)
+        for _, entries in series
+    ]
+    batch, caption, chance = series[0][0].run.batch_size, "", {}
+    if set(names) <= {"vv", "tt", "vt", "tv"}:  # InfoNCE has a known chance level
+        chance = {f"guessing (ln {batch})": math.log(batch)}
+        caption = "vv and tt: within vision and within touch; vt and tv: across, query first."
+    title = "parts of the loss" if len(study.sources) == 1 else f"parts of the loss, {source}"
+    drawing = figures.curves(title, lines, chance)
+    return [study.figure(f"loss parts {source}", drawing, f"{title} over the steps", caption)]
 
 
 def _column(entries: list[dict[str, Any]], key: str) -> tuple[list[float], list[float]]:
-    """Steps and values of the entries that have ``key``."""
+    """Steps and values of the entries with ``key``."""
     have = [entry for entry in entries if key in entry]
-    # five digits, or the noise of float32 would become the axis of a curve that stands still
+    # five digits, or float32 noise would set the axis of a constant curve
     return [entry["step"] for entry in have], [float(f"{entry[key]:.5g}") for entry in have]
 
 
 def collapse(study: Study) -> str:
-    """The panel that training logged on held-out groups: spread, rank, alignment, uniformity, gap, kNN, R@5."""
-    modalities = {m: MODALITY_HUES[m] for m in study.pack.spec.modalities}
-    across = {"vision->touch": "green", "touch->vision": "purple"}
-    panels: list[tuple[str, dict[str, tuple[str, str]], str]] = [
-        (
-            "std of the features",
-            {f"{m}/std": (m, h) for m, h in modalities.items()},
-            "About 1: spread out; 0: collapsed.",
-        ),
-        (
-            "effective rank",
-            {f"{m}/rankme": (m, h) for m, h in modalities.items()},
-            "RankMe; 1: collapsed, higher is richer.",
-        ),
-        (
-            "alignment",
-            {"alignment": ("pairs", "green")},
-            "Squared distance of true pairs; 0: they agree, 2: unrelated.",
-        ),
-        (
-            "uniformity",
-            {f"{m}/uniformity": (m, h) for m, h in modalities.items()},
-            "0: collapsed; −4: all over the sphere.",
-        ),
-        ("modality gap", {"modality gap": ("touch to vision", "green")}, "Distance of the two means; 0: mixed."),
-    ]
-    for task in study.pack.spec.tasks:
-        keys = {f"{m}/knn {task.name}": (m, h) for m, h in modalities.items()}
-        panels.append((f"kNN accuracy, {task.name}", keys, "20 nearest training rows vote; held-out rows, never test."))
-    keys = {f"{d} R@5": (d.replace("->", " → "), h) for d, h in across.items()}
-    panels.append(("retrieval R@5", keys, "Own group among the first five, in the space both share."))
+    """What training measured on held-out groups: std, rank, alignment, uniformity, gap, kNN, R@5."""
     drawn = []
-    for title, keys, caption in panels:
-        lines = []
-        for key, (label, hue) in keys.items():
-            for r in study.runs:
-                steps, values = _column([{"step": e["step"], **e["eval"]} for e in r.log if "eval" in e], key)
-                if steps:
-                    name = label if len(study.sources) == 1 else f"{label}, {r.source}"
-                    dash = figures.DASHES[study.sources.index(r.source) % len(figures.DASHES)]
-                    lines.append(Line(name, steps, values, hue, dash))
-        if lines:
+    for title, keys, caption in _panels(study):
+        if lines := _panel_lines(study, keys):
             drawing = figures.curves(title, lines, _chance(study, title))
             drawn.append(study.figure(title, drawing, f"{title} over the steps. {caption}", caption))
     if not drawn:
         return ""
-    held_out = len(study.pack.rows("val")) > 1
-    where = (
-        f"on {study.pack.spec.group_by}s held out for this (split val)"
-        if held_out
-        else "on training rows (no val split)"
-    )
-    return html.paragraph(f"Measured while training, {where}.") + html.grid(drawn)
+    where = f"{study.pack.spec.group_by}s held out for this (split val)"
+    if len(study.pack.rows("val")) < 2:
+        where = "training rows (no val split)"
+    return html.paragraph(f"Measured while training, on {where}.") + html.grid(drawn)
+
+
+def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
+    """Title, curves (key in the log -> label, hue) and caption of each figure about collapse."""
+
+    def each(name: str) -> dict[str, tuple[str, str]]:
+        return {f"{m}/{name}": (m, MODALITY_HUES[m]) for m in study.pack.spec.modalities}
+
+    across = {
+        f"{d} R@5": (d.replace("->", " → "), hue)
+        for d, hue in {"vision->touch": "green", "touch->vision": "purple"}.items()
+    }
+    knn = "20 nearest training rows vote; held-out rows, never test."
+    return [
+        ("std of the features", each("std"), "About 1: spread out; 0: collapsed."),
+        ("effective rank", each("rankme"), "RankMe; 1: collapsed, higher is richer."),
+        ("alignment", {"alignment": ("pairs", "green")}, "Squared distance of pairs; 0: they agree, 2: unrelated."),
+        ("uniformity", each("uniformity"), "0: collapsed; −4: spread over the sphere."),
+        ("modality gap", {"modality gap": ("touch to vision", "green")}, "Distance of the two means; 0: mixed."),
+        *((f"kNN accuracy, {task.name}", each(f"knn {task.name}"), knn) for task in study.pack.spec.tasks),
+        ("retrieval R@5", across, "Own group among the first five, in the space both share."),
+    ]
+
+
+def _panel_lines(study: Study, keys: dict[str, tuple[str, str]]) -> list[Line]:
+    """A curve per key and run; methods differ by their dashes."""
+    lines = []
+    for key, (label, hue) in keys.items():
+        for r in study.runs:
+            steps, values = _column([{"step": e["step"], **e["eval"]} for e in r.log if "eval" in e], key)
+            if steps:
+                name = label if len(study.sources) == 1 else f"{label}, {r.source}"
+                dash = figures.DASHES[study.sources.index(r.source) % len(figures.DASHES)]
+                lines.append(Line(name, steps, values, hue, dash))
+    return lines
 
 
 def _chance(study: Study, title: str) -> dict[str, float]:
-    """What guessing reaches in a panel, where that is defined."""
+    """The chance level of a figure, if it has one."""
     if title == "retrieval R@5":
         found = [e["eval"]["chance R@5"] for r in study.runs for e in r.log if "chance R@5" in e.get("eval", {})]
         return {"chance": found[0]} if found else {}
@@ -267,11 +262,11 @@ def _chance(study: Study, title: str) -> dict[str, float]:
     return {}
 
 
-# -- what is wrong, and where -----------------------------------------------------------------------------------------
+# -- mistakes -----------------------------------------------------------------------------------------
 
 
 def confusions(study: Study) -> str:
-    """Per task, the first method's confusion on both modalities (else on its best one), summed over seeds."""
+    """The first method's confusion matrix per task, on both modalities or its best one, summed over seeds."""
     source, drawn = study.sources[0], []
     for task, classes in study.result["classes"].items():
         if source not in {s for cells in study.result["summary"].get(task, {}).values() for s in cells}:
@@ -287,12 +282,12 @@ def confusions(study: Study) -> str:
         drawn.append(study.figure(f"confusion {task}", drawing, alt, caption))
     if not drawn:
         return ""
-    intro = f"Each row is a true class and sums to 100 %: blue is right, orange is taken for something else ({source})."
+    intro = f"Each row is a true class and sums to 100 %: blue is correct, orange is a mistake ({source})."
     return html.paragraph(intro) + html.grid(drawn)
 
 
 def headline(study: Study, task: str) -> tuple[str, dict[str, float], dict[str, dict[str, float]]]:
-    """The modality to name (both, else the best), the first method's score on it, and the controls beside it."""
+    """The modality to show (both, else the best), the first method's score on it, and those of the controls."""
     found, source = study.result["summary"][task], study.sources[0]
     have = [m for m in tables.columns_of(found) if source in found[m]]
     modality = "both" if "both" in have else max(have, key=lambda m: found[m][source]["mean"])

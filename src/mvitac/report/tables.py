@@ -1,23 +1,28 @@
-"""Probe results as tables for a terminal 80 columns wide, and as Markdown for docs/results."""
+"""Probe results as tables for a terminal 80 columns wide, and the rows that every table of results shares."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from mvitac.evaluation.scores import interval
+
 MODALITY_ORDER = ("none", "touch", "vision", "both")
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
+RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
+"""Columns of a retrieval table, in percent."""
 
 
 def columns_of(task: dict[str, Any]) -> list[str]:
-    """The modalities of one task's summary, in reading order; "none" (majority and the like) has no column of its own."""
+    """The modalities of one task's summary in reading order, without "none" (majority and the like)."""
     return [m for m in MODALITY_ORDER if m in task and m != "none"]
 
 
 def sources_of(task: dict[str, Any]) -> list[str]:
-    """Methods first (in order of appearance), then controls from the strongest idea to the weakest."""
+    """Methods in order of appearance, then controls from the strongest idea to the weakest."""
     last = ("imagenet", "untrained", "pixels", "border")
     found = list(dict.fromkeys(source for modality in task.values() for source in modality))
     fixed = list(task.get("none", {}))
@@ -25,16 +30,19 @@ def sources_of(task: dict[str, Any]) -> list[str]:
     return [*own, *(s for s in last if s in found), *sorted(fixed, key=lambda s: s == "majority")]
 
 
+def percent(mean: float, low: float, high: float) -> str:
+    """A score and its interval, such as '57.6 [55.1, 60.2]'."""
+    return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
 def cell(task: dict[str, Any], source: str, modality: str) -> str:
-    """'57.6 [55.1, 60.2]' in percent, or '' where there is nothing; controls without features stand in every column."""
+    """The score of one source, or '' if it has none. Controls without features appear in every column."""
     value = task.get(modality, {}).get(source) or task.get("none", {}).get(source)
-    if value is None:
-        return ""
-    return f"{100 * value['mean']:.1f} [{100 * value['low']:.1f}, {100 * value['high']:.1f}]"
+    return percent(value["mean"], value["low"], value["high"]) if value else ""
 
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
-    """One table per task: accuracy in percent, mean and 95 % interval."""
+    """Print one table per task: accuracy in percent, mean and 95 % interval."""
     for name, task in result["summary"].items():
         modalities = columns_of(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
@@ -52,46 +60,37 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
 
 
 def print_retrieval(result: dict[str, Any], console: Console) -> None:
-    """Cross-modal retrieval as one table, if the methods have a shared space."""
+    """Print cross-modal retrieval as one table, if the methods have a shared space."""
     if not result["retrieval"]:
         return
     table = Table(title=f"retrieval over unseen {result['group_by']}s", title_justify="left", title_style="bold")
-    for column in ("", "query -> found", "R@1 %", "R@5 %", "R@10 %", "chance R@5 %"):
-        table.add_column(column, justify="left" if column in ("", "query -> found") else "right")
-    for (source, direction), values in retrieval_means(result["retrieval"]).items():
-        numbers = [f"{100 * values[k]:.1f}" for k in ("R@1", "R@5", "R@10", "chance R@5")]
-        table.add_row(source, direction, *numbers)
+    table.add_column("")
+    table.add_column("query -> found")
+    for column in RETRIEVAL:
+        table.add_column(f"{column} %", justify="right")
+    for row in retrieval_rows(result["retrieval"]):
+        table.add_row(*row)
     console.print(table)
 
 
-def retrieval_means(records: list[dict[str, Any]]) -> dict[tuple[str, str], dict[str, float]]:
-    """(source, direction) -> R@k averaged over seeds."""
-    gathered: dict[tuple[str, str], list[dict[str, Any]]] = {}
+def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Rows of source, direction and ``RETRIEVAL`` in percent, averaged over seeds."""
+    rows = []
+    for (source, direction), found in by_direction(records).items():
+        rows.append([source, direction, *(f"{100 * recall(found, key):.1f}" for key in RETRIEVAL)])
+    return rows
+
+
+def recall(records: Sequence[dict[str, Any]], key: str) -> float:
+    """Mean over seeds of one of ``RETRIEVAL``; R@5 from its counts, so that it equals the mean of its interval."""
+    if key == "R@5":
+        return interval(records)[0]
+    return sum(r[key] for r in records) / len(records)
+
+
+def by_direction(records: Sequence[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """(source, direction) -> the retrieval records of its seeds."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in records:
-        gathered.setdefault((record["source"], record["direction"]), []).append(record)
-    keys = ("R@1", "R@5", "R@10", "chance R@5")
-    return {key: {k: sum(r[k] for r in found) / len(found) for k in keys} for key, found in gathered.items()}
-
-
-def markdown(result: dict[str, Any]) -> str:
-    """The same tables as Markdown."""
-    lines = []
-    for name, task in result["summary"].items():
-        modalities = columns_of(task)
-        lines += [
-            f"**{name}** (accuracy %)",
-            "",
-            f"| | {' | '.join(modalities)} |",
-            f"|---{'|---:' * len(modalities)}|",
-        ]
-        for source in sources_of(task):
-            lines.append(f"| {source} | {' | '.join(cell(task, source, m) for m in modalities)} |")
-        lines.append("")
-    if result["retrieval"]:
-        lines += ["| retrieval | | R@1 % | R@5 % | R@10 % | chance R@5 % |", "|---|---|---:|---:|---:|---:|"]
-        for (source, direction), values in retrieval_means(result["retrieval"]).items():
-            numbers = " | ".join(f"{100 * values[k]:.1f}" for k in ("R@1", "R@5", "R@10", "chance R@5"))
-            lines.append(f"| {source} | {direction} | {numbers} |")
-        lines.append("")
-    lines += [f"Note: {note}." for note in result.get("notes", ())]
-    return "\n".join(lines)
+        found.setdefault((record["source"], record["direction"]), []).append(record)
+    return found

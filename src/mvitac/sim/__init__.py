@@ -1,1 +1,1 @@
-"""Simulated visual-tactile data: object reliefs, gel optics and the data sets made from them (numpy and scipy only)."""
+"""Simulated visual-tactile data: reliefs, gel optics, materials and grasps (numpy, scipy and MuJoCo)."""

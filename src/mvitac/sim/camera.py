@@ -1,11 +1,11 @@
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
-"""A camera by ray casting (MuJoCo's rays, no OpenGL) with its own shading: lamp, shadow, gloss, print, table and wall.
+"""A camera that uses MuJoCo's ray casting (no OpenGL) and its own shading: lamp, shadow, gloss, print, table and wall.
 
-Everything here but the thing and the gripper's pose is a nuisance: viewpoint, lamp, colours, table, wall and clutter
-change from grasp to grasp and say nothing about the outcome.
+Only the object and the gripper's pose carry information. Viewpoint, lamp, colours, table, wall and clutter are random in
+each grasp and independent of the outcome.
 
-Shapes: P rays (pixels times samples), colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
+Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ SAMPLES = 2
 TABLES = ("plain", "checker", "planks", "marble", "dots")
 
 VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
-"""Geom groups the camera sees; the plain collision bars of the fingers are not drawn."""
+"""Geom groups that the camera sees; the collision bars of the fingers are not drawn."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One photograph's nuisances."""
+    """The random properties of one picture that are independent of the outcome."""
 
     position: np.ndarray
     """Camera position [3]."""
     target: np.ndarray
-    """Point [3] in the middle of the picture."""
+    """Point [3] in the centre of the picture."""
     roll: float
     half_fov: float
     """Tangent of half the field of view."""
@@ -54,13 +54,13 @@ class View:
     gripper_color: np.ndarray
     gel_color: np.ndarray
     clutter_poses: np.ndarray
-    """[clutter, 7]: position and quaternion; what is absent lies far under the table."""
+    """[clutter, 7]: position and quaternion; absent objects are far below the table."""
     clutter_colors: np.ndarray
     noise: float
 
 
 def draw_view(rng: np.random.Generator) -> View:
-    """Draw the nuisances of one grasp."""
+    """Draw the view of one grasp."""
     azimuth = np.deg2rad(-18 + rng.normal(0, 4))
     elevation = np.deg2rad(33 + rng.normal(0, 3))
     distance = 0.46 * rng.uniform(0.95, 1.08)
@@ -68,16 +68,7 @@ def draw_view(rng: np.random.Generator) -> View:
     forward = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     angle = azimuth + rng.uniform(-1.6, 1.6)
     lamp = np.array([np.cos(angle), np.sin(angle), rng.uniform(0.7, 1.8)]) * rng.uniform(0.6, 1.0)
-    poses = np.zeros((len(objects.CLUTTER), 7))
-    for pose in poses:
-        # Behind the gripper, seen from the camera, or well to one side: clutter never hides the thing.
-        where = azimuth + np.pi + rng.uniform(-1.15, 1.15)
-        far = rng.uniform(0.15, 0.30)
-        pose[:3] = far * np.cos(where), far * np.sin(where), rng.uniform(0.015, 0.05)
-        if rng.random() < 0.7:
-            pose[2] = -5.0
-        pose[3:] = rng.normal(size=4)
-        pose[3:] /= np.linalg.norm(pose[3:])
+    poses = _clutter(azimuth, rng)
     tint = rng.normal(1, 0.10, 3)
     return View(
         position=target + distance * forward,
@@ -102,6 +93,20 @@ def draw_view(rng: np.random.Generator) -> View:
     )
 
 
+def _clutter(azimuth: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw poses [clutter, 7] behind the gripper or at its side, seen from ``azimuth``: nothing hides the object."""
+    poses = np.zeros((len(objects.CLUTTER), 7))
+    for pose in poses:
+        where = azimuth + np.pi + rng.uniform(-1.15, 1.15)
+        far = rng.uniform(0.15, 0.30)
+        pose[:3] = far * np.cos(where), far * np.sin(where), rng.uniform(0.015, 0.05)
+        if rng.random() < 0.7:
+            pose[2] = -5.0
+        pose[3:] = rng.normal(size=4)
+        pose[3:] /= np.linalg.norm(pose[3:])
+    return poses
+
+
 def _pair(rng: np.random.Generator) -> np.ndarray:
     """Draw two related colours [2, 3]."""
     color = rng.uniform(0.25, 0.85) * rng.normal(1, 0.12, 3)
@@ -111,7 +116,7 @@ def _pair(rng: np.random.Generator) -> np.ndarray:
 def photograph(
     model: mujoco.MjModel, data: mujoco.MjData, thing: objects.Thing, view: View, rng: np.random.Generator, *, size: int
 ) -> np.ndarray:
-    """Return the picture [size, size, 3], uint8. Moves the clutter; ``rng`` is for the pixel noise alone."""
+    """Return the picture, uint8 [size, size, 3]. Moves the clutter; ``rng`` is used for pixel noise only."""
     data.mocap_pos[:], data.mocap_quat[:] = view.clutter_poses[:, :3], view.clutter_poses[:, 3:]
     mujoco.mj_kinematics(model, data)
     rays = _rays(view, size * SAMPLES)
@@ -156,7 +161,7 @@ def _rays(view: View, side: int) -> np.ndarray:
 def cast(
     model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray, groups: np.ndarray = VISIBLE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return geom [P] (-1: none), distance [P] (0 there) and normal [P, 3] of the first hit of each ray."""
+    """Return geom [P] (-1: none), distance [P] (0 if none) and normal [P, 3] of the first hit of each ray."""
     count = len(rays)
     geom, distance = np.full(count, -1, np.int32), np.zeros(count)
     normal = np.zeros(3 * count)
@@ -169,7 +174,7 @@ def cast(
 def _shadow(
     model: mujoco.MjModel, data: mujoco.MjData, lamp: np.ndarray, points: np.ndarray, lit: np.ndarray
 ) -> np.ndarray:
-    """Return which of the points [P, 3] the lamp does not reach; only those in ``lit`` are asked."""
+    """Return which of the points [P, 3] are in shadow; only those in ``lit`` are tested."""
     away = points[lit] - lamp
     length = np.linalg.norm(away, axis=1)
     geom, distance, _ = cast(model, data, lamp, away / length[:, None])
@@ -187,19 +192,8 @@ def _surface(
     points: np.ndarray,
     rays: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return colour [P, 3], gloss [P] and own light [P] of what each ray has hit."""
-    names = [model.geom(i).name for i in range(model.ngeom)]
-    color = np.tile(view.gripper_color, (model.ngeom, 1))
-    shine, own = np.full(model.ngeom, 0.25), np.zeros(model.ngeom)
-    for i, name in enumerate(names):
-        if name.endswith("_pad"):
-            color[i], own[i] = view.gel_color, 0.6
-        elif name == "table":
-            shine[i] = 0.05
-    mocap = model.body_mocapid[model.geom_bodyid]
-    color[mocap >= 0] = view.clutter_colors[mocap[mocap >= 0]]
-    albedo, gloss, glow = color[geom], shine[geom], own[geom]
-
+    """Return colour [P, 3], gloss [P] and emitted light [P] of the surface that each ray hits."""
+    albedo, gloss, glow = (values[geom] for values in _finishes(model, view))
     body = model.body("thing").id
     for part, i in zip(thing.parts, np.flatnonzero(model.geom_bodyid == body), strict=True):
         seen = geom == i
@@ -221,8 +215,23 @@ def _surface(
     return albedo, gloss, glow
 
 
+def _finishes(model: mujoco.MjModel, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return colour [geoms, 3], gloss [geoms] and emitted light [geoms] of gripper, gels, table and clutter."""
+    color = np.tile(view.gripper_color, (model.ngeom, 1))
+    gloss, glow = np.full(model.ngeom, 0.25), np.zeros(model.ngeom)
+    for i in range(model.ngeom):
+        name = model.geom(i).name
+        if name.endswith("_pad"):
+            color[i], glow[i] = view.gel_color, 0.6
+        elif name == "table":
+            gloss[i] = 0.05
+    mocap = model.body_mocapid[model.geom_bodyid]
+    color[mocap >= 0] = view.clutter_colors[mocap[mocap >= 0]]
+    return color, gloss, glow
+
+
 def _table(view: View, points: np.ndarray) -> np.ndarray:
-    """Return the table's colour [P, 3] at points of its plane."""
+    """Return the colour [P, 3] of the table at points of its plane."""
     cos, sin = np.cos(view.table_turn), np.sin(view.table_turn)
     x = (cos * points[:, 0] + sin * points[:, 1]) / view.table_scale
     y = (cos * points[:, 1] - sin * points[:, 0]) / view.table_scale
@@ -241,7 +250,7 @@ def _table(view: View, points: np.ndarray) -> np.ndarray:
 
 
 def _wall(view: View, rays: np.ndarray) -> np.ndarray:
-    """Return the backdrop's colour [P, 3] in direction of the rays."""
+    """Return the colour [P, 3] of the background in the direction of the rays."""
     bottom, top, stain = view.wall_colors
     height = np.clip(rays[:, 2:] * 1.5 + 0.6, 0, 1)
     spot = np.exp(-6 * (1 - rays @ (view.wall_stain / np.linalg.norm(view.wall_stain))))[:, None]

@@ -1,4 +1,4 @@
-"""A contact sheet of the simulated materials: every class, a few instances, camera and gel side by side."""
+"""Contact sheet of the simulated materials: a few instances of every class, camera and gel side by side."""
 
 from pathlib import Path
 from typing import BinaryIO
@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 
 from mvitac.sim.materials import CLASSES, touch
 
-_LABEL = 14  # pixels for a class name
+_LABEL = 14  # height of a class name in pixels
 
 
 def contact_sheet(
@@ -18,7 +18,7 @@ def contact_sheet(
     wide = instances * (2 * size + 4) + 8
     if wide * columns > 1600:
         raise ValueError(
-            f"{columns} classes of {instances} pairs at {size} px need {wide * columns} > 1600 px: lower one"
+            f"{columns} classes of {instances} pairs at {size} px need {wide * columns} > 1600 px: reduce one of them"
         )
     rows = -(-len(CLASSES) // columns)
     sheet = Image.new("RGB", (wide * columns, rows * (size + _LABEL + 4)), "white")

@@ -1,15 +1,15 @@
-"""The optics of a camera-based tactile sensor: a surface is pressed into a gel, a camera behind the gel looks at it.
+"""Optics of a camera-based tactile sensor: an object is pressed into a gel, and a camera behind the gel sees the imprint.
 
-Legend: H, W pixels of a height map, row 0 at the top, x to the right, y down; heights and imprints in mm, forces in N.
+Shapes: H, W pixels of a height map, row 0 at the top, x to the right, y down; heights and imprints in mm, forces in N.
 
-    press()       object relief [H, W] mm  ->  imprint [H, W] mm (how far the gel is pushed towards the camera)
+    press()       object relief [H, W] mm  ->  imprint [H, W] mm (displacement of the gel towards the camera)
     render()      imprint [H, W] mm        ->  picture [H, W, 3] uint8 of one `Sensor`
-    background()  the same sensor, untouched
+    background()  the same sensor without contact
 
 The gel is a Winkler foundation, independent springs (Johnson, Contact Mechanics, 1985, section 4.3), under a membrane.
-Colour follows slope almost linearly and saturates: gels are painted matt and lit at a grazing angle, one colour of LED
-per side, so a Lambertian model with an overhead term is far too grey (compare Johnson and Adelson, CVPR 2009). Levels,
-palettes and dots of `SENSORS` were set by eye beside pictures of real sensors; no real picture is used or needed here.
+Colour is almost linear in slope and saturates: gels have matt paint and are lit at a grazing angle, with one colour of LED
+per side. A Lambertian model with an overhead term is much too grey (compare Johnson and Adelson, CVPR 2009). Levels, colours
+and dots of `SENSORS` were set by eye, by comparison with pictures of real sensors; no real picture is used.
 """
 
 from functools import lru_cache
@@ -30,10 +30,10 @@ GEL_STIFFNESS = 0.06
 """Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm."""
 
 MEMBRANE_MM = (0.12, 0.35, 0.9)
-"""Radii over which the membrane bridges what the springs leave open (by eye, from the halo around real imprints)."""
+"""Radii over which the membrane bridges gaps (set by eye, from the halo around real imprints)."""
 
 MEMBRANE_SAG = 0.8
-"""How far the bridge stays up: the gel behind it pushes it back into the gap, so shallow grooves stay visible."""
+"""Relative height of the bridge: the gel behind pushes the membrane into the gap, so shallow grooves remain visible."""
 
 _TAG = 0x6E1
 
@@ -49,8 +49,8 @@ def pressure(
 ) -> F:
     """Return the contact pressure [H, W] in N/mm^2 whose integral over the picture is `force_n`.
 
-    Object and gel are springs in series under every pixel; the approach that balances the force is found exactly:
-    with the gaps sorted, pressure is linear in the approach between two neighbouring gaps.
+    Object and gel are springs in series at every pixel. The approach that balances the force is exact: with sorted gaps,
+    pressure is linear in the approach between two neighbouring gaps.
     """
     if relief_mm.ndim != 2:
         raise ValueError(f"relief_mm must be [H, W], got shape {relief_mm.shape}: pass one height map in mm")
@@ -62,16 +62,16 @@ def pressure(
     if force_n == 0:
         return np.zeros(relief_mm.shape, np.float32)
     height = np.array(relief_mm, np.float64)
-    if dome_radius_mm is not None:  # a domed gel touches first in its middle
+    if dome_radius_mm is not None:  # a domed gel touches first at its centre
         x, y = _axes_mm(height.shape, pixel_mm)
         height -= (x * x + y * y) / (2 * dome_radius_mm)
-    # -inf marks "no object here"; anything 50 mm down is as good as that and keeps the arithmetic finite
+    # -inf means "no object here"; a gap of 50 mm is equivalent and keeps the arithmetic finite
     gap = np.minimum(height.max() - height, 50.0)
     spring = stiffness * gel_stiffness / (stiffness + gel_stiffness) * pixel_mm**2  # N per mm and pixel
     gaps = np.sort(gap, axis=None)
     count = np.arange(1, gaps.size + 1)
     approach = (force_n / spring + np.cumsum(gaps)) / count  # if exactly the first `count` pixels touch
-    touching = int(np.argmax(np.append(gaps[1:], np.inf) >= approach))  # the first count that is consistent
+    touching = int(np.argmax(np.append(gaps[1:], np.inf) >= approach))  # first consistent count
     overlap = np.maximum(approach[touching] - gap, 0.0)
     return (overlap * (spring / pixel_mm**2)).astype(np.float32)
 
@@ -85,11 +85,21 @@ def press(
     dome_radius_mm: float | None = 25.0,
     gel_stiffness: float = GEL_STIFFNESS,
 ) -> F:
-    """Return the imprint [H, W] in mm that `relief_mm` (higher = nearer to the gel, -inf = nothing) leaves in the gel.
+    """Press an object into the gel.
 
-    `stiffness` is the object's own Winkler modulus in N/mm^3 (foam 0.01, wood above 10; 1e3 is rigid).
-    A soft object shares the deformation, so its contact is wider, shallower and flatter at the same force.
-    `dome_radius_mm=None` is a flat gel; a flat pad on a flat face leaves a nearly blank picture, real gels are domed.
+    A soft object deforms, too, so its contact is wider, shallower and flatter at the same force.
+
+    Args:
+        relief_mm: Object height [H, W]; higher = nearer to the gel, -inf = no object.
+        force_n: Contact force in N.
+        stiffness: Winkler modulus of the object in N/mm^3 (foam 0.01, wood above 10; 1e3 is rigid).
+        pixel_mm: Size of a pixel in mm.
+        dome_radius_mm: Radius of the gel's dome; None = flat. Real gels are domed; a flat pad on a flat face gives a nearly
+            blank picture.
+        gel_stiffness: Winkler modulus of the gel in N/mm^3.
+
+    Returns:
+        The imprint [H, W] in mm.
     """
     p = pressure(
         relief_mm,
@@ -103,11 +113,11 @@ def press(
 
 
 def relax(indent_mm: F, *, pixel_mm: float) -> F:
-    """Let the membrane bridge gaps: max(p, sag * blur(p)) from fine to coarse, [H, W] mm to [H, W] mm."""
+    """Model the membrane, which bridges gaps: max(p, sag * blur(p)) from fine to coarse, [H, W] mm to [H, W] mm."""
     surface = indent_mm
     for radius in MEMBRANE_MM:
         surface = np.maximum(surface, np.float32(MEMBRANE_SAG) * _blur(surface, radius / pixel_mm))
-    return gaussian_filter(surface, 0.07 / pixel_mm, mode="nearest")  # the paint layer rounds off what is left
+    return gaussian_filter(surface, 0.07 / pixel_mm, mode="nearest")  # the paint layer smooths the rest
 
 
 def render(
@@ -121,21 +131,30 @@ def render(
     unit: int | None = None,
     gain: float = 1.0,
 ) -> NDArray[np.uint8]:
-    """Draw the imprint [H, W] mm as `sensor` sees it: uint8 [h, w, 3], where (h, w) is `size` or (H, W).
+    """Render an imprint as a sensor sees it.
 
-    `unit` picks one physical copy of the sensor (its dots, dirt, scratches, tint): give it to draw several pictures
-    with the same one, then only camera noise comes from `rng`; None draws a copy from `rng`. `shear_mm` drags the dots
-    inside the contact along (x, y). `gain` scales the colour response to slope (LED current, paint).
+    Args:
+        imprint_mm: Imprint [H, W] in mm.
+        sensor: The sensor model.
+        rng: Random generator of camera noise, and of the unit if `unit` is None.
+        pixel_mm: Size of a pixel in mm.
+        shear_mm: Displacement (x, y) of the dots inside the contact.
+        size: Output size (h, w), or one number for both; default: (H, W).
+        unit: Number of a physical copy of the sensor with its own dots, dirt, scratches and tint. Give it to render several
+            pictures with the same copy.
+        gain: Factor of the colour response to slope (LED current, paint).
+
+    Returns:
+        The picture, uint8 [h, w, 3].
     """
     if imprint_mm.ndim != 2:
-        raise ValueError(f"imprint_mm must be [H, W], got shape {imprint_mm.shape}: pass what press() returned")
+        raise ValueError(f"imprint_mm must be [H, W], got shape {imprint_mm.shape}: pass the result of press()")
     if unit is None:
         unit = int(rng.integers(2**31))
     if unit < 0:
         raise ValueError(f"unit must be a number >= 0 that names one copy of the sensor, got {unit}")
-    copy, paint = np.random.default_rng([_TAG, *sensor.name.encode(), unit]).spawn(
-        2
-    )  # a copy is the same at every size
+    # A copy has the same properties at every size.
+    copy, paint = np.random.default_rng([_TAG, *sensor.name.encode(), unit]).spawn(2)
     imprint = imprint_mm.astype(np.float32)
     picture = _illuminate(imprint, sensor, copy, paint, pixel_mm, gain)
     if sensor.marker_pitch_mm:
@@ -151,14 +170,14 @@ def render(
 def background(
     sensor: Sensor, rng: np.random.Generator, *, size: int | Pair, pixel_mm: float = 0.09, unit: int | None = None
 ) -> NDArray[np.uint8]:
-    """Draw the untouched sensor: uint8 [h, w, 3] for `size` = h = w or (h, w); `unit` as in `render`."""
+    """Render the sensor without contact: uint8 [h, w, 3] for `size` = h = w or (h, w); `unit` as in `render`."""
     h, w = (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
     return render(np.zeros((h, w), np.float32), sensor, rng, pixel_mm=pixel_mm, unit=unit)
 
 
 def area_resize(picture: F, height: int, width: int) -> F:
-    """Average [H, W, C] down to [height, width, C], every source pixel counted with the area it covers."""
-    if picture.shape[:2] == (2 * height, 2 * width):  # the common case: one rounding per sum of two halves in any order
+    """Average [H, W, C] to [height, width, C]; each source pixel is weighted by the area it covers."""
+    if picture.shape[:2] == (2 * height, 2 * width):  # common case: the rounding does not depend on the order
         half = np.float32(0.5) * picture
         tall = half[0::2] + half[1::2]
         tall *= np.float32(0.5)
@@ -170,9 +189,9 @@ def area_resize(picture: F, height: int, width: int) -> F:
 def _illuminate(
     imprint: F, sensor: Sensor, copy: np.random.Generator, paint: np.random.Generator, pixel_mm: float, gain: float
 ) -> F:
-    """Return float levels [H, W, 3]: resting light, plus the odd response to slope, minus what ridges shadow."""
+    """Return float levels [H, W, 3]: light without contact, plus the response to slope, minus shadows of ridges."""
     u, v = _axes_unit(imprint.shape)
-    # paint is never even: a faint grain of slope, and each copy has its own LED balance and slightly shifted glow
+    # paint is uneven: a faint grain of slope; each copy has its own LED balance and a slightly shifted glow
     grain = gaussian_filter(paint.standard_normal(imprint.shape, np.float32), 1.0) * np.float32(0.0035)
     surface = imprint + grain
     gy, gx = np.gradient(surface, np.float32(pixel_mm))
@@ -185,7 +204,7 @@ def _illuminate(
         spot = np.exp(-(((u - cu - shift[c, 0]) / su) ** 2)) * np.exp(-(((v - cv - shift[c, 1]) / sv) ** 2))
         rest = (sensor.base[c] + height * spot + sensor.tilt[c][0] * u + sensor.tilt[c][1] * v) * balance[c]
         rx, ry = sensor.response[c]
-        lit = np.sqrt(np.maximum(rest, 4.0) / (sensor.base[c] + 0.6 * height))  # little light, little response
+        lit = np.sqrt(np.maximum(rest, 4.0) / (sensor.base[c] + 0.6 * height))  # the response decreases with light
         slope = (gx * np.float32(rx * gain) + gy * np.float32(ry * gain)) / np.float32(sensor.saturation)
         change = np.tanh(slope) * lit.astype(np.float32) * np.float32(sensor.saturation)
         if touched and sensor.shadow:
@@ -195,13 +214,13 @@ def _illuminate(
 
 
 def _shadow(imprint: F, towards: Pair, pixel_mm: float) -> F:
-    """Return 0..1 [H, W]: how much of the LED in direction `towards` is hidden by higher ground on the way."""
+    """Return 0..1 [H, W], the part of the LED in direction `towards` that is hidden by higher points."""
     length = float(np.hypot(*towards))
     blocked = np.zeros(imprint.shape, np.float32)
     for distance in (0.35, 0.8):
         dx = round(distance * towards[0] / length / pixel_mm)
         dy = round(distance * towards[1] / length / pixel_mm)
-        ahead = np.roll(imprint, (-dy, -dx), axis=(0, 1))  # what wraps around at the rim is lens edge anyway
+        ahead = np.roll(imprint, (-dy, -dx), axis=(0, 1))  # wrapped pixels at the rim are covered by the lens edge
         np.maximum(blocked, ahead - imprint - np.float32(0.3 * distance), out=blocked)
     return 1 - np.exp(blocked * np.float32(-4.0))
 
@@ -209,12 +228,12 @@ def _shadow(imprint: F, towards: Pair, pixel_mm: float) -> F:
 def _draw_markers(
     picture: F, imprint: F, sensor: Sensor, copy: np.random.Generator, pixel_mm: float, shear_mm: Pair
 ) -> None:
-    """Ink the dots into [H, W, 3] levels in place; they ride on the gel, so contact drags and spreads them."""
+    """Draw the dots into levels [H, W, 3] in place. They move with the gel, so contact drags and spreads them."""
     x, y = _axes_mm(imprint.shape, pixel_mm)
     push = _blur(imprint, 0.8 / pixel_mm)
     grip = push / (push + np.float32(0.08))
     spread_y, spread_x = np.gradient(push, np.float32(pixel_mm))
-    x = x - grip * np.float32(shear_mm[0]) + spread_x * np.float32(0.2)  # gel flows away from where it is pushed
+    x = x - grip * np.float32(shear_mm[0]) + spread_x * np.float32(0.2)  # the gel flows away from the contact
     y = y - grip * np.float32(shear_mm[1]) + spread_y * np.float32(0.2)
     pitch = sensor.marker_pitch_mm * np.exp(copy.normal(0.0, 0.08))
     angle = np.deg2rad(sensor.marker_angle_deg + copy.normal(0.0, 2.0))
@@ -229,7 +248,7 @@ def _draw_markers(
     squash = np.exp(copy.normal(0.0, 0.05 + 0.25 * wear, 4096))
     skew = copy.normal(0.0, 0.3 * wear, 4096)
     ink = np.clip(copy.normal(0.88 - 0.1 * wear, 0.04 + 0.2 * wear, 4096), 0.1, 1.0)
-    bite = copy.uniform(-1.6, 1.6, (2, 4096))  # a worn dot has lost a disc of ink somewhere
+    bite = copy.uniform(-1.6, 1.6, (2, 4096))  # a worn dot has lost a disc of ink
     lost = copy.random(4096) < wear * 0.5
     dx, dy = (i - fi - np.float32(0.5) - jitter[0][cell]), (j - fj - np.float32(0.5) - jitter[1][cell])
     scale = np.float32(pitch) / radius.astype(np.float32)[cell]
@@ -246,19 +265,19 @@ def _draw_markers(
 
 
 def _disc(square: F, soft: F | np.float32) -> F:
-    """Return the soft inside of a disc of radius 1 from squared distances [H, W]."""
+    """Return the inside of a disc of radius 1 with a soft edge, from squared distances [H, W]."""
     return np.clip((1 - np.sqrt(np.maximum(square, 0))) / (2 * soft) + np.float32(0.5), 0, 1)
 
 
 def _soil(picture: F, sensor: Sensor, copy: np.random.Generator, pixel_mm: float) -> None:
-    """Add specks, scratches and the lens edge to levels [H, W, 3] in place."""
+    """Add dirt, scratches and the lens edge to levels [H, W, 3] in place."""
     h, w = picture.shape[:2]
     x, y = _axes_mm((h, w), pixel_mm)
     reach = 3 * max(pixel_mm, 0.12)
     for _ in range(copy.poisson(sensor.dirt)):
         cx, cy = copy.uniform(-0.5, 0.5, 2) * (w, h) * pixel_mm
         r = 0.04 + 0.1 * copy.random() ** 3
-        dark = copy.uniform(-0.55, 0.2)  # mostly dark fluff, now and then a glint
+        dark = copy.uniform(-0.55, 0.2)  # mostly dark, sometimes bright
         a, b = round((cy - r - reach) / pixel_mm + h / 2), round((cy + r + reach) / pixel_mm + h / 2)
         c, d = round((cx - r - reach) / pixel_mm + w / 2), round((cx + r + reach) / pixel_mm + w / 2)
         box = np.s_[max(a, 0) : max(b, 0), max(c, 0) : max(d, 0)]
@@ -283,14 +302,14 @@ def _soil(picture: F, sensor: Sensor, copy: np.random.Generator, pixel_mm: float
 
 
 def _blur(surface: F, sigma_px: float) -> F:
-    """Blur [H, W] by about `sigma_px`; two box passes cost the same at every radius."""
+    """Blur [H, W] by about `sigma_px` with two box filters, whose cost does not depend on the radius."""
     width = max(3, 2 * round(sigma_px * 1.22) + 1)
     return uniform_filter(uniform_filter(surface, width, mode="nearest"), width, mode="nearest")
 
 
 @lru_cache(maxsize=16)
 def _axes_mm(shape: tuple[int, ...], pixel_mm: float) -> tuple[F, F]:
-    """Return x [1, W] and y [H, 1] in mm from the middle of the picture."""
+    """Return x [1, W] and y [H, 1] in mm from the centre of the picture."""
     h, w = shape
     x = (np.arange(w, dtype=np.float32) - (w - 1) / 2) * np.float32(pixel_mm)
     y = (np.arange(h, dtype=np.float32) - (h - 1) / 2) * np.float32(pixel_mm)
@@ -308,7 +327,7 @@ def _axes_unit(shape: tuple[int, ...]) -> tuple[F, F]:
 
 @lru_cache(maxsize=32)
 def _area_weights(source: int, target: int) -> F:
-    """Return [target, source]: row t averages the source pixels that target pixel t covers."""
+    """Return weights [target, source]: row t averages the source pixels that target pixel t covers."""
     edges = np.linspace(0, source, target + 1)
     start, stop, pixel = edges[:-1, None], edges[1:, None], np.arange(source)[None]
     covered = np.clip(np.minimum(stop, pixel + 1) - np.maximum(start, pixel), 0, None)

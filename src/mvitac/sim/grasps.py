@@ -1,26 +1,27 @@
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
-"""Simulated grasps: a parallel jaw with two gels and a camera tries to lift a thing; was it lifted and still held?
+"""Simulated grasps: a parallel gripper with two gels and a camera tries to lift an object; the label is success.
 
-A stand-in for "The Feeling of Success" (Calandra et al., CoRL 2017) with the same shape: about 106 objects, 50 grasps
-each, one camera picture and two tactile pictures before the fingers close, during the grip (closed, not lifted) and
-after the lift. It is a simulation: numbers from it are never to be set beside the real data's. 'after' shows the
-outcome and 'before' shows no contact, so a probe reads 'during'. Split by object, never by grasp.
+The format is that of "The Feeling of Success" (Calandra et al., CoRL 2017): about 106 objects with 50 grasps each, one
+camera picture and two tactile pictures before the fingers close, during the grip (closed, not lifted) and after the lift.
+Results are not comparable with those on real data. 'after' shows the outcome and 'before' shows no contact, so probes use
+'during'. Split by object, never by grasp.
 
-The outcome is physics, and what decides it is half seen, half felt: how far from the centre of mass the fingers grip
-(camera), and whether the patch of skin under them grips or slides (gels: `mvitac.sim.skin.Patch`). How big and bright
-the imprint is says nothing: the hand knows the weight and presses as hard as a middling friction would need. Shape, mass,
-sensor copy, lamp, colours, table, wall, clutter and viewpoint change and mean nothing by themselves.
+The outcome is computed by physics and has two factors: the distance of the grip from the centre of mass (camera), and
+whether the skin under the fingers grips or slides (gels: `mvitac.sim.skin.Patch`). Size and brightness of the imprint carry
+no information, because the hand knows the weight and presses as hard as a medium friction needs. Shape, mass, sensor copy,
+lamp, colours, table, wall, clutter and viewpoint are random.
 
-The generator was made by one rule: supervised at least 20 points above an untrained trunk and below 97 %, touch and
-vision, unseen objects (docs/simulator.md). It is frozen: a change of anything a picture or label depends on raises
+The generator was designed by one rule: on unseen objects, with touch and vision, a supervised model is at least 20 points
+above an untrained trunk and below 97 % (docs/simulator.md). It is frozen: every change of a picture or label increases
 VERSION.
 
-Every item is a function of (seed, object, grasp) alone.
+Every item is a function of (seed, object, grasp).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -38,35 +39,35 @@ __all__ = ["NUM_GRASPS", "NUM_OBJECTS", "PHASES", "VERSION", "contact_sheet", "g
 VERSION = 2
 NUM_OBJECTS = 106
 NUM_GRASPS = 50
-"""Grasps per object as in the original; an index may be larger."""
+"""Grasps per object as in the original; larger indices are allowed."""
 
 FIELD_MM = 22.0
-"""Side of a gel's field of view."""
+"""Width of a gel's field of view."""
 
 GRID = 144
-"""Samples across a gel for pictures up to this size: print and relief are finer than a small picture's pixels."""
+"""Smallest number of samples across a gel, because the relief is finer than the pixels of a small picture."""
 
 SHEAR_MM_PER_N = 0.35
 SHEAR_LIMIT_MM = 1.2
 
 FAR = 0.25
-"""Part of the grips that miss the centre of mass along the thing."""
+"""Fraction of grips that miss the centre of mass."""
 
 EXPECTED_FRICTION = 0.5
-"""The hand knows what a thing weighs, not how slippery it is: it presses as hard as this friction would need."""
+"""The hand knows the weight of an object, not its friction; it presses as hard as this friction needs."""
 
 BEHIND_M = 3.0
-"""Rays start so far behind the pad that they are parallel to within 0.2 degrees."""
+"""Rays start this far behind the pad, so that they are parallel to within 0.2 degrees."""
 
-# One stream per purpose, so that a change of the sensor or the picture size leaves physics and camera as they were.
+# One random stream per purpose, so that sensor and picture size do not affect physics and camera.
 _PLAN, _VIEW, _TOUCH = 0x67A50, 0x67A51, 0x67A52
 
 
 def draw_plan(thing: objects.Thing, patch: skin.Patch, rng: np.random.Generator) -> physics.Plan:
-    """Draw where, how hard and how high one grip of ``thing`` on ``patch`` is."""
+    """Draw position, force and lift height of one grip of ``thing`` on ``patch``."""
     low, high = thing.bounds
     middle, half = (low + high) / 2, (high - low) / 2
-    # Grips are careful or too far out, never in between: near the balance the outcome would be luck.
+    # Grips are central or far from the centre, never in between, where the outcome would be random.
     away = rng.uniform(0.48, 0.8) if rng.random() < FAR else rng.uniform(0.0, 0.05)
     y = thing.center_of_mass[1] + rng.choice([-1, 1]) * away * half[1]
     y = float(np.clip(y, low[1] + 0.1 * half[1], high[1] - 0.1 * half[1]))
@@ -91,14 +92,22 @@ def grasp(
     held_out_sensor: bool = False,
     phases: tuple[str, ...] = PHASES,
 ) -> list[dict[str, Any]]:
-    """Simulate one grasp; return its moments 'before', 'during' and 'after', or those in ``phases`` (cheaper).
+    """Simulate one grasp.
 
-    Each is a dict of ``vision``, ``touch_left``, ``touch_right`` (uint8 [size, size, 3]), ``phase``, ``success`` (0
-    or 1, the same in all three), the names ``object`` and ``sensor``, and floats: what the simulator knew
-    (``mass_kg``, ``friction``, ``force_n`` the set grip force, ``offset_mm`` from the centre of mass along the
-    thing, ``height_mm`` of the grip above it, ``yaw_deg``, ``roughness``, ``softness``), what came of it
-    (``lift_mm``, ``unstable``) and the moment's contact (``normal_*_n``; ``contact_*``: the mean imprint of that
-    gel in mm, the control any use of touch has to beat).
+    Args:
+        seed: Data seed.
+        obj: Number of the object.
+        index: Number of the grasp.
+        size: Side of the pictures in pixels.
+        held_out_sensor: Use the sensor that is not used otherwise.
+        phases: Phases to render; fewer are faster.
+
+    Returns:
+        A dict per phase with ``vision``, ``touch_left``, ``touch_right`` (uint8 [size, size, 3]), ``phase``, ``success``
+        (0 or 1, equal in all phases), the names ``object`` and ``sensor``, and numbers: the inputs (``mass_kg``,
+        ``friction``, ``force_n`` the set grip force, ``offset_mm`` from the centre of mass along the object, ``height_mm``
+        of the grip above it, ``yaw_deg``, ``peaks``, ``amplitude_mm``, ``softness``), the result (``lift_mm``,
+        ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in mm, a control).
     """
     if not 0 <= obj < NUM_OBJECTS:
         raise ValueError(f"obj must be in 0..{NUM_OBJECTS - 1}, got {obj}")
@@ -137,19 +146,67 @@ def _record(
     held_out_sensor: bool,
     phases: tuple[str, ...],
 ) -> list[dict[str, Any]]:
-    """Carry out a plan and photograph it; ``key`` is (seed, object, grasp) and decides the nuisances."""
+    """Simulate a plan and render it; ``key`` is (seed, object, grasp), which determines view and sensor."""
     thing = bench.thing
-    look = np.random.default_rng([_VIEW, *key])
-    feel = np.random.default_rng([_TOUCH, *key])
-    view = camera.draw_view(look)
-    sensor = _sensor(feel.random(), held_out_sensor)
-    units = feel.integers(2**31, size=2)
-    gain = feel.uniform(0.75, 1.3)
+    view = camera.draw_view(np.random.default_rng([_VIEW, *key]))
+    gels = _draw_gels(np.random.default_rng([_TOUCH, *key]), held_out_sensor)
+    known = {"object": thing.name, "sensor": gels.sensor.name, **_latents(thing, patch, plan)}
+    rows = []
+    moment = None
+    for order, moment in enumerate(bench.moments(plan), 1):
+        if moment.phase not in phases:
+            continue
+        # One noise stream per phase, so that leaving one out does not change the others.
+        touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
+        row: dict[str, Any] = {"phase": moment.phase, **known}
+        for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
+            imprint = _imprint(bench, patch, moment.data, side, touch.normal_n, size)
+            row[f"touch_{name}"] = gels.render(side, imprint, touch, touch_rng, size)
+            row[f"contact_{name}"] = float(imprint.mean())
+            row[f"normal_{name}_n"] = touch.normal_n
+        row["vision"] = camera.photograph(bench.model, moment.data, thing, view, view_rng, size=size)
+        rows.append(row)
+    assert moment is not None, "there are three phases"
+    outcome = {"success": moment.success, "lift_mm": 1000 * moment.rise_m, "unstable": float(moment.unstable)}
+    return [{**row, **outcome} for row in rows]
+
+
+@dataclass(frozen=True)
+class _Gels:
+    """The two gels of one grasp."""
+
+    sensor: gel.Sensor
+    units: np.ndarray
+    gain: float
+
+    def render(
+        self, side: int, imprint: np.ndarray, touch: physics.Touch, rng: np.random.Generator, size: int
+    ) -> np.ndarray:
+        """Return the picture of one gel, uint8 [size, size, 3]."""
+        x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
+        return gel.render(
+            imprint,
+            self.sensor,
+            rng,
+            pixel_mm=FIELD_MM / len(imprint),
+            shear_mm=(x, y),
+            size=size,
+            unit=int(self.units[side]),
+            gain=self.gain,
+        )
+
+
+def _draw_gels(rng: np.random.Generator, held_out: bool) -> _Gels:
+    sensors = [sensor for sensor in gel.SENSORS.values() if sensor.held_out == held_out]
+    sensor = sensors[int(rng.random() * len(sensors))]
+    return _Gels(sensor, rng.integers(2**31, size=2), rng.uniform(0.75, 1.3))
+
+
+def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dict[str, float]:
+    """Return the inputs of the simulation, stored as columns of the pack."""
     low, high = thing.bounds
     grip = (low + high) / 2 + plan.offset_m
-    known = {
-        "object": thing.name,
-        "sensor": sensor.name,
+    return {
         "mass_kg": thing.mass * plan.mass_scale,
         "friction": plan.friction,
         "force_n": plan.force_n,
@@ -160,49 +217,12 @@ def _record(
         "amplitude_mm": patch.amplitude_mm,
         "softness": thing.softness,
     }
-    rows = []
-    moment = None
-    for order, moment in enumerate(bench.moments(plan), 1):
-        if moment.phase not in phases:
-            continue
-        # Noise has a stream per moment, so that leaving one out changes no other.
-        feel, look = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
-        row: dict[str, Any] = {"phase": moment.phase, **known}
-        for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
-            imprint = _imprint(bench, patch, moment.data, side, touch.normal_n, size)
-            shear = [SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n]
-            row[f"touch_{name}"] = gel.render(
-                imprint,
-                sensor,
-                feel,
-                pixel_mm=FIELD_MM / len(imprint),
-                shear_mm=(shear[0], shear[1]),
-                size=size,
-                unit=int(units[side]),
-                gain=gain,
-            )
-            row[f"contact_{name}"] = float(imprint.mean())
-            row[f"normal_{name}_n"] = touch.normal_n
-        row["vision"] = camera.photograph(bench.model, moment.data, thing, view, look, size=size)
-        rows.append(row)
-    assert moment is not None, "there are three phases"
-    for row in rows:
-        row["success"] = moment.success
-        row["lift_mm"] = 1000 * moment.rise_m
-        row["unstable"] = float(moment.unstable)
-    return rows
-
-
-def _sensor(draw: float, held_out: bool) -> gel.Sensor:
-    """Pick one of the sensors by a number in [0, 1)."""
-    some = [sensor for sensor in gel.SENSORS.values() if sensor.held_out == held_out]
-    return some[int(draw * len(some))]
 
 
 def _imprint(
     bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, normal_n: float, size: int
 ) -> np.ndarray:
-    """Return the imprint [grid, grid] in mm of the thing in one gel; row 0 is up, seen from behind the gel."""
+    """Return the imprint [grid, grid] in mm of the object in one gel, seen from behind the gel; row 0 is up."""
     grid = max(GRID, size)
     if normal_n <= 0:
         return np.zeros((grid, grid), np.float32)
@@ -229,13 +249,13 @@ def _imprint(
         pixel_mm=FIELD_MM / grid,
         dome_radius_mm=objects.DOME_RADIUS_MM,
     )
-    return np.minimum(imprint, np.float32(2.5))  # a gel is no thicker; only a corner on the rim comes near
+    return np.minimum(imprint, np.float32(2.5))  # thickness of the gel; only corners at the rim come near it
 
 
 def contact_sheet(path: str | Path | BinaryIO, size: int = 132, seed: int = 0) -> None:
-    """Write one PNG: per row a shape kind, a failed and a held grasp of it, each with its three moments.
+    """Write a PNG: one row per shape, with a failed (red frame) and a successful (green frame) grasp.
 
-    Every moment is camera, left gel, right gel; the frame is red where the grasp fails and green where it holds.
+    Each grasp has its three phases, and each phase camera, left gel and right gel.
     """
     edge = 3
     size = min(size, (1600 - 4 * edge) // 18)

@@ -1,14 +1,14 @@
-"""Simulated materials: a camera picture and a tactile picture of the same touched surface, with labels.
+"""Simulated materials: a camera picture and a tactile picture of the same surface, with labels.
 
-A class sets ranges; an instance is one thing with its own relief, colour and physics; a touch is one press of it with
-its own pose, force, sensor, lamp and background. Split by instance.
+A class gives ranges; an instance is one object with its own relief, colour and physics; a touch is one press of it with its
+own pose, force, sensor, lamp and background. Split by instance.
 
-The labels are worth predicting by one rule (benchmarks/difficulty.py): on every task a supervised reference stands far
-above an untrained trunk, and below 97 %. Hence:
-- "soft" is a threshold on the instance's stiffness, not on its class. Soft things fold along curves, with lumpy outlines
-  and rolled edges; hard ones crack along straight lines and have corners. Number and size of such marks say nothing.
-- "rough" is the sign of the height skewness: peaks stand out, or pits are sunk in. Pictures of both have one spectrum.
-- Force, LED gain, sensor, lamp, tint, amplitude, background and clutter vary far more than what the labels change.
+The generator was designed by one rule (benchmarks/difficulty.py): on every task, a supervised reference is far above an
+untrained trunk, and below 97 %. Therefore:
+- "soft" is a threshold on the instance's stiffness, not on its class. Soft objects fold along curves and have lumpy outlines
+  and rolled edges; hard ones crack along straight lines and have corners. Number and size of marks carry no information.
+- "rough" is the sign of the height skewness: raised peaks or sunk pits. Pictures of both have the same spectrum.
+- Force, LED gain, sensor, lamp, tint, amplitude, background and clutter vary much more than the labels' effects.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS
 
 VERSION = 1
-"""Changes with every change of a pixel; stored in the pack."""
+"""Stored in the pack. Increase it with every change of a pixel."""
 
 SOFT_BELOW = 0.12
 """Stiffness in N/mm^3 below which an instance is labelled soft."""
@@ -38,24 +38,24 @@ MIN_SIZE, MAX_SIZE = 16, 512
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """The ranges of one class. `sight` and `feel` are relief kinds at camera and at gel scale."""
+    """Ranges of one class. `sight` and `feel` are relief kinds at camera and gel scale."""
 
     name: str
     sight: str
     feel: str
     colour: tuple[float, float, float]
-    """Mean reflectance; instances scatter widely around it."""
+    """Mean reflectance; instances vary widely around it."""
     wavelength_mm: tuple[float, float] = (0.9, 2.4)
     anisotropy: tuple[float, float] = (1.0, 1.3)
     irregularity: tuple[float, float] = (0.1, 0.6)
     gloss: tuple[float, float] = (0.0, 0.3)
     soft: float = 0.5
-    """Part of the instances that are soft (thin sheets lie on foam, panels on rubber, ...)."""
+    """Fraction of soft instances (thin sheets on foam, panels on rubber, ...)."""
     rough: float = 0.5
 
 
-# Confusable on purpose: laminate is wood to the eye and plastic to the finger; concrete and sand look alike, and glass,
-# plastic and paper do; concrete and brick feel alike, and glass, metal and tile do. So neither sense is enough.
+# Some classes are similar on purpose: laminate looks like wood and feels like plastic; concrete and sand look alike, and so
+# do glass, plastic and paper; concrete and brick feel alike, and so do glass, metal and tile. One sense is not enough.
 MATERIALS: tuple[Material, ...] = (
     Material(name="concrete", sight="blotch", feel="pores", colour=(0.52, 0.51, 0.49), soft=0.3, rough=0.5),
     Material(name="rock", sight="facets", feel="facets", colour=(0.47, 0.45, 0.43), soft=0.28, rough=0.66),
@@ -95,7 +95,7 @@ CLASSES: tuple[str, ...] = tuple(m.name for m in MATERIALS)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Instance:
-    """One thing: what both its pictures share. Lengths in mm, stiffness in N/mm^3."""
+    """One object: what both its pictures share. Lengths in mm, stiffness in N/mm^3."""
 
     sight: Relief
     feel: Relief
@@ -104,7 +104,7 @@ class Instance:
     gloss: float
     colour: NDArray[np.float32]
     ink: NDArray[np.float32]
-    """Second colour, laid along the relief with either sign."""
+    """Second colour, which follows the relief with either sign."""
     contrast: float
 
     @property
@@ -117,12 +117,12 @@ class Instance:
 
     @property
     def curl(self) -> float:
-        """How far its marks and outlines are folds (1) and not cracks (0)."""
+        """Whether marks and outlines are folds (1) or cracks (0), continuously."""
         return float(np.clip(0.5 - 2.6 * np.log10(self.stiffness / SOFT_BELOW), 0.0, 1.0))
 
 
 def draw_instance(seed: int, category: int, instance: int) -> Instance:
-    """Draw the latents of one thing; nothing but the three numbers enters."""
+    """Draw the latents of one object, which depend only on the three numbers."""
     rng = np.random.default_rng([_TAG, seed, category, instance])
     m = MATERIALS[category]
     soft, rough = rng.random() < m.soft, rng.random() < m.rough
@@ -160,20 +160,20 @@ def touch(
     held_out_sensor: bool = False,
     background: bool = False,
 ) -> dict[str, Any]:
-    """Draw one pair: "vision" and "touch" uint8 [size, size, 3], "category", "soft", "rough" and the latents.
+    """Simulate one pair.
 
-    `held_out_sensor` draws the tactile picture with a sensor that is never used otherwise; all else stays the same.
-    `background` also draws "background", the same copy of the sensor before the contact.
+    Args:
+        seed, category, instance, touch: Numbers of the data set, class, instance and touch.
+        size: Side of the pictures in pixels.
+        held_out_sensor: Use the sensor that is not used otherwise; everything else is the same.
+        background: Also return "background", the same copy of the sensor before contact.
+
+    Returns:
+        "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
     """
-    for name, value in (("seed", seed), ("instance", instance), ("touch", touch)):
-        if value < 0:
-            raise ValueError(f"{name} must be >= 0, got {value}")
-    if not 0 <= category < len(CLASSES):
-        raise ValueError(f"category must be 0 to {len(CLASSES) - 1} ({', '.join(CLASSES)}), got {category}")
-    if not MIN_SIZE <= size <= MAX_SIZE:
-        raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
+    _check_request(seed, category, instance, touch, size)
     thing = draw_instance(seed, category, instance)
-    # one stream per picture, so that a change in one never shifts the other; pixels are drawn last in each
+    # One random stream per picture, so that they are independent; pixel noise is drawn last in each.
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
     vision = _look(thing, eye, angle + eye.normal(0, 0.1), place, size)
@@ -195,8 +195,18 @@ def touch(
     }
 
 
+def _check_request(seed: int, category: int, instance: int, touch: int, size: int) -> None:
+    for name, value in (("seed", seed), ("instance", instance), ("touch", touch)):
+        if value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value}")
+    if not 0 <= category < len(CLASSES):
+        raise ValueError(f"category must be 0 to {len(CLASSES) - 1} ({', '.join(CLASSES)}), got {category}")
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
+
+
 def _grid(size: int, width_mm: float) -> tuple[F, F, float]:
-    """Return x, y [n, n] in mm and mm per pixel of the internal picture: twice as fine as `size` while affordable."""
+    """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
     n = 2 * size if size <= 96 else max(192, size)
     pixel = width_mm / n
     axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
@@ -210,7 +220,7 @@ def _turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
 
 
 def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -> F:
-    """Return about the distance in mm [n, n] inside an outline (< 0 outside): corners for curl 0, lobes for curl 1."""
+    """Return the approximate distance in mm [n, n] inside an outline (< 0 outside): corners for curl 0, lobes for curl 1."""
     cx, cy = rng.normal(0, 0.22 * radius, 2)
     x, y = x - np.float32(cx), y - np.float32(cy)
     sides, turn = int(rng.integers(3, 6)), rng.uniform(0, 2 * np.pi)
@@ -231,7 +241,7 @@ def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -
 def _look(
     thing: Instance, rng: np.random.Generator, angle: float, place: NDArray[np.float64], size: int
 ) -> NDArray[np.uint8]:
-    """Photograph the thing on a cluttered table under a lamp: uint8 [size, size, 3]."""
+    """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
     x, y, pixel = _grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
     width = float(x.shape[0] * pixel)
     curl = thing.curl
@@ -244,14 +254,14 @@ def _look(
     form = np.float32(0.7) * bevel * (np.sqrt(edge * (2 - edge)) if curl > 0.5 else edge)  # rounded or chamfered
     height = steep * texture + np.float32(0.012 * width) * lines + form
 
-    # people and cameras expect light from above: within 60 degrees of it, or peaks and pits could not be told apart
+    # Light comes from above (within 60 degrees); otherwise peaks and pits would look the same.
     lamp, rise = rng.uniform(-np.pi / 3, np.pi / 3), rng.uniform(0.45, 0.8)
     light = np.cos(rise) * np.sin(lamp), -np.cos(rise) * np.cos(lamp), np.sin(rise)
     skin = _shade(thing, height, texture, light, rng.uniform(0.25, 0.5), pixel)
     table = _table(x, y, rng, width, pixel)
     body = np.clip(inside / np.float32(pixel) + 0.5, 0, 1)
     away = tuple(round(-part * 0.035 * width / pixel) for part in (light[1], light[0]))
-    table *= (1 - np.float32(0.5) * np.roll(body, away, axis=(0, 1)))[..., None]  # the thing's shadow
+    table *= (1 - np.float32(0.5) * np.roll(body, away, axis=(0, 1)))[..., None]  # shadow of the object
     picture = table + body[..., None] * (skin - table)
 
     tint = np.exp(rng.normal(0, 0.12, 3) + rng.normal(0.0, 0.25)).astype(np.float32)
@@ -267,7 +277,7 @@ def _look(
 def _shade(
     thing: Instance, height: F, texture: F, light: tuple[float, float, float], ambient: float, pixel: float
 ) -> F:
-    """Light a height map [n, n] mm from direction `light`: reflected colour [n, n, 3], Lambert plus a Phong highlight."""
+    """Shade a height map [n, n] mm with light from direction `light`: colour [n, n, 3], Lambert plus Phong highlight."""
     lx, ly, lz = (np.float32(part) for part in light)
     gy, gx = np.gradient(height, np.float32(pixel))
     normal = 1 / np.sqrt(1 + gx * gx + gy * gy)
@@ -280,7 +290,7 @@ def _shade(
 
 
 def _table(x: F, y: F, rng: np.random.Generator, width: float, pixel: float) -> F:
-    """Paint what lies behind: a patterned ground and things with straight and with curved outlines, [n, n, 3]."""
+    """Draw the background [n, n, 3]: a patterned table, and objects with straight and with curved outlines."""
     ground, second = rng.uniform(0.12, 0.7, (2, 3)).astype(np.float32)
     table = rng.standard_normal((64, 64), np.float32)
     stretch, scale, turn = rng.uniform(1, 5), width * rng.uniform(0.04, 0.15), rng.uniform(0, np.pi)
@@ -306,7 +316,7 @@ def _feel(
     held_out: bool,
     background: bool,
 ) -> dict[str, Any]:
-    """Press the thing into a gel: "touch" uint8 [size, size, 3], if asked "background" alike, what describes the press."""
+    """Press the object into a gel: "touch" and, if requested, "background" (uint8 [size, size, 3]), sensor and force."""
     choice = [s for s in SENSORS.values() if s.held_out == held_out]
     sensor = choice[int(rng.random() * len(choice))]
     force = float(np.exp(rng.uniform(*np.log((2.0, 12.0)))))
@@ -317,7 +327,7 @@ def _feel(
     x, y, pixel = _grid(size, _TOUCH_MM)
     u, v = _turn(x, y, angle, place)
     curl = thing.curl
-    # a soft thing gives way, which alone would make every imprint of it shallower: it is given more relief to give away
+    # Soft objects deform, which would make their imprints shallower, so their relief is higher.
     yielding = GEL_STIFFNESS / thing.stiffness
     amplitude = np.float32(thing.amplitude_mm * (1 + yielding) * np.exp(rng.normal(0, 0.15)))
     relief = amplitude * thing.feel(u, v)
@@ -328,13 +338,13 @@ def _feel(
     roll = np.float32(0.2 + 1.5 * curl)
     fall = np.where(beyond < roll, beyond * beyond / (2 * roll), beyond - roll / 2)
     relief = relief - np.float32(1 + yielding) * fall
-    # soft things bulge, as cushions do; else the width of the patch alone would give them away
+    # Soft objects bulge, otherwise the width of the contact would reveal them.
     bulge = np.float32(yielding * rng.uniform(0.6, 1.2) / (2 * dome))
     relief = relief + tilt[0] * x + tilt[1] * y - bulge * (x * x + y * y)
     imprint = press(relief, force_n=force, stiffness=thing.stiffness, pixel_mm=pixel, dome_radius_mm=dome)
     unit = int(rng.integers(2**31))
     draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
     made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
-    if background:  # drawn last, so that the other pictures do not change
+    if background:  # rendered last, so that other pictures do not change
         made["background"] = draw(np.zeros_like(imprint))
     return {**made, "sensor": sensor.name, "force_n": force}

@@ -1,8 +1,9 @@
-"""Things to grasp: shapes and masses, and the MJCF of the scene around one of them.
+"""Objects to grasp (shapes and masses), and the MJCF of the scene with one of them.
 
-A thing is a few primitive geoms of one mass, with a finish that the camera sees (`skin.py`). Heavy parts are bare metal.
+An object ("thing" in code) consists of a few primitive geoms, with a finish that the camera sees (`skin.py`). Dense parts
+look like bare metal.
 
-Frames: the gripper closes along x, a thing's long side lies along y, z is up and the table is z = 0.
+Frames: the gripper closes along x, an object's long side is along y, z is up and the table is z = 0.
 Shapes: N points. Units: metres, kilograms and newtons, except names that end in ``_mm``.
 """
 
@@ -15,10 +16,7 @@ import numpy as np
 from mvitac.sim.skin import Finish, draw_finish
 
 OBJECT_TAG = 0x0B1EC7
-"""First word of the seed sequence of object properties; grasps use other tags, because trailing zeros do not count."""
-
-KINDS = ("box", "can", "rod", "ellipsoid", "capsule", "hammer", "mug", "bottle", "tee", "dumbbell")
-"""Shape kinds; objects cycle through them, so that any split by object holds every kind."""
+"""First word of the seed sequence of object properties. Grasps use other tags, because trailing zeros are ignored."""
 
 PAD_HALF_M = 0.0115
 """Half the side of a gel pad."""
@@ -27,7 +25,7 @@ DOME_RADIUS_MM = 20.0
 """Radius of curvature of the gels, in the physics and in the optics."""
 
 PAD_DEPTH_M = PAD_HALF_M**2 / (DOME_RADIUS_MM / 1000)
-"""Half depth of the ellipsoid whose apex has that radius."""
+"""Half depth of the ellipsoid with this radius at its apex."""
 
 FINGER_M = (0.006, 0.009, 0.036)
 """Half sizes of a finger's bar: thickness, width, height."""
@@ -36,15 +34,15 @@ OPEN_M = 0.047
 """Distance of an open pad's apex from the hand's axis."""
 
 MASS_KG = 0.25, 0.7
-"""Least and most that a thing weighs."""
+"""Smallest and largest mass of an object."""
 
 CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045"), ("capsule", ".015 .05"))
-"""MuJoCo types and sizes of what lies about."""
+"""MuJoCo types and sizes of the clutter."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One primitive of a thing, in the thing's frame."""
+    """One primitive of an object, in the object's frame."""
 
     shape: str
     """MuJoCo geom type: box, cylinder, capsule, ellipsoid or sphere."""
@@ -52,9 +50,9 @@ class Part:
     """MuJoCo half sizes in metres."""
     center: tuple[float, float, float]
     lying: bool = False
-    """Whether the geom's own axis lies along y instead of standing along z."""
+    """Whether the geom's axis is y instead of z."""
     density: float = 1.0
-    """Multiple of the thing's density; above 1.2 the part is drawn as metal."""
+    """Multiple of the object's density; above 1.2 the part is drawn as metal."""
 
     def half(self) -> np.ndarray:
         """Return the half extents [3] of the axis-aligned box around the part."""
@@ -79,9 +77,9 @@ class Part:
         return 2 * np.pi * radius**2 * half + ball
 
     def pad_radius(self) -> float:
-        """Return the effective radius of curvature between the pad's dome and the part's flank, in metres.
+        """Return the effective radius of curvature between the pad's dome and the part's side, in metres.
 
-        On a Winkler foundation principal curvatures a, b touch as much as a sphere of curvature sqrt(a b) does.
+        On a Winkler foundation, principal curvatures a, b have the contact area of a sphere of curvature sqrt(a b).
         """
         dome = 1000 / DOME_RADIUS_MM
         if self.shape == "box":
@@ -96,16 +94,16 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Thing:
-    """Everything about an object that does not change between its grasps."""
+    """An object; it is the same in all its grasps."""
 
     name: str
     kind: str
     parts: tuple[Part, ...]
     finish: Finish
     density: float
-    """Kilograms per cubic metre (things are mostly hollow)."""
+    """Kilograms per cubic metre (objects are mostly hollow)."""
     softness: float
-    """0 hard .. 1 foam-like: stiffness, and the time constant of the contact."""
+    """0 = hard, 1 = foam-like: determines stiffness and the time constant of the contact."""
 
     @property
     def mass(self) -> float:
@@ -114,7 +112,7 @@ class Thing:
 
     @property
     def center_of_mass(self) -> np.ndarray:
-        """Centre of mass [3] in the thing's frame."""
+        """Centre of mass [3] in the object's frame."""
         weights = [part.volume() * part.density for part in self.parts]
         return np.average([part.center for part in self.parts], axis=0, weights=weights)
 
@@ -124,93 +122,122 @@ class Thing:
         return 10.0 * 0.002**self.softness
 
     def heights(self, y: float) -> tuple[float, float]:
-        """Return the lowest and highest z of what lies across the plane at ``y``."""
+        """Return the lowest and highest z of the parts that cross the plane at ``y``."""
         across = [part for part in self.parts if abs(y - part.center[1]) <= part.half()[1]] or list(self.parts)
         low = min(part.center[2] - part.half()[2] for part in across)
         return low, max(part.center[2] + part.half()[2] for part in across)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner [3] in the thing's frame."""
+        """Lower and upper corner [3] in the object's frame."""
         center = np.array([part.center for part in self.parts])
         half = np.array([part.half() for part in self.parts])
         return (center - half).min(0), (center + half).max(0)
 
 
 def object_name(seed: int, index: int) -> str:
-    """Return the name of an object, shape kind and index, e.g. ``box_010``. It is the same for every seed."""
+    """Return the name of an object (shape kind and index), e.g. ``box_010``. It does not depend on the seed."""
     del seed
     return f"{KINDS[index % len(KINDS)]}_{index:03d}"
 
 
-def _parts(kind: str, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Draw the primitives of a shape kind; all of them stand on z = 0, the caller's frame is the table's."""
+def _mm(rng: np.random.Generator, *ranges: tuple[float, float]) -> list[float]:
+    """Draw a length from each range in millimetres; return them in metres."""
+    return [rng.uniform(low, high) / 1000 for low, high in ranges]
 
-    def u(low: float, high: float) -> float:
-        """Draw a length in millimetres and return it in metres."""
-        return rng.uniform(low, high) / 1000
 
-    if kind == "box":
-        x, y, z = u(11, 27), u(30, 72), u(13, 32)
-        return (Part(shape="box", size=(x, y, z), center=(0, 0, z)),)
-    if kind == "can":
-        r, h = u(16, 31), u(24, 52)
-        return (Part(shape="cylinder", size=(r, h), center=(0, 0, h)),)
-    if kind == "rod":
-        r, h = u(12, 24), u(38, 78)
-        return (Part(shape="cylinder", size=(r, h), center=(0, 0, r), lying=True),)
-    if kind == "ellipsoid":
-        x, y, z = u(16, 30), u(26, 58), u(15, 28)
-        return (Part(shape="ellipsoid", size=(x, y, z), center=(0, 0, z)),)
-    if kind == "capsule":
-        r, h = u(13, 25), u(22, 55)
-        return (Part(shape="capsule", size=(r, h), center=(0, 0, r), lying=True),)
-    if kind == "hammer":
-        r, h = u(11, 16), u(45, 65)
-        x, y, z = u(16, 22), u(7, 11), u(15, 20)
-        side = rng.choice([-1, 1])
-        return (
-            Part(shape="cylinder", size=(r, h), center=(0, 0, z), lying=True),
-            Part(shape="box", size=(x, y, z), center=(0, side * (h + y), z), density=rng.uniform(1.0, 1.3)),
-        )
-    if kind == "mug":
-        r, h = u(22, 31), u(32, 48)
-        y, z = u(9, 14), u(16, 26)
-        side = rng.choice([-1, 1])
-        return (
-            Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
-            Part(shape="box", size=(0.005, y, z), center=(0, side * (r + y - 0.001), h)),
-        )
-    if kind == "bottle":
-        r, h, neck, tall = u(18, 30), u(26, 44), u(10, 14), u(12, 20)
-        return (
-            Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
-            Part(shape="cylinder", size=(neck, tall), center=(0, 0, 2 * h + tall)),
-        )
-    if kind == "tee":
-        x, y, z = u(11, 20), u(36, 62), u(13, 20)
-        a, b, c = u(12, 26), u(12, 22), u(10, 22)
-        shift = rng.choice([-1, 1]) * rng.uniform(0.3, 0.75) * y
-        return (
-            Part(shape="box", size=(x, y, z), center=(0, 0, z)),
-            Part(shape="box", size=(a, b, c), center=(0, shift, 2 * z + c), density=rng.uniform(0.8, 1.4)),
-        )
-    if kind == "dumbbell":
-        r, h, left, right = u(10, 15), u(28, 48), u(17, 28), u(17, 28)
-        z = max(left, right)
-        return (
-            Part(shape="capsule", size=(r, h), center=(0, 0, z), lying=True),
-            Part(shape="cylinder", size=(z, left / 2), center=(0, -h, z), lying=True, density=rng.choice([1.0, 1.5])),
-            Part(shape="cylinder", size=(z, right / 2), center=(0, h, z), lying=True),
-        )
-    raise AssertionError(kind)
+def _box(rng: np.random.Generator) -> tuple[Part, ...]:
+    x, y, z = _mm(rng, (11, 27), (30, 72), (13, 32))
+    return (Part(shape="box", size=(x, y, z), center=(0, 0, z)),)
+
+
+def _can(rng: np.random.Generator) -> tuple[Part, ...]:
+    r, h = _mm(rng, (16, 31), (24, 52))
+    return (Part(shape="cylinder", size=(r, h), center=(0, 0, h)),)
+
+
+def _rod(rng: np.random.Generator) -> tuple[Part, ...]:
+    r, h = _mm(rng, (12, 24), (38, 78))
+    return (Part(shape="cylinder", size=(r, h), center=(0, 0, r), lying=True),)
+
+
+def _ellipsoid(rng: np.random.Generator) -> tuple[Part, ...]:
+    x, y, z = _mm(rng, (16, 30), (26, 58), (15, 28))
+    return (Part(shape="ellipsoid", size=(x, y, z), center=(0, 0, z)),)
+
+
+def _capsule(rng: np.random.Generator) -> tuple[Part, ...]:
+    r, h = _mm(rng, (13, 25), (22, 55))
+    return (Part(shape="capsule", size=(r, h), center=(0, 0, r), lying=True),)
+
+
+def _hammer(rng: np.random.Generator) -> tuple[Part, ...]:
+    r, h, x, y, z = _mm(rng, (11, 16), (45, 65), (16, 22), (7, 11), (15, 20))
+    side = rng.choice([-1, 1])
+    return (
+        Part(shape="cylinder", size=(r, h), center=(0, 0, z), lying=True),
+        Part(shape="box", size=(x, y, z), center=(0, side * (h + y), z), density=rng.uniform(1.0, 1.3)),
+    )
+
+
+def _mug(rng: np.random.Generator) -> tuple[Part, ...]:
+    r, h, y, z = _mm(rng, (22, 31), (32, 48), (9, 14), (16, 26))
+    side = rng.choice([-1, 1])
+    return (
+        Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
+        Part(shape="box", size=(0.005, y, z), center=(0, side * (r + y - 0.001), h)),
+    )
+
+
+def _bottle(rng: np.random.Generator) -> tuple[Part, ...]:
+    r, h, neck, tall = _mm(rng, (18, 30), (26, 44), (10, 14), (12, 20))
+    return (
+        Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
+        Part(shape="cylinder", size=(neck, tall), center=(0, 0, 2 * h + tall)),
+    )
+
+
+def _tee(rng: np.random.Generator) -> tuple[Part, ...]:
+    x, y, z, a, b, c = _mm(rng, (11, 20), (36, 62), (13, 20), (12, 26), (12, 22), (10, 22))
+    shift = rng.choice([-1, 1]) * rng.uniform(0.3, 0.75) * y
+    return (
+        Part(shape="box", size=(x, y, z), center=(0, 0, z)),
+        Part(shape="box", size=(a, b, c), center=(0, shift, 2 * z + c), density=rng.uniform(0.8, 1.4)),
+    )
+
+
+def _dumbbell(rng: np.random.Generator) -> tuple[Part, ...]:
+    r, h, left, right = _mm(rng, (10, 15), (28, 48), (17, 28), (17, 28))
+    z = max(left, right)
+    return (
+        Part(shape="capsule", size=(r, h), center=(0, 0, z), lying=True),
+        Part(shape="cylinder", size=(z, left / 2), center=(0, -h, z), lying=True, density=rng.choice([1.0, 1.5])),
+        Part(shape="cylinder", size=(z, right / 2), center=(0, h, z), lying=True),
+    )
+
+
+_DRAW = {
+    "box": _box,
+    "can": _can,
+    "rod": _rod,
+    "ellipsoid": _ellipsoid,
+    "capsule": _capsule,
+    "hammer": _hammer,
+    "mug": _mug,
+    "bottle": _bottle,
+    "tee": _tee,
+    "dumbbell": _dumbbell,
+}
+"""Shape kind -> function that draws its parts, which stand on z = 0."""
+KINDS = tuple(_DRAW)
+"""Shape kinds. Objects cycle through them, so that every split by object has all kinds."""
 
 
 def make_thing(seed: int, index: int) -> Thing:
     """Draw object ``index`` of data seed ``seed``."""
     rng = np.random.default_rng([OBJECT_TAG, seed, index])
     kind = KINDS[index % len(KINDS)]
-    parts = _parts(kind, rng)
+    parts = _DRAW[kind](rng)
     finish = draw_finish(rng)
     return Thing(
         name=object_name(seed, index),
@@ -223,33 +250,12 @@ def make_thing(seed: int, index: int) -> Thing:
 
 
 def scene(thing: Thing) -> str:
-    """Return the MJCF of table, gripper, clutter and one thing.
+    """Return the MJCF of table, gripper, clutter and one object.
 
-    Geom groups: 0 scenery, 1 gripper, 2 the thing (what the gels see), 3 the fingers' collision bars (not drawn: the
-    camera would see them twice).
-    The thing's geoms have priority 1: MuJoCo otherwise takes the larger friction of the two, and the pad would hide it.
+    Geom groups: 0 scenery, 1 gripper, 2 the object (what the gels see), 3 the collision bars of the fingers (not drawn,
+    because the camera would see them twice).
     """
-    # A soft thing's contact answers more slowly; below 2.5 time steps MuJoCo would clip the time constant anyway.
-    solref = f"{0.006 + 0.014 * thing.softness:.5f} 1"
-    geoms = "\n".join(
-        f'<geom name="part{i}" type="{part.shape}" size="{_numbers(part.size)}" pos="{_numbers(part.center)}"'
-        f' euler="{90 if part.lying else 0} 0 0" mass="{part.volume() * part.density * thing.density:.9g}"'
-        f' group="2" priority="1" condim="6" solref="{solref}" contype="1" conaffinity="1"/>'
-        for i, part in enumerate(thing.parts)
-    )
-    width, _, height = FINGER_M
-    bar = f'type="box" size="{_numbers(FINGER_M)}" pos="{PAD_DEPTH_M + 0.003 + width} 0 0.022"'
-    dome = f'size="{PAD_DEPTH_M} {PAD_HALF_M} {PAD_HALF_M}" pos="{PAD_DEPTH_M} 0 0"'
-    fingers = "\n".join(
-        f'''<body name="{name}" pos="{sign * OPEN_M} 0 0" euler="0 0 {turn}">
-          <joint name="{name}" type="slide" axis="-1 0 0" range="0 {OPEN_M - 0.004}" damping="3" armature="0.05"/>
-          <geom class="shown" {bar} mass=".05"/>
-          <geom class="shown" type="box" size=".0025 {PAD_HALF_M} {PAD_HALF_M}" pos="{PAD_DEPTH_M} 0 0" mass=".01"/>
-          <geom name="{name}_pad" type="ellipsoid" {dome} group="1" mass=".01" condim="6" contype="2" conaffinity="1"/>
-          <geom name="{name}_bar" {bar} group="3" mass=".001" condim="3" contype="2" conaffinity="1"/>
-        </body>'''
-        for name, sign, turn in (("left", -1, 180), ("right", 1, 0))
-    )
+    height = FINGER_M[2]
     clutter = "\n".join(
         f'<body name="clutter{i}" mocap="true"><geom type="{shape}" size="{size}" class="scenery"/></body>'
         for i, (shape, size) in enumerate(CLUTTER)
@@ -268,9 +274,9 @@ def scene(thing: Thing) -> str:
           <joint name="lift" type="slide" axis="0 0 1" armature="1"/>
           <geom class="shown" type="box" size=".062 .018 .014" pos="0 0 {0.022 + height + 0.014}" mass=".4"/>
           <geom class="shown" type="cylinder" size=".02 .06" pos="0 0 {0.022 + height + 0.085}" mass=".1"/>
-          {fingers}
+          {_fingers()}
         </body>
-        <body name="thing"><freejoint name="thing"/>{geoms}</body>
+        <body name="thing"><freejoint name="thing"/>{_geoms(thing)}</body>
       </worldbody>
       <tendon><fixed name="grip"><joint joint="left" coef="1"/><joint joint="right" coef="1"/></fixed></tendon>
       <equality><joint joint1="left" joint2="right" solref=".004 1"/></equality>
@@ -279,6 +285,37 @@ def scene(thing: Thing) -> str:
         <position name="grip" tendon="grip" kp="1500" kv="4" forcerange="-1 1"/>
       </actuator>
     </mujoco>"""
+
+
+def _geoms(thing: Thing) -> str:
+    """Return the MJCF of the object's parts.
+
+    They have priority 1. MuJoCo otherwise uses the larger friction of two geoms, and the pad would hide the object's.
+    """
+    # A soft object's contact responds more slowly; MuJoCo limits the time constant to 2.5 time steps anyway.
+    solref = f"{0.006 + 0.014 * thing.softness:.5f} 1"
+    return "\n".join(
+        f'<geom name="part{i}" type="{part.shape}" size="{_numbers(part.size)}" pos="{_numbers(part.center)}"'
+        f' euler="{90 if part.lying else 0} 0 0" mass="{part.volume() * part.density * thing.density:.9g}"'
+        f' group="2" priority="1" condim="6" solref="{solref}" contype="1" conaffinity="1"/>'
+        for i, part in enumerate(thing.parts)
+    )
+
+
+def _fingers() -> str:
+    """Return the MJCF of both fingers with their gels."""
+    bar = f'type="box" size="{_numbers(FINGER_M)}" pos="{PAD_DEPTH_M + 0.003 + FINGER_M[0]} 0 0.022"'
+    dome = f'size="{PAD_DEPTH_M} {PAD_HALF_M} {PAD_HALF_M}" pos="{PAD_DEPTH_M} 0 0"'
+    return "\n".join(
+        f'''<body name="{name}" pos="{sign * OPEN_M} 0 0" euler="0 0 {turn}">
+          <joint name="{name}" type="slide" axis="-1 0 0" range="0 {OPEN_M - 0.004}" damping="3" armature="0.05"/>
+          <geom class="shown" {bar} mass=".05"/>
+          <geom class="shown" type="box" size=".0025 {PAD_HALF_M} {PAD_HALF_M}" pos="{PAD_DEPTH_M} 0 0" mass=".01"/>
+          <geom name="{name}_pad" type="ellipsoid" {dome} group="1" mass=".01" condim="6" contype="2" conaffinity="1"/>
+          <geom name="{name}_bar" {bar} group="3" mass=".001" condim="3" contype="2" conaffinity="1"/>
+        </body>'''
+        for name, sign, turn in (("left", -1, 180), ("right", 1, 0))
+    )
 
 
 def _numbers(values: tuple[float, ...]) -> str:

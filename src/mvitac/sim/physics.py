@@ -1,6 +1,6 @@
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
-"""One grasp in MuJoCo: settle, close, lift, hold; the scene is handed out at the three moments that are photographed.
+"""Simulates one grasp in MuJoCo: settle, close, lift, hold. The scene is returned at three moments, to be rendered.
 
 Frames and units as in :mod:`mvitac.sim.objects`: metres, kilograms, newtons, radians, seconds.
 """
@@ -18,29 +18,29 @@ from mvitac.sim import gel, objects
 PHASES = ("before", "during", "after")
 STEP_S = 0.002
 CHUNK = 5
-"""Time steps between two changes of the set points."""
+"""Time steps between changes of the set points."""
 
 SETTLE_S, CLOSE_S, LIFT_S, HOLD_S = 0.10, 0.30, 0.36, 0.24
 CLOSE_SPEED = 0.14
 """Metres per second of each finger."""
 
 HELD_PART = 0.7
-"""A thing is lifted if its centre of mass has risen by this part of the hand's way."""
+"""An object is lifted if its centre of mass has risen by this fraction of the hand's path."""
 
 RUNAWAY = 30.0
-"""A velocity (m/s or rad/s) that no grasp reaches unless the solver has lost it."""
+"""A velocity (m/s or rad/s) that occurs only if the solver diverges."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What varies between two grasps of the same thing."""
+    """The parameters of one grasp."""
 
     force_n: float
     """Limit of the grip force, per finger."""
     offset_m: tuple[float, float, float]
-    """Where the hand grips, in the thing's frame, relative to the middle of its bounds."""
+    """Position of the grip in the object's frame, relative to the centre of its bounds."""
     yaw: float
-    """Angle in radians between the thing's long side and the pads."""
+    """Angle in radians between the object's long side and the pads."""
     lift_m: float
     friction: float
     mass_scale: float = 1.0
@@ -48,16 +48,16 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True)
 class Touch:
-    """What one gel feels."""
+    """Contact forces on one gel."""
 
     normal_n: float
     shear_n: tuple[float, float]
-    """Tangential force on the gel along its picture's x (right) and y (down)."""
+    """Tangential force along x (right) and y (down) of the gel's picture."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """The scene when it is photographed; ``data`` lives on and must be read before the next moment is asked for."""
+    """The scene at one moment. Read ``data`` before the next moment is requested, which overwrites it."""
 
     phase: str
     data: mujoco.MjData
@@ -70,9 +70,9 @@ class Moment:
 
 
 def contact_radius_m(part: objects.Part, force_n: float, stiffness: float) -> float:
-    """Return the radius of a pad's contact on a part: Winkler, F = pi k R d^2 and a^2 = 2 R d, at most the pad.
+    """Return the radius of the contact between a pad and a part (Winkler: F = pi k R d^2, a^2 = 2 R d), at most the pad's.
 
-    ``stiffness`` is the part's own in N/mm^3; part and gel are springs in series, as in :func:`mvitac.sim.gel.press`.
+    ``stiffness`` is that of the part in N/mm^3. Part and gel are springs in series, as in :func:`mvitac.sim.gel.press`.
     """
     spring = 1e9 * stiffness * gel.GEL_STIFFNESS / (stiffness + gel.GEL_STIFFNESS)
     radius = part.pad_radius()
@@ -80,7 +80,7 @@ def contact_radius_m(part: objects.Part, force_n: float, stiffness: float) -> fl
 
 
 class Bench:
-    """The compiled scene of one thing, reused for all its grasps."""
+    """The compiled scene of one object, reused for all its grasps."""
 
     def __init__(self, thing: objects.Thing) -> None:
         self.thing = thing
@@ -94,24 +94,42 @@ class Bench:
         self.address = self.model.joint("thing").qposadr[0]
 
     def moments(self, plan: Plan) -> Iterator[Moment]:
-        """Yield the three moments of a grasp. The result depends on ``plan`` alone, not on earlier grasps."""
+        """Yield the three moments of a grasp. The result depends only on ``plan``, not on earlier grasps."""
+        data = self.data
+        height, start = self._place(plan)
+        unstable = self._run(SETTLE_S, lambda _: height, lambda _: start)
+        yield self._moment("before", 0.0, unstable)
+
+        # The set point continues into the object: the force limit determines where the fingers stop.
+        unstable |= self._run(CLOSE_S, lambda _: height, lambda t: min(start + CLOSE_SPEED * t, objects.OPEN_M))
+        yield self._moment("during", 0.0, unstable)
+
+        lowest = float(data.xipos[self.body, 2])
+        closed = min(start + CLOSE_SPEED * CLOSE_S, objects.OPEN_M)
+        unstable |= self._run(LIFT_S + HOLD_S, lambda t: height + _lifted(plan.lift_m, t), lambda _: closed)
+        rise = float(data.xipos[self.body, 2]) - lowest
+        moment = self._moment("after", rise, unstable)
+        held = moment.left.normal_n > 0 and moment.right.normal_n > 0
+        success = int(held and rise > HELD_PART * plan.lift_m and not self._on_table() and not unstable)
+        yield replace(moment, success=success)
+
+    def _place(self, plan: Plan) -> tuple[float, float]:
+        """Reset the scene for ``plan``; return the height of the hand and the position of the open fingers."""
         model, data, thing = self.model, self.data, self.thing
         mujoco.mj_resetData(model, data)
         model.body_mass[self.body] = self.mass[self.body] * plan.mass_scale
         model.body_inertia[self.body] = self.inertia[self.body] * plan.mass_scale
         mujoco.mj_setConst(model, data)
         for part, geom in zip(thing.parts, self.parts, strict=True):
-            # A round patch with a paraboloid of pressure turns at a torque of 8/15 mu a F.
+            # A round contact with a paraboloid of pressure rotates at a torque of 8/15 mu a F.
             patch = 8 / 15 * contact_radius_m(part, plan.force_n, thing.stiffness)
             model.geom_friction[geom] = plan.friction, plan.friction * patch, 2e-4
         model.actuator_forcerange[1] = -plan.force_n, plan.force_n
         low, high = thing.bounds
-        middle = (low + high) / 2
-        grip = middle + plan.offset_m
+        grip = (low + high) / 2 + plan.offset_m
         height = max(float(grip[2]), objects.PAD_HALF_M + 0.002)
         cos, sin = np.cos(plan.yaw), np.sin(plan.yaw)
-        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        place = -turn @ [grip[0], grip[1], 0.0]
+        place = -np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ [grip[0], grip[1], 0.0]
         data.qpos[self.address : self.address + 3] = place[0], place[1], 0.0003 - low[2]
         data.qpos[self.address + 3 : self.address + 7] = np.cos(plan.yaw / 2), 0, 0, np.sin(plan.yaw / 2)
         data.qpos[0] = height
@@ -119,29 +137,10 @@ class Bench:
         reach = abs(cos) * half[0] + abs(sin) * min(half[1], 0.02) + abs(plan.offset_m[0]) + 0.008
         start = objects.OPEN_M - min(reach, objects.OPEN_M - 0.002)
         data.qpos[1:3] = start
-        unstable = self._run(SETTLE_S, lambda _: height, lambda _: start)
-        yield self._moment("before", 0.0, unstable)
-
-        # The set point runs on into the thing: the force limit decides where the fingers stop.
-        unstable |= self._run(CLOSE_S, lambda _: height, lambda t: min(start + CLOSE_SPEED * t, objects.OPEN_M))
-        yield self._moment("during", 0.0, unstable)
-
-        lowest = float(data.xipos[self.body, 2])
-        closed = min(start + CLOSE_SPEED * CLOSE_S, objects.OPEN_M)
-
-        def way(t: float) -> float:
-            x = min(t / LIFT_S, 1.0)
-            return height + plan.lift_m * x * x * (3 - 2 * x)
-
-        unstable |= self._run(LIFT_S + HOLD_S, way, lambda _: closed)
-        rise = float(data.xipos[self.body, 2]) - lowest
-        moment = self._moment("after", rise, unstable)
-        held = moment.left.normal_n > 0 and moment.right.normal_n > 0
-        success = int(held and rise > HELD_PART * plan.lift_m and not self._on_table() and not unstable)
-        yield replace(moment, success=success)
+        return height, start
 
     def _run(self, seconds: float, lift: Callable[[float], float], close: Callable[[float], float]) -> int:
-        """Advance; return 1 if the solver lost the scene, which is then left at its last good state."""
+        """Advance the simulation; return 1 if the solver diverged, with the scene reset to the last valid state."""
         model, data = self.model, self.data
         for chunk in range(round(seconds / STEP_S / CHUNK)):
             time = (chunk + 1) * CHUNK * STEP_S
@@ -162,7 +161,7 @@ class Bench:
         return Moment(phase=phase, data=self.data, left=left, right=right, success=0, rise_m=rise, unstable=unstable)
 
     def _touch(self, side: int) -> Touch:
-        """Sum the contact forces on a pad's dome."""
+        """Return the sum of contact forces on a pad's dome."""
         total = np.zeros(3)
         force = np.zeros(6)
         for i in range(self.data.ncon):
@@ -176,6 +175,12 @@ class Bench:
 
     def _on_table(self) -> bool:
         return any(0 in pair for pair in self.data.contact.geom[: self.data.ncon])
+
+
+def _lifted(lift_m: float, time: float) -> float:
+    """Return the height of the hand at ``time`` (s): a smooth step from 0 to ``lift_m`` in ``LIFT_S``."""
+    x = min(time / LIFT_S, 1.0)
+    return lift_m * x * x * (3 - 2 * x)
 
 
 _LOST = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)

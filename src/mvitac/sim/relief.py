@@ -1,9 +1,9 @@
-"""Reliefs: height functions of the plane, one per material instance, evaluated at any scale.
+"""Reliefs: height functions of the plane, one per material instance, which can be evaluated at any scale.
 
-Legend: x, y [H, W] mm on the object; u, v [H, W] the same in wavelengths, turned so that u runs along the grain.
-Every `KINDS` function maps u, v and four random tables to an unscaled height [H, W]. `Relief` then gives all kinds the
-same height distribution (unit RMS, skewness set by `asperity`), so neither amplitude nor contrast tells a kind from
-another: only the arrangement in space does.
+Shapes: x, y [H, W] mm on the object; u, v [H, W] the same in wavelengths, rotated so that u is along the grain.
+Each `KINDS` function maps u, v and four random tables to an unscaled height [H, W]. `Relief` then gives all kinds the same
+height distribution (unit RMS, skewness set by `asperity`), so that kinds differ only in spatial arrangement and not in
+amplitude or contrast.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
-_SIDE = 64  # the random tables repeat after this many wavelengths, more than any picture shows
+_SIDE = 64  # period of the random tables in wavelengths, larger than any picture
 _NEXT = (np.arange(_SIDE) + 1) % _SIDE
 _STEPS = 129
 _NORMAL = ndtri((np.arange(_STEPS) + 0.5) / _STEPS).astype(np.float32)
 
 
 def noise(u: F, v: F, table: F) -> F:
-    """Interpolate a random lattice [64, 64] smoothly at u, v: about zero mean, features as large as 1."""
+    """Interpolate a random lattice [64, 64] smoothly at u, v: mean about zero, features of size 1."""
     fu, fv = np.floor(u), np.floor(v)
     cell, j = fu.astype(np.intp), fv.astype(np.intp)
     a, b = u - fu, v - fv
@@ -30,7 +30,7 @@ def noise(u: F, v: F, table: F) -> F:
         rise = 3 - 2 * s
         s *= s
         s *= rise
-    # Most of the simulator's time goes here: in place, and the step to the next row is taken once per table, not per pixel.
+    # Most of the simulator's time is spent here: in place, with row differences computed once per table, not per pixel.
     flat, step = table.ravel(), np.subtract(table[_NEXT], table).ravel()
     cell &= 63
     cell *= _SIDE
@@ -52,7 +52,7 @@ def noise(u: F, v: F, table: F) -> F:
 
 
 def fractal(u: F, v: F, table: F, octaves: int = 3, fall: float = 0.55) -> F:
-    """Sum noise octaves, each twice as fine and `fall` times as high, turned against lattice artefacts."""
+    """Sum noise octaves, each twice as fine and `fall` times as high, and rotated to hide the lattice."""
     total, height = noise(u, v, table), 1.0
     for _ in range(octaves - 1):
         u, v = 1.62 * u - 1.18 * v + 17.3, 1.18 * u + 1.62 * v + 5.7
@@ -62,7 +62,7 @@ def fractal(u: F, v: F, table: F, octaves: int = 3, fall: float = 0.55) -> F:
 
 
 def cells(u: F, v: F, t: NDArray[np.float32], regular: float = 0.0) -> tuple[F, F, NDArray[np.int32]]:
-    """Return the distances to the nearest and second nearest random point and the nearest point's cell number."""
+    """Return the distances to the nearest and second nearest random point, and the nearest point's cell number."""
     fu, fv = np.floor(u), np.floor(v)
     i, j = fu.astype(np.int32), fv.astype(np.int32)
     a, b = u - fu, v - fv
@@ -109,7 +109,7 @@ def _pebbles(u: F, v: F, t: F) -> F:
 def _facets(u: F, v: F, t: F) -> F:
     _, _, owner = cells(0.6 * u, 0.6 * v, t)
     level, along, across = t[1].ravel()[owner], t[2].ravel()[owner], t[3].ravel()[owner]
-    return level + 0.6 * (along * _sin(0.23 * u) + across * _sin(0.19 * v))  # locally planes, tilted at random
+    return level + 0.6 * (along * _sin(0.23 * u) + across * _sin(0.19 * v))  # planes with random tilt
 
 
 def _crackle(u: F, v: F, t: F) -> F:
@@ -212,18 +212,18 @@ KINDS: dict[str, Callable[[F, F, F], F]] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Relief:
-    """One instance's height function; call it with x, y [H, W] in mm for a height of unit RMS."""
+    """The height function of one instance: call it with x, y [H, W] in mm. The result has unit RMS."""
 
     kind: str
     wavelength_mm: float
     anisotropy: float = 1.0
-    """Stretch along the grain."""
+    """Stretch factor along the grain."""
     irregularity: float = 0.2
-    """0: as regular as the kind allows; 1: bent, uneven and overlaid with debris."""
+    """0: as regular as possible; 1: bent, uneven and covered with debris."""
     asperity: float = 0.0
-    """-1: plateaus with pits and grooves; +1: separate peaks. The skewness R_sk of surface metrology (ISO 21920-2)."""
+    """-1: plateaus with pits and grooves; +1: separate peaks. Skewness R_sk of surface metrology (ISO 21920-2)."""
     tables: F
-    """Random numbers [4, 64, 64] that make this instance itself."""
+    """Random numbers [4, 64, 64] of this instance."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -234,7 +234,7 @@ class Relief:
             )
 
     def __call__(self, x: F, y: F, scale: float = 1.0) -> F:
-        """Return heights [H, W]; `scale` > 1 shows the coarse structure of the same instance."""
+        """Return heights [H, W]; `scale` > 1 gives the coarse structure of the same instance."""
         wave = np.float32(self.wavelength_mm * scale)
         u, v = x / (wave * np.float32(self.anisotropy)), y / wave
         bend = np.float32(0.45 * self.irregularity)
@@ -256,7 +256,7 @@ def draw_tables(rng: np.random.Generator) -> F:
 def skew(height: F, asperity: float) -> F:
     """Give heights [H, W] a log-normal distribution of unit RMS: peaks for `asperity` > 0, pits for < 0.
 
-    The ranks stay, so the arrangement in space does; h and -h under opposite asperity have one and the same spectrum.
+    Ranks do not change, so the spatial arrangement is the same. h and -h with opposite asperity have the same spectrum.
     """
     sample = np.sort(height[1::5, 2::5], axis=None)
     ranks = sample[np.linspace(0, sample.size - 1, _STEPS).astype(np.int64)]
@@ -273,17 +273,13 @@ def skew(height: F, asperity: float) -> F:
 def marks(x: F, y: F, rng: np.random.Generator, *, curl: float, extent_mm: float, count: int = 3) -> F:
     """Draw `count` long narrow ridges or grooves of height 1 over [H, W]: kinked lines for curl 0, folds for curl 1.
 
-    Hard things chip and crack along lines, soft things fold along curves; width, number, height and sign say nothing.
+    Hard objects crack along lines and soft ones fold along curves. Width, number, height and sign carry no information.
     """
     total = np.zeros(np.broadcast_shapes(x.shape, y.shape), np.float32)
     for _ in range(count):
         angle, place, width = rng.uniform(0, np.pi), rng.uniform(-0.4, 0.4), rng.uniform(0.012, 0.022)
-        wave, phase, kink, where = (
-            rng.uniform(0.28, 0.5),
-            rng.uniform(0, 1),
-            rng.uniform(-0.8, 0.8),
-            rng.uniform(-0.3, 0.3),
-        )
+        wave, phase = rng.uniform(0.28, 0.5), rng.uniform(0, 1)
+        kink, where = rng.uniform(-0.8, 0.8), rng.uniform(-0.3, 0.3)
         cos, sin = np.float32(np.cos(angle) / extent_mm), np.float32(np.sin(angle) / extent_mm)
         u, v = cos * x + sin * y, cos * y - sin * x
         turn = np.float32(2 * np.pi / wave)

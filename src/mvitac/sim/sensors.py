@@ -1,4 +1,4 @@
-"""What makes of tactile sensor look like: palettes, LED directions, printed dots, dirt and lens edge."""
+"""Models of tactile sensors: colours, LED directions, printed dots, dirt and lens edge."""
 
 from dataclasses import dataclass
 
@@ -8,28 +8,28 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """What one make of tactile sensor looks like. Colours in 8-bit levels; u, v run from -1 to 1 over the picture."""
+    """Appearance of one type of tactile sensor. Colours are 8-bit levels; u, v are -1 to 1 over the picture."""
 
     name: str
     base: RGB
-    """Level far away from the glow, per channel."""
+    """Level far from the glow, per channel."""
     glow: tuple[tuple[float, float, float, float, float], ...]
-    """Per channel (height in levels, centre u, centre v, width u, width v) of the soft bright spot its LEDs make."""
+    """Per channel (height in levels, centre u, centre v, width u, width v) of the soft bright spot of its LEDs."""
     tilt: tuple[Pair, Pair, Pair]
-    """Per channel the linear change of level along (u, v)."""
+    """Linear change of level along (u, v), per channel."""
     response: tuple[Pair, Pair, Pair]
-    """Per channel the change of level per unit slope along (x, y): the direction its LED shines from."""
+    """Change of level per unit slope along (x, y), per channel: the direction of its LED."""
     saturation: float = 75.0
-    """Level change at which the response bends over."""
+    """Change of level at which the response saturates."""
     shadow: float = 0.35
-    """How much light a ridge takes from what lies behind it, seen from the LED."""
+    """Fraction of light that a ridge takes from the surface behind it, seen from the LED."""
     marker_pitch_mm: float = 0.0
-    """Distance of the printed dots; 0 means no dots."""
+    """Distance between printed dots; 0 = no dots."""
     marker_radius_mm: float = 0.0
     marker_jitter: float = 0.0
-    """Scatter of a dot around its place, as a part of the pitch."""
+    """Standard deviation of a dot's position, as a fraction of the pitch."""
     marker_wear: float = 0.0
-    """0: round full dots; 1: odd shapes, half rubbed off."""
+    """0: round, complete dots; 1: irregular, half worn off."""
     marker_angle_deg: float = 0.0
     dirt: float = 6.0
     """Expected number of specks on the gel."""
@@ -40,14 +40,14 @@ class Sensor:
     noise: float = 1.5
     """Standard deviation of the camera noise in levels."""
     held_out: bool = False
-    """Never drawn for training data: the sensor that tests what was learnt."""
+    """Not used for training data; it tests transfer to a new sensor."""
 
 
 SENSORS: dict[str, Sensor] = {
     s.name: s
     for s in (
         Sensor(
-            name="mini",  # GelSight Mini without dots: teal rim, rose heart, blue sky above, olive ground below
+            name="mini",  # GelSight Mini without dots: teal rim, rose centre, blue above, olive below
             base=(30, 80, 90),
             glow=((98, 0.0, 0.1, 0.62, 0.58), (44, 0.0, -0.05, 0.62, 0.75), (68, 0.0, -0.15, 0.68, 0.56)),
             tilt=((3, 13), (-6, -3), (2, -16)),
@@ -73,7 +73,7 @@ SENSORS: dict[str, Sensor] = {
             edge=0.25,
         ),
         Sensor(
-            name="classic",  # hand-made GelSight: pale, small worn dots, a pastel colour in every corner
+            name="classic",  # hand-made GelSight: pale, with small worn dots and pastel corners
             base=(122, 126, 128),
             glow=((26, -0.35, 0.25, 0.9, 0.8), (26, 0.1, 0.05, 0.9, 1.0), (24, 0.25, 0.0, 0.7, 0.6)),
             tilt=((6, 7), (4, 6), (-8, -13)),
@@ -104,7 +104,7 @@ SENSORS: dict[str, Sensor] = {
             noise=2.6,
         ),
         Sensor(
-            name="slim",  # a sensor nobody trains on: warm light from two sides, white fill, a fine tilted grid
+            name="slim",  # held out: warm light from two sides, white fill, a fine tilted grid
             base=(104, 96, 86),
             glow=((30, 0.35, -0.2, 0.8, 0.9), (28, 0.0, 0.2, 0.9, 0.7), (28, -0.35, 0.1, 0.8, 0.8)),
             tilt=((10, -5), (0, 6), (-10, 3)),

@@ -1,10 +1,10 @@
-"""What covers a thing to grasp: the finish that the camera sees, and the patches of skin that only the gels can feel.
+"""Surfaces of objects to grasp: the finish that the camera sees, and the skin that only the gels can feel.
 
-The skin is a patchwork, every grip meets another patch. Peaks dig into the gel and grip, pits leave a plateau that slides: a
-skewness of opposite sign at one spectrum and one range of depth, so neither contrast nor the size of the imprint tells
-them apart.
+Each grip meets another patch of skin. Peaks dig into the gel and grip; pits leave a plateau that slides. Both have the same
+spectrum and range of depth and differ only in the sign of the skewness, so that neither contrast nor the size of the
+imprint distinguishes them.
 
-Shapes: N points, in millimetres in the thing's own frame (`objects.py`).
+Shapes: N points, in millimetres in the object's frame (`objects.py`).
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 PATTERNS = ("ribs", "knurl", "grain", "bumps")
 
 PEAKS = 0.76
-"""Part of the patches whose relief is peaks."""
+"""Fraction of patches with peaks."""
 
 GRIPS, SLIDES = 0.85, 0.3
-"""Sliding friction against the gel of a relief of peaks and of pits."""
+"""Friction coefficients against the gel for peaks and for pits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pattern:
-    """A procedural texture in a thing's own coordinates: few high places, much low ground."""
+    """A procedural texture in the object's frame, with few high and many low points."""
 
     kind: str
     """One of ``PATTERNS``."""
@@ -35,7 +35,7 @@ class Pattern:
     """Their phases [7] in radians."""
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return the pattern in [-1, 1] at points [N, 3] of the thing's frame."""
+        """Return the pattern in [-1, 1] at points [N, 3] of the object's frame."""
         angle = points_mm @ self.waves.T * (2 * np.pi / self.wavelength_mm) + self.phases
         if self.kind == "ribs":
             wave = np.sin(angle[:, 0])
@@ -50,7 +50,7 @@ class Pattern:
 
 @dataclass(frozen=True, kw_only=True)
 class Finish:
-    """What a thing looks like to the camera; it says nothing about friction."""
+    """Appearance of an object in the camera; it is independent of friction."""
 
     printed: Pattern
     color: np.ndarray
@@ -63,25 +63,25 @@ class Finish:
 
 @dataclass(frozen=True, kw_only=True)
 class Patch:
-    """The piece of skin that one grip meets. Its relief is too fine for the camera; the gels feel it."""
+    """The skin under one grip. Its relief is visible to the gels, but too fine for the camera."""
 
     pattern: Pattern
     peaks: bool
-    """Whether the pattern stands out of the surface, which grips, or is sunk into it, which slides."""
+    """Whether the pattern is raised, which grips, or sunk, which slides."""
     amplitude_mm: float
-    """Half the height from the deepest to the highest points; the same for peaks and pits."""
+    """Half the height between lowest and highest points."""
     friction: float
     """Sliding friction coefficient against the gel."""
 
     def relief_mm(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return the relief in mm at points [N, 3] of the thing's frame."""
+        """Return the relief in mm at points [N, 3] of the object's frame."""
         return (self.amplitude_mm if self.peaks else -self.amplitude_mm) * self.pattern(points_mm)
 
 
 def _pattern(rng: np.random.Generator, low_mm: float, high_mm: float) -> Pattern:
     kind = str(rng.choice(PATTERNS))
     waves = rng.normal(size=(7, 3))
-    # The flanks that meet the pads face x: a wave along x would be invisible to the gel.
+    # The sides that touch the pads face x, so a wave along x would be invisible to the gel.
     waves[:, 0] *= 0.3
     waves /= np.linalg.norm(waves, axis=1, keepdims=True)
     if kind in ("knurl", "bumps"):
@@ -93,8 +93,8 @@ def _pattern(rng: np.random.Generator, low_mm: float, high_mm: float) -> Pattern
 
 
 def draw_finish(rng: np.random.Generator) -> Finish:
-    """Draw what a thing looks like."""
-    # Saturated, so that a thing stands out from the pale tables: the picture should tell where it is gripped.
+    """Draw the appearance of an object."""
+    # Saturated, so that the object differs from the pale tables and the picture shows where it is gripped.
     color = rng.permutation([rng.uniform(0.02, 0.15), rng.uniform(0.02, 0.9), rng.uniform(0.6, 0.95)])
     return Finish(
         printed=_pattern(rng, 8, 20),

@@ -1,1 +1,1 @@
-"""What the operating system gives: files, locks, processes, devices, memory, many machines."""
+"""Files, locks, processes, devices, memory, distributed training."""

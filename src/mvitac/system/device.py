@@ -11,7 +11,7 @@ SIDE = 256
 
 
 def pick_device(name: str) -> torch.device:
-    """The device of ``Run.device``; ValueError if it is not there."""
+    """Return the device called ``name`` (``Run.device``); ValueError if it does not exist."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -20,16 +20,16 @@ def pick_device(name: str) -> torch.device:
         raise ValueError(f"unknown device {name!r}: give auto, cpu, cuda or cuda:N") from None
     there = {"cpu": True, "cuda": True, "mps": torch.backends.mps.is_available()}
     if not there.get(device.type):
-        raise ValueError(f"device {name!r} is not there or not supported: give auto, cpu, cuda or cuda:N")
+        raise ValueError(f"device {name!r} does not exist or is not supported: give auto, cpu, cuda or cuda:N")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise ValueError(
-            f"device {name!r} is not there: torch sees {torch.cuda.device_count()} CUDA GPUs; use cpu or auto"
+            f"device {name!r} does not exist: torch sees {torch.cuda.device_count()} CUDA GPUs; use cpu or auto"
         )
     return device
 
 
 def describe(device: torch.device) -> str:
-    """The device for the record: a GPU by name, a CPU with its number of threads."""
+    """Return a description of the device: the name of a GPU, or the number of CPU threads."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"{device.type}, {torch.get_num_threads()} threads"

@@ -1,12 +1,13 @@
-"""Many processes, one batch: rank, gather, the sum of gradients, synchronised BatchNorm. Started by torchrun.
+"""Distributed training with torchrun: gather embeddings, sum gradients, synchronise BatchNorm.
 
-Without torchrun there is a world of one and everything here does nothing. Process r embeds its own rows; the embeddings
-of all are gathered, each process takes the whole loss and so holds the full gradient of its own embeddings; parameter
-gradients are then summed. That is the gradient of one process on the joint batch (tests/training/test_distributed.py).
+Without torchrun there is one process and all functions do nothing. Each process embeds its own rows. Embeddings of all
+processes are gathered, and each process computes the whole loss, so it has the full gradient of its own embeddings.
+Parameter gradients are then summed. The result is the gradient of a single process on the joint batch
+(tests/training/test_distributed.py).
 
-Of memory that is sharded, process r holds rows r, r + size, ... (`shard`). What it makes of these with embeddings that all
-have goes through `spread`, what comes of it through `sum`: value and gradient are then complete on every process (the f
-and g of Shoeybi et al., arXiv:1909.08053).
+If a memory bank is sharded, process r has rows r, r + size, ... (`shard`). Inputs that are equal on all processes go through
+`spread`, and partial results of the shards through `sum`, so that values and gradients are complete on every process (the
+operators f and g of Shoeybi et al., arXiv:1909.08053).
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class World:
-    """Who takes part: this process is ``rank`` of ``size``."""
+    """The processes of a run: this one is ``rank`` of ``size``."""
 
     rank: int = 0
     size: int = 1
 
     @property
     def writes(self) -> bool:
-        """Only one process writes files and progress."""
+        """Whether this process writes files and shows progress (rank 0)."""
         return self.rank == 0
 
     def gather(self, own: Tensor) -> Tensor:
-        """[B, ...] of every process, in the order of ranks: [size * B, ...]; B must be the same everywhere."""
+        """Concatenate [B, ...] of all processes in the order of ranks to [size * B, ...]; B must be equal everywhere."""
         if self.size == 1:
             return own
         everyones = [torch.empty_like(own) for _ in range(self.size)]
@@ -41,23 +42,23 @@ class World:
         return torch.cat(everyones)
 
     def own(self, everyones: Tensor, num: int) -> Tensor:
-        """This process's ``num`` rows of what ``gather`` made."""
+        """Return this process's ``num`` rows of a gathered tensor."""
         return everyones[self.rank * num : (self.rank + 1) * num]
 
     def sum(self, part: Tensor) -> Tensor:
-        """The sum of every process's ``part``; its gradient, the same on all, is that of each part."""
+        """Return the sum of ``part`` over processes. The gradient of each part is that of the sum."""
         return part if self.size == 1 else _Sum.apply(part, True, False)  # type: ignore[return-value]
 
     def spread(self, value: Tensor) -> Tensor:
-        """``value``, which all processes have, for each to make a part of a ``sum`` of: its gradients are summed."""
+        """Return ``value``, which is equal on all processes. Its gradients are summed over processes."""
         return value if self.size == 1 else _Sum.apply(value, False, True)  # type: ignore[return-value]
 
     def shard(self, whole: Tensor) -> Tensor:
-        """The rows of ``whole`` [N, ...] that this process holds where memory is sharded: rank, rank + size, ..."""
+        """Return this process's rows of ``whole`` [N, ...]: rank, rank + size, ..."""
         return whole[self.rank :: self.size]
 
     def unshard(self, own: Tensor, num: int) -> Tensor | None:
-        """All ``num`` rows of which ``own`` is this process's ``shard``: on rank 0 in main memory, None elsewhere."""
+        """Collect all ``num`` rows from the shards (``own``) in main memory of rank 0; return None on other ranks."""
         if self.size == 1:
             return own
         if self.rank:
@@ -73,7 +74,7 @@ class World:
         return whole
 
     def sum_gradients(self, module: nn.Module) -> None:
-        """Add up the gradients of all processes, in one message."""
+        """Sum the gradients over processes, in one message."""
         if self.size == 1:
             return
         gradients = [p.grad for p in module.parameters() if p.grad is not None]
@@ -89,7 +90,7 @@ class World:
                 dist.broadcast(tensor, 0)
 
     def anyone(self, flag: bool) -> bool:
-        """Whether ``flag`` is set on any process; all must ask together."""
+        """Return whether ``flag`` is true on any process; all processes must call this."""
         if self.size == 1:
             return flag
         value = torch.tensor(float(flag), device=local_device("cuda") if dist.get_backend() == "nccl" else "cpu")
@@ -97,13 +98,13 @@ class World:
         return bool(value > 0)
 
     def wait(self) -> None:
-        """Until every process has come here."""
+        """Wait until all processes have called this."""
         if self.size > 1:
             dist.barrier()
 
 
 def join() -> World:
-    """The world torchrun started this process in (NCCL with GPUs, else gloo), or a world of one without it."""
+    """Return the processes started by torchrun (NCCL with GPUs, else gloo), or a world of one."""
     if "WORLD_SIZE" not in os.environ or int(os.environ["WORLD_SIZE"]) == 1:
         return World()
     if not dist.is_initialized():
@@ -112,29 +113,29 @@ def join() -> World:
 
 
 def local_device(name: str) -> str:
-    """The device of this process: under torchrun with GPUs its own one, whatever `auto` or `cuda` says."""
+    """Return the device of this process: its own GPU under torchrun if ``name`` is `auto` or `cuda`."""
     if name in ("auto", "cuda") and "LOCAL_RANK" in os.environ and torch.cuda.is_available():
         return f"cuda:{os.environ['LOCAL_RANK']}"
     return name
 
 
 def synchronise_norms(module: nn.Module, world: World) -> nn.Module:
-    """Let every BatchNorm take its statistics over all processes: torch's on GPUs, `SyncedBatchNorm` elsewhere."""
+    """Make every BatchNorm compute statistics over all processes: torch's on GPUs, `SyncedBatchNorm` elsewhere."""
     if world.size == 1:
         return module
     if next(module.parameters()).is_cuda:
         return nn.SyncBatchNorm.convert_sync_batchnorm(module)
     for layer in module.modules():
         if type(layer) in (nn.BatchNorm1d, nn.BatchNorm2d):
-            layer.__class__ = SyncedBatchNorm  # the same state, another forward
+            layer.__class__ = SyncedBatchNorm  # same state, different forward
     return module
 
 
 class SyncedBatchNorm(nn.BatchNorm2d):
-    """BatchNorm over the batches of all processes, for backends that torch's SyncBatchNorm does not serve (gloo).
+    """BatchNorm over the batches of all processes, for backends that torch's SyncBatchNorm does not support (gloo).
 
-    Takes [B, C] and [B, C, H, W]; every process must have the same B. Statistics in fp32. One message per pass; the
-    arithmetic is that of torch's own kernels, with everyone's statistics.
+    Inputs are [B, C] or [B, C, H, W] with the same B on all processes. Statistics are fp32, with one message per pass. The
+    arithmetic is torch's own kernels with the joint statistics.
     """
 
     def _check_input_dim(self, input: Tensor) -> None:
@@ -162,11 +163,11 @@ class SyncedBatchNorm(nn.BatchNorm2d):
 
 
 class _Normalise(torch.autograd.Function):
-    """(x - mean) / sqrt(variance + eps) * weight + bias, where mean and variance are those of all processes' x.
+    """(x - mean) / sqrt(variance + eps) * weight + bias, with mean and variance over all processes.
 
-    Gradient of x: with s = weight / sqrt(variance + eps), n the number of values of all processes per channel, y the
-    normalised x and sums over all processes, s g - s (sum(g) + y sum(g y)) / n. Both terms are kernels of BatchNorm with
-    fixed statistics: its backward, and itself with another weight and bias.
+    The gradient of x is s g - s (sum(g) + y sum(g y)) / n, where s = weight / sqrt(variance + eps), n is the number of
+    values per channel on all processes, y is the normalised x, and sums are over all processes. Both terms are kernels of
+    BatchNorm with fixed statistics: its backward, and its forward with other weight and bias.
     """
 
     @staticmethod
@@ -190,7 +191,7 @@ class _Normalise(torch.autograd.Function):
 
 
 class _Sum(torch.autograd.Function):
-    """All-reduce by sum: of the value, of its gradient, or of both."""
+    """All-reduce (sum) of the value, of its gradient, or of both."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, there: bool, back: bool) -> Tensor:
@@ -209,7 +210,7 @@ def _all_reduced(value: Tensor) -> Tensor:
 
 
 def _everyones(own: Tensor) -> Tensor:
-    """[size, ...]: ``own`` of every process."""
+    """Return ``own`` of every process as [size, ...]."""
     found = [torch.empty_like(own) for _ in range(dist.get_world_size())]
     dist.all_gather(found, own)
     return torch.stack(found)

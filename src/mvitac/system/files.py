@@ -1,4 +1,4 @@
-"""Files written atomically, read with clear errors, and told by their digests."""
+"""Atomic writes, reads with clear errors, digests of files."""
 
 from __future__ import annotations
 
@@ -15,10 +15,14 @@ from typing import Any, BinaryIO
 
 
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:
-    """Let ``write`` fill a neighbouring file, then rename it over ``path``: a reader never sees half of it.
+    """Write a temporary file next to ``path``, then rename it to ``path``, so that no reader sees a partial file.
 
-    Without ``sync`` that holds against a killed process, not against lost power, and nothing waits for the disk.
-    On any failure (a full disk, Ctrl-C) the half-written neighbour is removed and ``path`` keeps its old content.
+    If it fails (full disk, Ctrl-C), the temporary file is removed and ``path`` is unchanged.
+
+    Args:
+        path: The file to write. Missing folders are created.
+        write: Called with the open file.
+        sync: Flush to disk, which protects against power loss. Without it, only a killed process is safe.
     """
     made = [parent for parent in path.parents if not parent.exists()]
     neighbour = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
@@ -33,18 +37,18 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
     except BaseException as error:
         with contextlib.suppress(OSError):
             neighbour.unlink(missing_ok=True)
-            for parent in made:  # deepest first; only empty ones go
+            for parent in made:  # deepest first; rmdir removes empty folders only
                 parent.rmdir()
         if isinstance(error, OSError) and error.filename in (None, str(neighbour)):
-            if error.errno is None:  # numpy's own "1000 requested and 0 written", of a large array on a full disk
+            if error.errno is None:  # numpy raises "1000 requested and 0 written" on a full disk
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
-            error.filename = str(path)  # the system names no file when a write fails
+            error.filename = str(path)  # a failed write has no file name
         raise
 
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Name ``path`` in an error of writing it: the system names no file when a disk is full."""
+    """Add ``path`` to errors of writing it, because an error of a full disk has no file name."""
     try:
         yield
     except OSError as error:
@@ -53,12 +57,12 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def check_place(path: Path) -> None:
-    """ValueError if nothing can be written at ``path``, found out before the work whose result belongs there."""
+    """Raise ValueError if ``path`` cannot be written. Call it before the work whose result is written there."""
     if "\0" in str(path):
         raise ValueError(f"{path}: a name cannot hold a NUL character, choose another")
     parent = next(p for p in path.absolute().parents if os.path.lexists(p))
     try:
-        path.exists()  # says so itself where the name is too long
+        path.exists()  # raises OSError if the name is too long
         if not parent.is_dir():
             raise ValueError(f"{path} cannot be written: {parent} is not a folder, choose another place")
         with tempfile.TemporaryFile(dir=parent):
@@ -68,41 +72,41 @@ def check_place(path: Path) -> None:
 
 
 def brief(error: BaseException) -> str:
-    """The first line of a library's error, at most 160 characters, to quote in one of ours."""
+    """Return the first line of a library's error, at most 160 characters, to quote in an error message."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
 
 
 def write_json(path: Path, value: Any) -> None:
-    """``value`` as indented JSON, atomically."""
+    """Write ``value`` as indented JSON, atomically."""
     text = json.dumps(value, indent=1, allow_nan=False) + "\n"
     write_atomic(path, lambda file: file.write(text.encode()))
 
 
 def read_json(path: Path, what: str) -> Any:
-    """The JSON in ``path``; ValueError says which file is missing or damaged. ``what`` names it for the reader."""
+    """Read a JSON file; ValueError says if it is missing or damaged. ``what`` describes it in the message."""
     try:
         return json.loads(path.read_text())
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist: {what} is missing there") from None
     except (IsADirectoryError, NotADirectoryError):
-        raise ValueError(f"{path} is no file but a folder, or lies below a file: give the file of {what}") from None
-    except (ValueError, RecursionError) as error:  # also: no UTF-8, numbers of 5000 digits, a million brackets
+        raise ValueError(f"{path} is a folder, or is below a file: give the file of {what}") from None
+    except (ValueError, RecursionError) as error:  # also: invalid UTF-8, numbers of 5000 digits, a million brackets
         raise ValueError(f"{path} is not valid JSON ({brief(error)}): {what} is damaged") from None
 
 
 def digest(value: Any) -> str:
-    """sha256 (hex) of a JSON-ready value, independent of key order."""
+    """Return the sha256 (hex) of a JSON-ready value, independent of key order."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def digest_file(path: Path) -> str:
-    """sha256 (hex) of a file's bytes."""
+    """Return the sha256 (hex) of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def cache_dir() -> Path:
-    """Where packs and features are kept: $MVITAC_CACHE, else $XDG_CACHE_HOME/mvitac, else ~/.cache/mvitac."""
+    """Return the cache of packs and features: $MVITAC_CACHE, else $XDG_CACHE_HOME/mvitac, else ~/.cache/mvitac."""
     if "MVITAC_CACHE" in os.environ:
         return Path(os.environ["MVITAC_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mvitac"

@@ -1,4 +1,4 @@
-"""One process at a time: who makes a pack or trains a run holds a lock beside it, which ends with the process, however."""
+"""File locks: one process per pack or run. A lock is released even if its process is killed."""
 
 from __future__ import annotations
 
@@ -12,25 +12,30 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 
 _held: ContextVar[frozenset[Path]] = ContextVar("_held", default=frozenset())
-"""Places that this thread holds."""
+"""Paths whose locks this thread holds."""
 
 
 class Busy(ValueError):
-    """Another process is at it."""
+    """Another process holds the lock."""
 
 
 @contextmanager
 def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Iterator[None]:
-    """Hold ``<place>.lock``. If another process does: say ``busy`` (not if ``quiet``) and wait for it, or raise Busy(busy).
+    """Hold the file lock ``<place>.lock``. A thread may hold the same lock twice.
 
-    Between machines, too, as far as their shared file system keeps locks; on one that knows none nobody waits. A thread may
-    hold a place it holds already.
+    Locks work between machines if their shared file system supports them; otherwise nothing is locked.
+
+    Args:
+        place: Path of the pack or run.
+        busy: Message if another process holds the lock.
+        wait: Wait for the other process, after printing ``busy``; otherwise raise ``Busy``.
+        quiet: Do not print ``busy``.
     """
     place = place.absolute()
     if place in _held.get():
         yield
         return
-    # No soft lock there: it would outlive a process that was killed.
+    # No soft lock: it would remain after a process is killed.
     lock = FileLock(place.with_name(place.name + ".lock"), fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)
@@ -48,5 +53,5 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
         yield
     finally:
         _held.reset(token)
-        Path(lock.lock_file).unlink(missing_ok=True)  # filelock tells a deleted file from a lock
+        Path(lock.lock_file).unlink(missing_ok=True)  # filelock detects a deleted lock file
         lock.release()

@@ -1,7 +1,7 @@
-"""Memory that is kept instead of handed back to the system between steps: every page taken anew costs a page fault.
+"""Keeps freed memory in the process instead of returning it to the system, to avoid page faults.
 
-Arrays over 128 KiB are mapped and unmapped by glibc one by one, and the kernel zeroes each page on first touch. A loop
-that makes the same large temporaries again and again then spends a third of its time there (docs/speed.md).
+By default, glibc maps and unmaps each array over 128 KiB separately, and the kernel zeroes each new page. A loop that
+allocates the same large arrays repeatedly spends a third of its time there (docs/speed.md).
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ _KEPT = 1 << 30
 
 
 def keep_freed_memory() -> bool:
-    """Let this process's malloc keep up to 1 GiB of freed memory; returns whether it can (glibc only).
+    """Let malloc keep up to 1 GiB of freed memory; return whether this worked (glibc only).
 
-    Changes no result, only where arrays lie. The price is that the process holds on to its peak.
+    Results do not change. The process keeps its peak memory usage.
     """
     if not sys.platform.startswith("linux"):
         return False

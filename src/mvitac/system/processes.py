@@ -1,7 +1,6 @@
-"""Work side by side: processes with their share of the cores or a GPU each, and threads with their share of the cores.
+"""Parallel work: processes with their share of cores or one GPU each, and threads with their share of cores.
 
-No process outlives the command's own, so a command that was killed can be given again at once, and finds no one writing to
-its folders.
+Child processes end when the command's process ends, so a killed command can be started again immediately.
 """
 
 from __future__ import annotations
@@ -11,13 +10,15 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache, partial
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -26,7 +27,7 @@ _device = "auto"
 
 @contextmanager
 def _answer(number: int, handler: Any) -> Iterator[None]:
-    """``handler`` of a signal for as long as the ``with`` lasts; nothing in other threads than the main one."""
+    """Set a signal handler inside the ``with``; do nothing in threads other than the main thread."""
     here = threading.current_thread() is threading.main_thread()
     before = signal.signal(number, handler) if here else None
     try:
@@ -37,7 +38,7 @@ def _answer(number: int, handler: Any) -> Iterator[None]:
 
 
 class _DeafProcess(SpawnProcess):
-    """Ctrl-C is for its parent to hear: while it imports, it would only answer with a traceback."""
+    """A process that ignores Ctrl-C, which its parent handles: during imports it would only print a traceback."""
 
     def start(self) -> None:
         with _answer(signal.SIGINT, signal.SIG_IGN):
@@ -50,13 +51,13 @@ class _Context(SpawnContext):
 
 @contextmanager
 def side_by_side(num: int, devices: Sequence[str] = ()) -> Iterator[ProcessPoolExecutor]:
-    """A pool of ``num`` spawned processes; each takes one of ``devices``, if given, for its life (``my_device``).
+    """Create a pool of ``num`` spawned processes; each uses one of ``devices``, if given (``my_device``).
 
-    On Ctrl-C or SIGTERM, which is a KeyboardInterrupt here, or any other error in the ``with``, nothing more is begun and
-    what is under way gets SIGTERM: training saves its checkpoint and stops after its step, anything else is cut off.
+    On Ctrl-C, SIGTERM (raised as KeyboardInterrupt) or any other error in the ``with``, no further task is started and
+    running ones get SIGTERM: training saves a checkpoint after its step and stops, other tasks are killed.
     """
     context = _Context()
-    places, stop = context.Queue(), context.Semaphore(0)  # an Event would wait for sleepers that have died
+    places, stop = context.Queue(), context.Semaphore(0)  # not an Event: that would wait for processes that died
     for i in range(num):
         places.put(devices[i % len(devices)] if devices else "auto")
     threads = max(1, (os.cpu_count() or 1) // num)
@@ -74,15 +75,15 @@ def side_by_side(num: int, devices: Sequence[str] = ()) -> Iterator[ProcessPoolE
 
 
 def my_device() -> str:
-    """The device of this process: "auto" where none was given to it."""
+    """Return the device of this process; "auto" if it was given none."""
     return _device
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """``function`` of every item, in order, several at a time, each with its share of torch's threads.
+    """Apply ``function`` to each item in several threads, each with its share of torch's threads; results are in order.
 
-    For work on the CPU that releases the interpreter and draws nothing from global generators: networks of different
-    models, fits. Several such of few threads get more out of the cores than one of many.
+    Use it for CPU work that releases the GIL and does not use global random generators, such as forward passes of different
+    models. Several tasks with few threads each are faster than one task with many.
     """
     threads = torch.get_num_threads()
     num = min(len(items), 2 * threads)
@@ -97,22 +98,90 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
         torch.set_num_threads(threads)
 
 
+def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dict[Hashable, Tensor]:
+    """The tensors of all ``branches``, which share no parameters and draw no random numbers: networks that are trained
+    together, each in a thread with its share of torch's threads. ``backward()`` takes them side by side as well.
+
+    Two networks of one thread each get more out of two cores than one network of two threads, which wait for each other
+    after every layer. In fp32 the numbers are those of one thread, bit for bit.
+    """
+    threads = torch.get_num_threads()
+    if threads < 2 or len(branches) < 2 or torch.compiler.is_compiling() or torch.distributed.is_initialized():
+        return {name: tensor for branch in branches for name, tensor in branch().items()}
+    cpu = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu"), torch.is_grad_enabled()
+
+    def in_this_mode(branch: Callable[[], dict[Hashable, Tensor]]) -> dict[Hashable, Tensor]:
+        # A thread begins without these modes. Autocast's cache belongs to all threads, and whoever ends first empties it.
+        cast = torch.autocast("cpu", cpu[1], enabled=cpu[0], cache_enabled=False)
+        with cast, torch.set_grad_enabled(cpu[2]):
+            return branch()
+
+    named: list[Hashable] = []
+    given = _Branches.apply(torch.empty(0, requires_grad=True), [partial(in_this_mode, b) for b in branches], named)
+    return dict(zip(named, given, strict=True))  # type: ignore[arg-type]
+
+
+class _Branches(torch.autograd.Function):
+    """Cuts the graph: the branches keep theirs, and are taken backward when the gradients of all their tensors are there."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, anchor: Tensor, branches: list[Callable[[], dict[Hashable, Tensor]]], named: list[Hashable]
+    ) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)  # what no loss uses gets none, instead of zeros
+        made = _at_once(branches)
+        named += [name for tensors in made for name in tensors]
+        ctx.made = [list(tensors.values()) for tensors in made]
+        cut = [[tensor.detach() for tensor in tensors] for tensors in ctx.made]
+        both = [(c, t) for cuts, tensors in zip(cut, ctx.made, strict=True) for c, t in zip(cuts, tensors, strict=True)]
+        ctx.mark_non_differentiable(*(c for c, t in both if not t.requires_grad))
+        return tuple(c for c, _ in both)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[None, None, None]:
+        left = iter(gradients)
+        pairs = [[(t, g) for t in tensors if (g := next(left)) is not None] for tensors in ctx.made]
+        given = [tuple(zip(*used, strict=True)) for used in pairs if used]
+        _at_once([partial(torch.autograd.backward, *each) for each in given])
+        return None, None, None
+
+
+def _at_once(calls: Sequence[Callable[[], Result]]) -> list[Result]:
+    """The results of ``calls``, the first in this thread, each with its share of torch's threads."""
+    threads = torch.get_num_threads()
+    share = max(1, threads // max(1, len(calls)))
+    torch.set_num_threads(share)
+    try:
+        others = [_pool(len(calls) - 1, share).submit(call) for call in calls[1:]]
+        return [calls[0](), *(other.result() for other in others)] if calls else []
+    finally:
+        torch.set_num_threads(threads)
+
+
+@cache
+def _pool(num: int, threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num, "branch", torch.set_num_threads, (threads,))
+
+
 def _start(places: Any, threads: int, stop: Any) -> None:
     global _device
     _device = places.get()
     torch.set_num_threads(threads)
     parent = multiprocessing.parent_process()
     assert parent is not None
+    threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
+    threading.Thread(target=_terminate_on, args=(stop,), daemon=True).start()
 
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
 
-    def obey() -> None:
-        stop.acquire()
-        while True:  # training answers by stopping, but a further task may lie ready
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(1)
+def _exit_after(parent: Any) -> None:
+    """End this process when its parent ends."""
+    parent.join()
+    os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
-    threading.Thread(target=obey, daemon=True).start()
+
+def _terminate_on(stop: Any) -> None:
+    """Send SIGTERM to this process after ``stop`` is released."""
+    stop.acquire()
+    while True:  # training stops after one signal, but the next task may be queued
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(1)

@@ -1,4 +1,4 @@
-"""Provenance of a result: library versions, the machine and the git commit."""
+"""Provenance of results: library versions, machine and git commit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LIBRARIES = (
 
 
 def provenance() -> dict[str, Any]:
-    """Versions, machine and git commit to stand beside a result."""
+    """Return library versions, machine and git commit, to store with a result."""
     versions = {}
     for library in LIBRARIES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -31,17 +31,16 @@ def provenance() -> dict[str, Any]:
 
 
 def git_commit() -> str | None:
-    """Commit of the checkout this package is imported from, '+' appended when it has changes; None outside one."""
-    here = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(here), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
+    """Return the commit of the checkout this package is imported from, with '+' if it has changes; None outside one."""
     try:
-        top = Path(git("rev-parse", "--show-toplevel"))
-        if here != top / "src" / "mvitac" / "system":
-            return None  # installed below somebody else's repository
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", "src") else "")
+        top = Path(_git("rev-parse", "--show-toplevel"))
+        if Path(__file__).parent != top / "src" / "mvitac" / "system":
+            return None  # installed inside another repository
+        return _git("rev-parse", "HEAD") + ("+" if _git("status", "--porcelain", "--", "src") else "")
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()

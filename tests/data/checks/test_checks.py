@@ -168,10 +168,10 @@ FAULTS = {
     "near-copies": ("near-copies across splits", "look", "vision: 16 of"),
     "leak": ("groups across splits", "broken", "e.g. 'object 0'; 1 of 5 in test are also in train"),
     "labels": ("missing labels", "look", "first 00-01"),
-    "numbers": ("numbers", "look", "force is no number in 1 of 320 (0.3 %), first row 41"),
+    "numbers": ("numbers", "look", "force is not a number in 1 of 320 (0.3 %), first row 41"),
     "range": ("numbers", "look", "force is 1e+06 in row 41"),
-    "sensor": ("sensors and resolutions", "look", "sensor alone tells material to 100 %"),
-    "give-away": ("columns that give a label away", "look", "force tells material to 91 %"),
+    "sensor": ("sensors and resolutions", "look", "sensor alone predicts material with 100 % accuracy"),
+    "give-away": ("columns that give a label away", "look", "force predicts material with 91 % accuracy"),
     "published": ("published: objects", "look", "20 found, 21 published; missing 20"),
 }
 
@@ -294,7 +294,7 @@ def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main([*command, "--json", str(tmp_path / "leak.json")]) == 2
     told = {f["item"]: f for f in json.loads((tmp_path / "leak.json").read_text())["findings"]}
     assert told["groups across splits"]["verdict"] == told["unreadable items"]["verdict"] == "broken"
-    assert "group (group): 1 of 20 on two sides, e.g. 'g0'" in told["groups across splits"]["evidence"]
+    assert "group (group): 1 of 20 in more than one split, e.g. 'g0'" in told["groups across splits"]["evidence"]
     assert main([*command, "--sheet", "sheet.jpg"]) == 2
     assert "ends in .png" in capsys.readouterr().err
     assert main(["data", "check", str(tmp_path / "nothing")]) == 2
@@ -455,7 +455,7 @@ def test_what_was_not_compared_is_not_called_well(tmp_path: Path) -> None:
 
     findings = {f.item: f for f in examine(build(Untested(), tmp_path / "p", size=SIDE, quiet=True))}
     near, colour = findings["near-copies across splits"], findings["red and blue swapped"]
-    assert (near.verdict, near.evidence) == ("not checkable", "vision: all on one side; touch: all on one side")
+    assert (near.verdict, near.evidence) == ("not checkable", "vision: all in one split; touch: all in one split")
     assert colour.verdict == "not checkable" and "colours vary too much to tell" in colour.evidence
 
 
@@ -473,9 +473,9 @@ def test_other_keys_and_other_splits_are_looked_at_too(tmp_path: Path) -> None:
     pack = build(Recorded(), tmp_path / "p", size=SIDE, quiet=True)
     findings = {f.item: f for f in examine(pack)}
     own, fold = findings["groups across splits"], findings["groups across column fold1"]
-    assert own.verdict == "look" and "recording: 4 of 4 on two sides" in own.evidence
+    assert own.verdict == "look" and "recording: 4 of 4 in more than one split" in own.evidence
     assert "4 of 4 in test are also in train" in own.evidence
-    assert fold.verdict == "broken" and "group (object): 20 of 20 on two sides" in fold.evidence
+    assert fold.verdict == "broken" and "group (object): 20 of 20 in more than one split" in fold.evidence
 
 
 def test_half_a_dataset_in_the_other_order_is_seen_too(tmp_path: Path) -> None:

@@ -1,11 +1,11 @@
-"""`mvitac data check`: what is wrong with a dataset, item by item, before anybody trains on it.
+"""`mvitac data check`: finds errors in a dataset before training.
 
     examine.py         all checks of a pack, or of a source packed as thumbnails before it is packed
-    image_stats.py     one pass over the images: thumbnails, ranges, exact digests
-    image_checks.py    what images alone tell: constant, grayscale, red and blue swapped, modalities swapped, out of step
-    table_checks.py    what the table tells: labels, classes, leaks between splits, sensors, numbers, published counts
+    image_stats.py     one pass over the images: thumbnails, standard deviations, digests
+    image_checks.py    checks of images: constant, grayscale, red and blue swapped, modalities swapped, time offset
+    table_checks.py    checks of the table: labels, classes, leaks between splits, sensors, numbers, published counts
     duplicates.py      exact and near duplicates across splits
-    contact_sheet.py   the suspicious rows as a picture
+    contact_sheet.py   an image of the suspicious rows
 
-A check returns a ``Finding``; it never changes anything. Heuristics say "look", facts say "broken".
+A check returns a ``Finding`` and changes nothing. Heuristics give the verdict "look", facts "broken".
 """

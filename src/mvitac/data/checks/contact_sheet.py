@@ -1,4 +1,4 @@
-"""The suspicious rows as one picture: a strip per finding, vision beside touch, the row's id below."""
+"""An image of the suspicious rows: one strip per finding, vision next to touch, the row's id below."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mvitac.data.pack import Pack
 
 SIDE, NUM_SHOWN, LINE = 96, 8, 14
 MISSING = 225
-"""Gray level of an image that a row does not have."""
+"""Gray level shown for a missing image."""
 Strips = dict[str, list[tuple[str, np.ndarray]]]
 """Finding -> (caption, uint8 [SIDE, width, 3]) of its first rows."""
 
 
 def strips_of(pack: Pack, findings: Sequence[Finding]) -> Strips:
-    """The pictures behind the findings that point at rows."""
+    """Return the strips of the findings that list rows."""
     ids, splits = pack.column("id").astype(str), pack.column("split").astype(str)
     strips: Strips = {}
     for finding in findings:
@@ -34,16 +34,14 @@ def _row(pack: Pack, row: int) -> np.ndarray:
     images = [
         fit(np.asarray(pack.images[m][row]), SIDE)
         if pack.has(m)[row]
-        else np.full(
-            (SIDE, SIDE, pack.spec.channels(m)), MISSING, np.uint8
-        )  # the zeros in its place are no black image
+        else np.full((SIDE, SIDE, pack.spec.channels(m)), MISSING, np.uint8)
         for m in pack.spec.modalities
     ]
     return np.concatenate([part for image in images for part in np.split(image, image.shape[2] // 3, axis=2)], axis=1)
 
 
 def draw(file: BinaryIO, strips: Strips) -> None:
-    """Write ``strips`` as a PNG; without any, a note that there is nothing to see."""
+    """Write ``strips`` as a PNG; without any, write a note that nothing is suspicious."""
     width = max([720, *(sum(image.shape[1] + 6 for _, image in strip) for strip in strips.values())])
     height = (SIDE + 2 * LINE + 12) * len(strips) or 2 * LINE
     sheet = Image.new("RGB", (width, height), "white")

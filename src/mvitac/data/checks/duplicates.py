@@ -1,4 +1,4 @@
-"""Copies across splits: identical pixels, and near-copies by the correlation of what is not in every picture."""
+"""Duplicates across splits: identical pixels, and near-duplicates by correlation of residual thumbnails."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from mvitac.data.checks.table_checks import sides_of
 from mvitac.data.pack import Pack
 
 NEAR = 0.975
-"""Correlation of two residual thumbnails from which they count as near-copies, whatever the data."""
+"""Upper limit of the correlation threshold for near-duplicates."""
 NEAR_AT_LEAST = 0.85
-"""The same for data whose groups are much less alike than that."""
+"""Lower limit of the threshold, for datasets whose groups differ a lot."""
 FAINT = 2.0
-"""Standard deviation in grey levels below which a residual shows nothing but noise and is not compared."""
+"""Standard deviation in grey levels below which a residual is noise and is not compared."""
 BLUR = 5
-"""Side in thumbnail pixels of the blur that is taken off."""
+"""Width of the blur that is subtracted, in thumbnail pixels."""
 MAX_ASKED, MAX_SEARCHED = 2000, 40_000
 
 
 def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Rows of two sides with the same pixels; inside one side they are counted, but do no harm to a test."""
+    """Find identical images in different splits. Copies within a split are counted only."""
     sides = sides_of(pack.column("split").astype(str))
     notes, rows, inside = [], [], []
     for name, one in looks.items():
@@ -33,71 +33,83 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         across = np.flatnonzero(np.isin(numbers, numbers[different]) & one.seen)
         if len(across):
             across = across[np.argsort(numbers[across], kind="stable")]
-            notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy on another side")
+            notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy in another split")
             rows += across.tolist()
     if notes:
         return Finding(
             item="identical images across splits",
             verdict="broken",
             evidence="; ".join(notes),
-            advice="remove the copies, or put them in one group so that they stay on one side",
+            advice="remove the copies, or put them in one group so that they stay in one split",
             rows=tuple(rows),
         )
-    evidence = "none" + (f" (inside one side: {'; '.join(inside)})" if inside else "")
+    evidence = "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")
     return Finding(item="identical images across splits", verdict="ok", evidence=evidence)
 
 
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Rows of test and val that nearly repeat a row of another side.
+    """Find rows of val and test that are nearly identical to a row of train.
 
-    A thumbnail's brightness minus the median thumbnail of its sensor (a gel's background, a fixed camera's scene) minus
-    its own blur (lamps that drift) is what sets it apart; two of these that correlate above ``NEAR`` show the same
-    thing. The bar lies halfway between 1 and the most alike rows of two *groups inside train*; the share of those that
-    reach it as well says how much is the nature of the data, such as frames without contact.
+    Each thumbnail is reduced to its residual (see ``residuals``); two rows are near-duplicates if these correlate by at
+    least a threshold. The threshold is halfway between 1 and the most similar rows of two *groups inside train*, at most
+    ``NEAR``. The fraction of train rows above it measures how similar rows of this dataset are by nature, for example
+    frames without contact.
     """
     sides = sides_of(pack.column("split").astype(str))
     sensors = pack.column("sensor").astype(str) if "sensor" in pack.table.column_names else np.full(pack.num, "")
     groups = pack.column("group").astype(str)
-    notes, rows, worst, compared = [], [], False, False
+    notes, rows, suspicious, compared = [], [], False, False
     for name, one in looks.items():
         held_out = one.has & (sides != "train")
         if not held_out.any() or not (one.has & ~held_out).any():
-            notes.append(f"{name}: all on one side")
+            notes.append(f"{name}: all in one split")
             continue
         unit, clear = residuals(one, sensors)
-        exact = one.exact
         asked = _some(np.flatnonzero(clear & (sides != "train")), MAX_ASKED)
         bank = _some(np.flatnonzero(clear & (sides == "train")), MAX_SEARCHED)
         if not len(asked) or not len(bank):
             notes.append(f"{name}: too faint to compare")
             continue
         compared = True
-        best, value = _nearest(unit, asked, bank)
-        _, natural = _nearest(unit, _some(bank, 500), bank, apart=groups)
-        near = float(np.clip((1 + natural.max()) / 2, NEAR_AT_LEAST, NEAR)) if natural.max() > -1 else NEAR
-        base = float((natural >= near).mean())
-        hit = (value >= near) & (exact[asked] != exact[bank[best]])
+        pairs, base = _near_pairs(unit, asked, bank, groups, one.exact)
+        rate = len(pairs) / len(asked)
         notes.append(
-            f"{name}: {share(int(hit.sum()), len(asked))} of held-out rows nearly repeat one of train"
+            f"{name}: {share(len(pairs), len(asked))} of held-out rows nearly repeat one of train"
             f" ({100 * base:.1f} % between groups of train)"
         )
-        worst |= hit.mean() > 0.01 or (hit.sum() >= 3 and hit.mean() > 3 * base)
-        order = np.argsort(-value[hit])
-        for a, b in zip(asked[hit][order], bank[best][hit][order], strict=True):
-            rows += [a, b]
+        suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
+        rows += pairs.ravel().tolist()
     return Finding(
         item="near-copies across splits",
-        verdict="look" if worst else "ok" if compared else "not checkable",
+        verdict="look" if suspicious else "ok" if compared else "not checkable",
         evidence="; ".join(notes),
-        advice="look at the sheet (pairs side by side); if they are one contact or one scene, group them"
-        if worst
-        else "",
-        rows=tuple(rows) if worst else (),
+        advice=suspicious * "look at the sheet (pairs side by side); if they are one contact or one scene, group them",
+        rows=tuple(rows) if suspicious else (),
     )
 
 
+def _near_pairs(
+    unit: np.ndarray, asked: np.ndarray, bank: np.ndarray, groups: np.ndarray, exact: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return near-duplicates of ``asked`` in ``bank``, and how common they are between groups of ``bank``.
+
+    Returns:
+        Pairs of rows [n, 2], the most similar first (exact copies are left out), and a fraction.
+    """
+    best, value = _nearest(unit, asked, bank)
+    _, natural = _nearest(unit, _some(bank, 500), bank, apart=groups)
+    near = float(np.clip((1 + natural.max()) / 2, NEAR_AT_LEAST, NEAR)) if natural.max() > -1 else NEAR
+    hit = (value >= near) & (exact[asked] != exact[bank[best]])
+    order = np.argsort(-value[hit])
+    return np.stack([asked[hit][order], bank[best][hit][order]], axis=1), float((natural >= near).mean())
+
+
 def residuals(one: ImageStats, sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors [N, F * F] of what sets each thumbnail apart, and which of them [N] show more than noise."""
+    """Return unit vectors [N, F * F] of what is specific to each thumbnail, and which [N] are more than noise.
+
+    A residual is the brightness minus the median thumbnail of the sensor (a gel's background, a fixed camera's scene),
+    minus its own blur (lamps that drift).
+    """
     light = one.fine.astype(np.float32)
     for sensor in np.unique(sensors[one.has]):
         mine = (sensors == sensor) & one.has
@@ -110,14 +122,14 @@ def residuals(one: ImageStats, sensors: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _some(rows: np.ndarray, num: int) -> np.ndarray:
-    """At most ``num`` of ``rows``, evenly spread."""
+    """Return at most ``num`` of ``rows``, evenly spaced."""
     return rows if len(rows) <= num else rows[np.linspace(0, len(rows) - 1, num).astype(int)]
 
 
 def _nearest(
     unit: np.ndarray, asked: np.ndarray, bank: np.ndarray, apart: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Place in ``bank`` and correlation of each asked row's nearest; with ``apart``, among other values of it only."""
+    """Return each asked row's nearest in ``bank`` (index, correlation); with ``apart``, only among other values of it."""
     best, value = np.zeros(len(asked), int), np.full(len(asked), -1.0)
     for start in range(0, len(asked), 256):
         at = slice(start, start + 256)

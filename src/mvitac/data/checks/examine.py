@@ -1,4 +1,4 @@
-"""The whole examination, of a pack or of a source that is packed as thumbnails for it."""
+"""Runs all checks on a pack, or on a source that is packed as thumbnails first."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mvitac.data.spec import DataSpec
 
 
 class ThumbnailSource(Source):
-    """Every k-th item of another source, with the size of the images as they came in columns of their own."""
+    """Evenly spaced items of another source, with the original image sizes as extra columns."""
 
     def __init__(self, source: Source, num: int) -> None:
         self.source = source
@@ -59,8 +59,13 @@ class ThumbnailSource(Source):
 
 
 def examine(pack: Pack, counts: list[Count] | None = None, *, part: bool = False) -> list[Finding]:
-    """Every check of ``pack``; ``counts`` are what its source says of the owners' lists. Classes and labels that are not in
-    ``part`` of a source may be in the rest of it."""
+    """Run every check on ``pack``.
+
+    Args:
+        pack: The pack.
+        counts: Published counts, from the source.
+        part: Whether the pack is a part of the source. Classes missing here may be in the rest, so they are not "broken".
+    """
     looks = look_at(pack)
     labels = [table_checks.missing_labels(pack), *table_checks.class_balance(pack)]
     if part:
@@ -87,14 +92,14 @@ def examine(pack: Pack, counts: list[Count] | None = None, *, part: bool = False
 
 
 def examine_pack(path: Path) -> tuple[list[Finding], Strips]:
-    """The findings on the pack at ``path``, and their suspicious rows as pictures."""
+    """Check the pack at ``path``; return the findings and the images of suspicious rows."""
     try:
         pack = Pack(path)
     except ValueError as error:
         if not (path / "pack.json").is_file():
             raise
         found = Finding(
-            item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it as well"
+            item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it, too"
         )
         return [found], {}
     whole = Finding(item="pack", verdict="ok", evidence=f"{pack.num} rows, every digest matches")
@@ -105,15 +110,25 @@ def examine_pack(path: Path) -> tuple[list[Finding], Strips]:
 def examine_source(
     source: Source, *, num: int = 0, size: int = 64, workers: int = 1, quiet: bool = False
 ) -> tuple[list[Finding], Strips]:
-    """The findings on ``source``, read once into a temporary pack of ``size`` px; ``num`` items of it, 0 = all.
+    """Check ``source``, which is read into a temporary pack of ``size`` px.
 
-    Damaged items are a finding, not an error, unless nothing at all can be read.
+    Damaged items are a finding; it is an error only if nothing can be read.
+
+    Args:
+        source: The dataset.
+        num: Number of items to read, evenly spaced; 0 = all.
+        size: Side of the thumbnails in pixels.
+        workers: Number of processes; 0 = one per core.
+        quiet: Show no progress.
+
+    Returns:
+        The findings, and the images of suspicious rows.
     """
-    glance = ThumbnailSource(source, num)
+    thumbnails = ThumbnailSource(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         options: dict[str, Any] = {"size": size, "workers": workers, "quiet": quiet}
-        pack = build(glance, Path(folder) / "pack", max_damaged=1.0, **options)
-        findings = examine(pack, glance.expected(), part=len(glance.items()) < len(source.items()))
-        read = f"{len(glance.items())} of {len(source.items())} items examined, kept at {size} px"
+        pack = build(thumbnails, Path(folder) / "pack", max_damaged=1.0, **options)
+        findings = examine(pack, thumbnails.expected(), part=len(thumbnails.items()) < len(source.items()))
+        read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
         return findings, strips_of(pack, findings)

@@ -1,4 +1,4 @@
-"""What one check found."""
+"""The result of one check."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ MAX_ROWS = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One item of the examination."""
+    """The result of one check."""
 
     item: str
     verdict: Verdict
     evidence: str
-    """One line: what was measured."""
+    """What was measured, in one line."""
     advice: str = ""
-    """What to do, unless all is well."""
+    """What to do; "" if nothing is wrong."""
     rows: tuple[int, ...] = ()
-    """Suspicious pack rows for the sheet, at most ``MAX_ROWS``."""
+    """Suspicious rows for the contact sheet, at most ``MAX_ROWS``."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rows", tuple(int(row) for row in self.rows[:MAX_ROWS]))
 
 
 def exit_code(findings: Iterable[Finding]) -> int:
-    """0 all is well, 1 somebody should look, 2 something is broken."""
+    """Return 0 if all is well, 1 if someone should look, 2 if something is broken."""
     return max(({"broken": 2, "look": 1}.get(finding.verdict, 0) for finding in findings), default=0)
 
 
 def some(names: Sequence[object], num: int = 3) -> str:
-    """The first few of ``names``, and how many more there are."""
+    """Return the first ``num`` names and the number of others."""
     shown = ", ".join(str(name) for name in names[:num])
     return shown + (f" and {len(names) - num} more" if len(names) > num else "")
 
 
 def share(part: int, whole: int) -> str:
-    """'12 of 340 (3.5 %)'."""
+    """Return a text such as '12 of 340 (3.5 %)'."""
     return f"{part} of {whole} ({100 * part / max(1, whole):.1f} %)"

@@ -1,6 +1,8 @@
-"""What the images alone tell. Thumbnails [N, S, S, 3] of ``ImageStats``; every test is within the set, none knows the truth."""
+"""Checks of the images, by thumbnails [N, S, S, 3] of ``ImageStats``. They compare rows of one dataset with each other."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 
@@ -9,14 +11,14 @@ from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
 
 ORDER_COLUMNS = ("seq", "frame", "step", "time")
-"""Columns that say in which order rows of one group were taken."""
+"""Columns that give the order of the rows of a group."""
 MAX_LAG = 5
 BLOCK = 48
-"""Frames of a long sequence that count as one measurement of the offset."""
+"""Frames per measurement of the offset in a long sequence."""
 
 
 def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Images of one grey: a closed shutter, a failed decode, floats 0 to 1 stored as bytes."""
+    """Find constant images: a closed shutter, a failed decode, floats 0 to 1 stored as bytes."""
     found = {name: np.flatnonzero(one.has & ~one.seen) for name, one in looks.items()}
     rows = np.unique(np.concatenate(list(found.values())))
     if not len(rows):
@@ -33,11 +35,11 @@ def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 
 
 def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Some images without colour among others with."""
+    """Find images without colour in a dataset with colour."""
     rows: list[int] = []
     notes = []
     for name, one in looks.items():
-        gray, seen = one.gray & one.seen, one.seen  # of a nearly constant image the colour says nothing
+        gray, seen = one.gray & one.seen, one.seen  # the colour of a constant image is meaningless
         if gray.sum() and (gray.sum() < seen.sum()):
             minority = gray if gray.sum() * 2 <= seen.sum() else seen & ~gray
             rows += np.flatnonzero(minority).tolist()
@@ -46,63 +48,70 @@ def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             notes.append(f"{name}: all without colour")
     verdict = "look" if rows else "ok"
     evidence = "; ".join(notes) or "all in colour"
-    advice = "different cameras or converters: make all alike, or keep them as sensors apart" if rows else ""
+    advice = (
+        "different cameras or converters: convert all in the same way, or mark them as different sensors"
+        if rows
+        else ""
+    )
     return Finding(item="grayscale among colour", verdict=verdict, evidence=evidence, advice=advice, rows=tuple(rows))
 
 
 def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Rows whose red minus blue is the mirror image of the others': a minority stored as BGR.
+    """Find a minority of images stored as BGR: their red minus blue mirrors that of the others.
 
     With d = R - B of every thumbnail [N, S * S], swapping channels turns d into -d. Along the first principal direction
-    of d (not centred) a mix-up therefore is two heaps either side of zero that mirror each other, with nothing between.
-    Where colours vary from scene to scene there is no gap, and nothing can be said; nor of a set that is BGR throughout.
+    of d (not centred), a mixture therefore has two clusters that mirror each other around zero, with a gap between them.
+    If colours vary from scene to scene there is no gap, and the check cannot decide; nor can it if all images are BGR.
     """
     notes, rows, compared = [], [], False
     for name, one in looks.items():
         usable = np.flatnonzero(one.seen & ~one.gray)
-        usable = (
-            usable[np.linspace(0, len(usable) - 1, min(len(usable), 20_000)).astype(int)] if len(usable) else usable
-        )
         if len(usable) < 8:
             notes.append(f"{name}: no colour to compare")
             continue
-        thumbs = one.thumbs[usable].astype(np.float32)
-        d = (thumbs[..., 0] - thumbs[..., 2]).reshape(len(usable), -1)
-        direction = np.linalg.eigh(d.T @ d)[1][:, -1]
-        p = d @ direction
-        p = p if np.sign(p).sum() >= 0 else -p
-        typical = float(np.median(np.abs(p)))
-        strength = typical / d.shape[1] ** 0.5  # grey levels of R - B per pixel
-        between = float((np.abs(p) < typical / 3).mean())
-        other = p < -typical / 2
-        if strength < 3 or between > 0.08:
-            notes.append(f"{name}: colours vary too much to tell ({100 * between:.0f} % between the two orders)")
-            continue
-        compared = True
-        if not other.any():
-            notes.append(f"{name}: all in one order")
-            continue
-        a, b = d[p > typical / 2].mean(0), d[other].mean(0)
-        alike = float(-(a @ b) / (np.linalg.norm(a) * np.linalg.norm(b)))
-        even = thumbs[..., 1] + 0.5 * (thumbs[..., 0] + thumbs[..., 2])
-        apart = float(np.abs(even[other].mean(0) - even[p > typical / 2].mean(0)).mean() / 2)
-        if alike < 0.8 or apart > 30:
-            notes.append(f"{name}: two kinds of colour, but no mirror images ({alike:.2f})")
-            continue
-        mine = usable[other]
-        rows += mine.tolist()
-        notes.append(f"{name}: {share(int(other.sum()), len(usable))} have red and blue mirrored{_where(pack, mine)}")
+        usable = usable[np.linspace(0, len(usable) - 1, min(len(usable), 20_000)).astype(int)]
+        swapped, decided, note = _mirrored(one.thumbs[usable].astype(np.float32))
+        compared |= decided
+        if swapped.any():
+            rows += (mine := usable[swapped]).tolist()
+            note = f"{share(len(mine), len(usable))} have red and blue mirrored{_where(pack, mine)}"
+        notes.append(f"{name}: {note}")
     return Finding(
         item="red and blue swapped",
         verdict="look" if rows else "ok" if compared else "not checkable",
         evidence="; ".join(notes),
-        advice="look at the sheet; if they are BGR (OpenCV's order), turn them round when reading" if rows else "",
+        advice="look at the sheet; if they are BGR (OpenCV's order), reverse their channels when reading"
+        if rows
+        else "",
         rows=tuple(rows),
     )
 
 
+def _mirrored(thumbs: np.ndarray) -> tuple[np.ndarray, bool, str]:
+    """Return which of ``thumbs`` float32 [N, S, S, 3] are mirrored in d, whether that could be decided, and a note."""
+    none = np.zeros(len(thumbs), bool)
+    d = (thumbs[..., 0] - thumbs[..., 2]).reshape(len(thumbs), -1)
+    p = d @ np.linalg.eigh(d.T @ d)[1][:, -1]
+    p = p if np.sign(p).sum() >= 0 else -p
+    typical = float(np.median(np.abs(p)))
+    strength = typical / d.shape[1] ** 0.5  # grey levels of R - B per pixel
+    between = float((np.abs(p) < typical / 3).mean())
+    usual, other = p > typical / 2, p < -typical / 2
+    if strength < 3 or between > 0.08:
+        return none, False, f"colours vary too much to tell ({100 * between:.0f} % between the two orders)"
+    if not other.any():
+        return none, True, "all in one order"
+    a, b = d[usual].mean(0), d[other].mean(0)
+    alike = float(-(a @ b) / (np.linalg.norm(a) * np.linalg.norm(b)))
+    even = thumbs[..., 1] + 0.5 * (thumbs[..., 0] + thumbs[..., 2])  # does not change when R and B are swapped
+    apart = float(np.abs(even[other].mean(0) - even[usual].mean(0)).mean() / 2)
+    if alike < 0.8 or apart > 30:
+        return none, True, f"two kinds of colour, but no mirror images ({alike:.2f})"
+    return other, True, ""
+
+
 def _where(pack: Pack, rows: np.ndarray) -> str:
-    """Sensors or groups that consist of ``rows``, if they do."""
+    """Return the sensors or groups that ``rows`` consist of, if any."""
     for column in ("sensor", "group"):
         if column in pack.table.column_names:
             values = pack.column(column).astype(str)
@@ -114,7 +123,7 @@ def _where(pack: Pack, rows: np.ndarray) -> str:
 
 
 def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Rows whose vision looks like the others' touch and whose touch looks like the others' vision."""
+    """Find rows whose vision resembles the others' touch and whose touch resembles the others' vision."""
     item = "vision and touch swapped"
     if len(pack.spec.modalities) < 2:
         return Finding(item=item, verdict="not checkable", evidence="one modality only")
@@ -123,21 +132,17 @@ def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     if len(seen) < 16:
         return Finding(item=item, verdict="not checkable", evidence="fewer than 16 usable pairs")
     x = [np.concatenate([_coarse(one.thumbs[seen]), one.std[seen, None]], axis=1) for one in pair]
-    # A diagonal Gaussian per modality, by median and MAD, so that a minority of swapped rows does not shape it.
+    # A diagonal Gaussian per modality, by median and MAD, which a minority of swapped rows does not change.
     middle = [np.median(values, axis=0) for values in x]
     width = [1.4826 * np.median(np.abs(v - m), axis=0) + 6 for v, m in zip(x, middle, strict=True)]
-
-    def fit(values: np.ndarray, k: int) -> np.ndarray:
-        z = np.clip((values - middle[k]) / width[k], -5, 5)
-        return -0.5 * (z**2).mean(1) - np.log(width[k]).mean()
-
-    as_touch, as_vision = fit(x[0], 1) - fit(x[0], 0), fit(x[1], 0) - fit(x[1], 1)  # > 0: looks like the other one
+    fit = [[_log_likelihood(values, middle[k], width[k]) for k in (0, 1)] for values in x]
+    as_touch, as_vision = fit[0][1] - fit[0][0], fit[1][0] - fit[1][1]  # > 0: resembles the other modality
     right = float(np.concatenate([as_touch < 0, as_vision < 0]).mean())
     if right < 0.75:
-        evidence = f"cameras and gels look too alike here ({100 * right:.0f} % of the images can be told apart)"
+        evidence = f"cameras and gels look too similar here ({100 * right:.0f} % of the images can be told apart)"
         return Finding(item=item, verdict="not checkable", evidence=evidence)
     bad = seen[(as_touch > 0) & (as_vision > 0)]
-    # Both images of a row look like the other one: always where they are swapped, now and then by chance.
+    # Both images of a row resemble the other modality: always if swapped, sometimes by chance.
     chance = float((as_touch > 0).mean() * (as_vision > 0).mean() * len(seen))
     if len(bad) <= 2 * chance + 3 * chance**0.5:
         told = f"{len(bad)} of {len(seen)} pairs, {chance:.1f} by chance" if len(bad) else f"none of {len(seen)} pairs"
@@ -152,46 +157,42 @@ def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     )
 
 
+def _log_likelihood(values: np.ndarray, middle: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Return [N], the mean log-likelihood per feature of ``values`` [N, D], with outliers limited to 5 widths."""
+    z = np.clip((values - middle) / width, -5, 5)
+    return -0.5 * (z**2).mean(1) - np.log(width).mean()
+
+
 def _coarse(thumbs: np.ndarray) -> np.ndarray:
-    """[N, S, S, 3] -> [N, 48], means over a 4 x 4 grid."""
+    """Average [N, S, S, 3] over a 4 x 4 grid to [N, 48]."""
     step = thumbs.shape[1] // 4
     cut = thumbs[:, : 4 * step, : 4 * step].astype(np.float32)
     return cut.reshape(len(cut), 4, step, 4, step, 3).mean(axis=(2, 4)).reshape(len(cut), -1)
 
 
-# -- time -------------------------------------------------------------------------------------------------------------
-
-
 def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
-    """Lag between motion in vision and motion in touch, by cross-correlation within ordered groups."""
+    """Find a lag between motion in vision and in touch, by cross-correlation within ordered groups."""
     item = "time offset between streams"
-
-    def cannot(why: str) -> Finding:
-        return Finding(item=item, verdict="not checkable", evidence=why)
-
+    cannot = partial(Finding, item=item, verdict="not checkable")
     column = next((name for name in ORDER_COLUMNS if name in pack.table.column_names), None)
     if len(pack.spec.modalities) < 2 or column is None:
-        why = (
-            "one modality only"
-            if column
-            else f"no column {', '.join(ORDER_COLUMNS)} says in which order rows were taken"
-        )
-        return cannot(why)
+        missing = f"no column {', '.join(ORDER_COLUMNS)} gives the order of rows"
+        return cannot(evidence="one modality only" if column else missing)
     try:
         when = pack.column(column).astype(float)
     except ValueError:
-        return cannot(f"column {column} holds no numbers")
+        return cannot(evidence=f"column {column} holds no numbers")
     curves = motion_correlations(pack, looks, when)
     if len(curves) < 3:
-        return cannot(f"{len(curves)} ordered stretches of {2 * MAX_LAG + 2} rows or more, 3 are needed")
+        return cannot(evidence=f"{len(curves)} ordered sequences of {2 * MAX_LAG + 2} rows or more, 3 are needed")
     mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
     lag = int(mean.argmax()) - MAX_LAG
     best = lag + MAX_LAG
     if mean[best] < 0.15 or mean[best] < 3 * error[best]:
-        return cannot(f"motion in vision and touch is unrelated (at best r = {mean[best]:.2f} at lag {lag})")
+        return cannot(evidence=f"motion in vision and touch is unrelated (at best r = {mean[best]:.2f} at lag {lag})")
     gain = curves[:, best] - curves[:, MAX_LAG]
     certain = lag != 0 and gain.mean() > 3 * gain.std(ddof=1) / len(gain) ** 0.5 and gain.mean() > 0.05
-    evidence = f"r = {mean[MAX_LAG]:.2f} at lag 0, best {mean[best]:.2f} at lag {lag} over {len(curves)} stretches"
+    evidence = f"r = {mean[MAX_LAG]:.2f} at lag 0, best {mean[best]:.2f} at lag {lag} over {len(curves)} sequences"
     if not certain:
         return Finding(item=item, verdict="ok", evidence=evidence)
     later = "touch" if lag > 0 else "vision"
@@ -204,7 +205,7 @@ def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 
 
 def motion_correlations(pack: Pack, looks: dict[str, ImageStats], when: np.ndarray) -> np.ndarray:
-    """[stretches, 2 * MAX_LAG + 1]: correlation of motion energies, touch ``lag`` rows after vision, lag from -MAX_LAG."""
+    """Return [sequences, 2 * MAX_LAG + 1]: correlation of motion in vision with motion in touch, by lag of touch."""
     light = {m: next(one for one in looks.values() if one.modality == m).light for m in ("vision", "touch")}
     groups, curves, both = pack.touch_groups, [], pack.has("vision") & pack.has("touch")
     order = np.lexsort((when, groups))

@@ -1,4 +1,4 @@
-"""One pass over a pack's images; every check of images works on what is kept here. N rows, S = thumbnail side."""
+"""Statistics of a pack's images, computed in one pass for all checks. N rows, S = thumbnail side, F = fine side."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from mvitac.data.pack import Images, Pack
 
 SIDE, FINE = 16, 32
 CONSTANT = 1.0
-"""Standard deviation in grey levels below which an image shows nothing."""
+"""Standard deviation in grey levels below which an image is constant."""
 NUM_AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class ImageStats:
-    """What is kept of every image of one sensor."""
+    """Statistics of the images of one sensor."""
 
     name: str
-    """vision, touch, or touch 1 and touch 2 of a stacked pair."""
+    """vision, touch, or touch 1 and touch 2 if stacked."""
     modality: str
     thumbs: np.ndarray
     """uint8 [N, S, S, 3], area means."""
@@ -29,9 +29,9 @@ class ImageStats:
     std: np.ndarray
     """float32 [N], the largest of the three channels' standard deviations."""
     exact: np.ndarray
-    """bytes [N], a digest of the pixels."""
+    """bytes [N], digest of the pixels."""
     has: np.ndarray
-    """bool [N], whether the row has this image at all; nothing else here means anything where it has not."""
+    """bool [N], whether the row has this image. If not, the other values are meaningless."""
 
     @property
     def light(self) -> np.ndarray:
@@ -40,18 +40,18 @@ class ImageStats:
 
     @property
     def seen(self) -> np.ndarray:
-        """bool [N], whether there is an image that shows something."""
+        """bool [N], whether the row has an image that is not constant."""
         return self.has & (self.std >= CONSTANT)
 
     @property
     def gray(self) -> np.ndarray:
-        """bool [N], whether the three channels are alike."""
+        """bool [N], whether the three channels are equal."""
         span = self.thumbs.max(axis=3).astype(int) - self.thumbs.min(axis=3)
         return span.max(axis=(1, 2)) <= 2
 
 
 def look_at(pack: Pack) -> dict[str, ImageStats]:
-    """``ImageStats`` by name, in the order of the modalities; memory is about 2 kB per image, whatever their size."""
+    """Return ``ImageStats`` by name, in the order of modalities. Needs about 2 kB of memory per image of any size."""
     found = {}
     for modality in pack.spec.modalities:
         num_sensors = pack.spec.channels(modality) // 3
@@ -65,7 +65,7 @@ def look_at(pack: Pack) -> dict[str, ImageStats]:
 def _look(name: str, modality: str, images: Images, channels: slice, has: np.ndarray) -> ImageStats:
     num, size = images.shape[:2]
     side = min(SIDE, size)
-    fine_side, every = min(FINE, size), max(1, size // 64)  # some 64 x 64 pixels are plenty for a standard deviation
+    fine_side, every = min(FINE, size), max(1, size // 64)  # about 64 x 64 pixels suffice for a standard deviation
     thumbs, fine = np.empty((num, side, side, 3), np.uint8), np.empty((num, fine_side, fine_side), np.uint8)
     std, exact = np.empty(num, np.float32), np.empty(num, "S16")
     for start in range(0, num, NUM_AT_ONCE):
@@ -79,7 +79,7 @@ def _look(name: str, modality: str, images: Images, channels: slice, has: np.nda
 
 
 def area_means(images: np.ndarray, side: int) -> np.ndarray:
-    """uint8 [N, H, W, C] -> [N, side, side, C], every pixel counted once."""
+    """Average uint8 [N, H, W, C] to [N, side, side, C]."""
     sums = images.astype(np.float32)
     for axis in (1, 2):
         edges = np.linspace(0, images.shape[axis], side + 1).astype(int)

@@ -1,4 +1,4 @@
-"""What the table tells: damaged items, labels, classes, leaks between splits, sensors, numbers, published counts."""
+"""Checks of the table: damaged items, labels, classes, leaks between splits, sensors, numbers, published counts."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from mvitac.data.pack import SPLITS, Pack
 from mvitac.data.source import Count
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
-"""Columns that, where a dataset has them, should not lie on two sides of a split either."""
+"""Columns whose values should not be in more than one split either, if the dataset has them."""
 MIX = ("sensor", "vision_size", "touch_size")
-"""Columns that say what an image was taken with."""
+"""Columns that describe how an image was taken."""
 
 
 def unreadable(pack: Pack) -> Finding:
-    """Items that packing could not read."""
+    """List items that packing could not read."""
     damaged = pack.meta.get("damaged", [])
     if not damaged:
         return Finding(item="unreadable items", verdict="ok", evidence=f"none; {pack.num} rows were read")
@@ -25,13 +25,13 @@ def unreadable(pack: Pack) -> Finding:
     return Finding(
         item="unreadable items",
         verdict="broken" if len(damaged) > 0.01 * pack.num else "look",
-        evidence=f"{len(damaged)} beside {pack.num} rows that were read, first {name}: {why}",
-        advice="repair or download them again; the pack holds only the others",
+        evidence=f"{len(damaged)}; {pack.num} rows were read; first {name}: {why}",
+        advice="repair them or download them again; the pack does not contain them",
     )
 
 
 def missing_images(pack: Pack) -> Finding:
-    """Rows that lack an image of a modality the dataset has."""
+    """Count rows without an image of a modality that the dataset has."""
     notes = []
     verdict: Verdict = "ok"
     for modality in pack.spec.modalities:
@@ -46,12 +46,12 @@ def missing_images(pack: Pack) -> Finding:
         item="missing images",
         verdict=verdict,
         evidence="; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
-        advice="deal the splits so that both have both, or leave the modality out" if verdict != "ok" else "",
+        advice="assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else "",
     )
 
 
 def missing_labels(pack: Pack) -> Finding:
-    """Rows of train, val and test without the label that their task is about."""
+    """Find rows of train, val and test without a label of their task."""
     item, notes, rows = "missing labels", [], []
     verdict: Verdict = "ok"
     if not pack.spec.tasks:
@@ -81,7 +81,7 @@ def missing_labels(pack: Pack) -> Finding:
 
 
 def class_balance(pack: Pack) -> list[Finding]:
-    """Per task: classes that cannot be learned or are never asked, and how far a constant answer gets."""
+    """Find classes that are missing in train or test, and the accuracy of a constant answer, per task."""
     findings = []
     for task in pack.spec.tasks:
         labels = pack.column(f"label_{task.name}").astype(int)
@@ -101,28 +101,30 @@ def class_balance(pack: Pack) -> list[Finding]:
         verdict: Verdict = "ok"
         advice = ""
         if unasked:
-            verdict, advice = "look", "say in every result which classes were asked, or deal the groups anew"
+            verdict, advice = "look", "name the tested classes in every result, or assign the groups to splits again"
             evidence += f"; never tested: {some(unasked)}"
         if majority > 0.9 or (majority > 0.75 and len(task.classes) > 2):
-            verdict, advice = "look", "report balanced accuracy beside accuracy"
+            verdict, advice = "look", "report balanced accuracy as well"
         if unseen:
-            verdict, advice = "broken", "these cannot be learned: deal the groups anew, or drop the classes"
+            verdict, advice = (
+                "broken",
+                "these cannot be learned: assign the groups to splits again, or drop the classes",
+            )
             evidence += f"; tested but never seen in training: {some(unseen)}"
         findings.append(Finding(item=item, verdict=verdict, evidence=evidence, advice=advice))
     return findings
 
 
-# -- splits -----------------------------------------------------------------------------------------------------------
-
-
 def sides_of(splits: np.ndarray) -> np.ndarray:
-    """Split names with unlabelled counted as train: pre-training sees both."""
+    """Return split names with unlabelled counted as train, because pre-training uses both."""
     return np.where(splits == "unlabelled", "train", splits)
 
 
 def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """(name, rows that count, their sides) of ``split`` and of every other column that holds nothing but split names
-    (folds). In a task's own column the rows without its label are on no side: nobody learns from them or is asked."""
+    """Yield (name, rows that count, their splits) of ``split`` and of each other column of split names (folds).
+
+    In a task's own column, rows without its label do not count: they are used neither to train nor to test.
+    """
     for name in pack.table.column_names:
         values = pack.column(name)
         if values.dtype == object and set(np.unique(values.astype(str))) <= set(SPLITS):
@@ -134,7 +136,7 @@ def split_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def leaks(pack: Pack) -> list[Finding]:
-    """Groups, touch groups and other keys that lie on two sides, for every split column; sound folds are one finding."""
+    """Find groups, touch groups and other keys in more than one split, per split column. Correct folds are one finding."""
     findings, sound = [], []
     names = [n for n in ("group", "touch_group", *KEYS) if n in pack.table.column_names]
     for split, counted, sides in split_columns(pack):
@@ -149,8 +151,10 @@ def leaks(pack: Pack) -> list[Finding]:
                 kind = f" ({pack.spec.group_by})" if name == "group" else ""
                 test = on.get("test", set())
                 of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""
-                notes.append(f"{name}{kind}: {len(both)} of {len(set(values))} on two sides, e.g. {both[0]!r}{of}")
-                for one in both[:4]:  # a row from each side, next to each other on the sheet
+                notes.append(
+                    f"{name}{kind}: {len(both)} of {len(set(values))} in more than one split, e.g. {both[0]!r}{of}"
+                )
+                for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
         if split != "split" and not notes:
@@ -160,29 +164,25 @@ def leaks(pack: Pack) -> list[Finding]:
             Finding(
                 item="groups across splits" if split == "split" else f"groups across column {split}",
                 verdict=verdict,
-                evidence="; ".join(notes) or f"none of {', '.join(names)} lies on two sides",
-                advice="split by the largest of these keys, or say in every result what test shares with train"
-                * bool(notes),
+                evidence="; ".join(notes) or f"none of {', '.join(names)} is in more than one split",
+                advice=bool(notes) * "split by the largest of these keys, or report what test shares with train",
                 rows=tuple(rows),
             )
         )
     if sound:
-        evidence = f"{some(sound, 8)}: none of {', '.join(names)} lies on two sides"
+        evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
         findings.append(Finding(item="groups across split columns", verdict="ok", evidence=evidence))
     return findings
 
 
-# -- sensors and numbers ----------------------------------------------------------------------------------------------
-
-
 def mixture(pack: Pack) -> Finding:
-    """Several sensors or resolutions: where they are, and whether they alone give a label away."""
+    """Find several sensors or resolutions, and whether they alone predict a label."""
     columns = [name for name in MIX if name in pack.table.column_names]
     verdict: Verdict = "ok"
     notes = []
     for column in columns:
         values = pack.column(column).astype(str)
-        names, counts = np.unique(values[values != "None"], return_counts=True)  # rows without this image
+        names, counts = np.unique(values[values != "None"], return_counts=True)  # None: rows without this image
         if len(names) == 1:
             notes.append(f"{column}: {names[0]}")
             continue
@@ -194,39 +194,51 @@ def mixture(pack: Pack) -> Finding:
         if alone := sorted(on["test"] - on["train"]):
             verdict = "look"
             notes.append(f"{column} {some(alone)} only in test")
-        for task in pack.spec.tasks:
-            rows = pack.rows("train", "val", "test", only=task.only, by=task.split)
-            labels = pack.column(f"label_{task.name}").astype(int)[rows]
-            counted = (labels >= 0) & (values[rows] != "None")
-            mine, labels = values[rows][counted], labels[counted]
-            if not len(labels):
-                continue
-            majority = np.bincount(labels).max() / len(labels)
-            told = sum(np.bincount(labels[mine == one]).max() for one in np.unique(mine)) / len(labels)
-            if told > majority + 0.1:
-                verdict = "look"
-                notes.append(
-                    f"{column} alone tells {task.name} to {100 * told:.0f} % (majority {100 * majority:.0f} %)"
-                )
+        if told := _predicted_tasks(pack, column, values):
+            verdict = "look"
+            notes += told
     if not columns:
         return Finding(
             item="sensors and resolutions",
             verdict="not checkable",
             evidence="no column sensor, and a pack holds one size: check the source with --data instead",
         )
-    advice = "probe each kind apart, or make train and test alike in it" if verdict != "ok" else ""
+    advice = "probe each kind separately, or use the same kinds in train and test" if verdict != "ok" else ""
     return Finding(item="sensors and resolutions", verdict=verdict, evidence="; ".join(notes), advice=advice)
 
 
+def _predicted_tasks(pack: Pack, column: str, values: np.ndarray) -> list[str]:
+    """Return a note for each task that the values of ``column`` predict better than the majority class."""
+    notes = []
+    for task in pack.spec.tasks:
+        rows = pack.rows("train", "val", "test", only=task.only, by=task.split)
+        labels = pack.column(f"label_{task.name}").astype(int)[rows]
+        counted = (labels >= 0) & (values[rows] != "None")
+        mine, labels = values[rows][counted], labels[counted]
+        if not len(labels):
+            continue
+        majority, told = np.bincount(labels).max() / len(labels), _accuracy(mine, labels)
+        if told > majority + 0.1:
+            notes.append(
+                f"{column} alone predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
+            )
+    return notes
+
+
+def _accuracy(values: np.ndarray, labels: np.ndarray) -> float:
+    """Return the accuracy of answering the most frequent label of each value."""
+    return sum(np.bincount(labels[values == one]).max() for one in np.unique(values)) / len(labels)
+
+
 def numbers(pack: Pack) -> Finding:
-    """Columns of numbers with gaps, infinities or values far outside the others'."""
+    """Find numeric columns with gaps, infinities or extreme outliers."""
     notes, rows, seen = [], [], 0
     for name, values in numeric_columns(pack):
         seen += 1
         bad = ~np.isfinite(values)
         if bad.any() and not bad.all():
             notes.append(
-                f"{name} is no number in {share(int(bad.sum()), len(values))}, first row {np.flatnonzero(bad)[0]}"
+                f"{name} is not a number in {share(int(bad.sum()), len(values))}, first row {np.flatnonzero(bad)[0]}"
             )
             rows += np.flatnonzero(bad).tolist()
         good = values[~bad]
@@ -250,10 +262,10 @@ def numbers(pack: Pack) -> Finding:
 
 
 def give_aways(pack: Pack) -> Finding:
-    """Columns of numbers that alone tell a label: confounds that a control probe should have.
+    """Find numeric columns that predict a label: confounds that a control probe should use.
 
-    In the labelled rows outside test: the best answer in each eighth of the values, against always the same answer. A
-    column that holds the label itself (every value one class) says nothing, and one that is a control is known.
+    On the labelled rows outside test, the accuracy of the most frequent class in each eighth of the values is compared
+    with that of the majority class. A column that is the label itself (each value one class) or a control is skipped.
     """
     notes = []
     known = {column for columns in pack.spec.controls.values() for column in columns}
@@ -271,10 +283,12 @@ def give_aways(pack: Pack) -> Finding:
             if not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
                 continue
             part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
-            told = sum(np.bincount(labels[part == one]).max() for one in np.unique(part)) / len(labels)
+            told = _accuracy(part, labels)
             if told > majority + 0.1:
-                notes.append(f"{name} tells {task.name} to {100 * told:.0f} % (majority {100 * majority:.0f} %)")
-    advice = "put them beside every score as a control (--data.controls name=column)" if notes else ""
+                notes.append(
+                    f"{name} predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
+                )
+    advice = "report them with every score as a control (--data.controls name=column)" if notes else ""
     return Finding(
         item="columns that give a label away",
         verdict="look" if notes else "ok",
@@ -284,7 +298,7 @@ def give_aways(pack: Pack) -> Finding:
 
 
 def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
-    """Whether the values are few and each goes with one label only: the label itself, or a name for it."""
+    """Return whether the values are few and each has one label only: the label itself, or another name for it."""
     names, numbers = np.unique(values, return_inverse=True)
     return len(names) <= 2 * len(np.unique(labels)) and all(
         len(set(labels[numbers == i])) == 1 for i in range(len(names))
@@ -292,8 +306,7 @@ def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
 
 
 def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, float [N]) of the columns that hold numbers, as numbers or as text, except ids, names of groups, labels (also
-    as a table wrote them, with gaps where a row has none) and sums."""
+    """Yield (name, float [N]) of columns of numbers (or text of numbers), except ids, groups, labels and checksums."""
     other = {"id", *(task.name for task in pack.spec.tasks)}
     names = [pack.column(key).astype(str) for key in ("group", "touch_group") if key in pack.table.column_names]
     for name in pack.table.column_names:
@@ -308,12 +321,14 @@ def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _parsed(values: np.ndarray) -> np.ndarray | None:
-    """A text column of numbers (at least nine cells in ten) as float, gaps as NaN; None if it is not one."""
+    """Convert a text column to float, gaps to NaN; None unless at least 90 % of the cells are numbers."""
     out = np.full(len(values), np.nan)
     known = 0
     for i, cell in enumerate(values):
         try:
-            out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name, though Python reads a number
+            out[i] = float(
+                "" if "_" in str(cell) else cell
+            )  # 20220319_002026 is a name, although Python reads it as a number
             known += 1
         except (TypeError, ValueError):
             continue
@@ -321,7 +336,7 @@ def _parsed(values: np.ndarray) -> np.ndarray | None:
 
 
 def published(counts: list[Count]) -> list[Finding]:
-    """Counts of the source against the owners' lists."""
+    """Compare counts of the source with the published ones."""
     findings = []
     for count in counts:
         same = count.published == count.found
@@ -331,7 +346,7 @@ def published(counts: list[Count]) -> list[Finding]:
                 item=f"published: {count.what}",
                 verdict="ok" if same else "look",
                 evidence=f"{count.found} found, {count.published} published{detail}",
-                advice="" if same else "fine for a part of the data; say so beside every result",
+                advice="" if same else "fine for a part of the data; mention it with every result",
             )
         )
     return findings

@@ -1,4 +1,4 @@
-"""Calandra et al.'s grasps (2017) as their owners ship them."""
+"""Grasps of Calandra et al. (2017), read as published."""
 
 from mvitac.datasets.calandra import reader
 

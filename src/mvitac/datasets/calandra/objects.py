@@ -1,4 +1,4 @@
-"""Calandra's objects: the authors' lists, the repair of cut and misspelt names, and the owners' way of dealing them.
+"""Calandra's objects: the authors' lists, the repair of truncated and misspelt names, and the owners' random split.
 
 Sources: github.com/robertocalandra/the-feeling-of-success (repairs, shuffle); github.com/ligerfotis/mvitac (the lists).
 """
@@ -19,7 +19,7 @@ chocolate_shake webcam_box rubics_cube muffin red_bull purple_small_plastic_frui
 fox_head small_coffe_cup lemon red_apple 3d_printed_white_ball set_small_plastic_men_police_man dog_toy_ice_cream_cone
 playdoh_container bandaid_box emergency_stop_button_for_sawyer plastic_duck brown_paper_cup_2_upside mentos_gum_can"""
 AUTHORS_TEST, AUTHORS_TRAIN = tuple(_TEST.split()), tuple(_TRAIN.split())
-"""The paper's 40 most attempted objects as its authors list them (spelling theirs)."""
+"""The paper's 40 most attempted objects as listed by its authors (in their spelling)."""
 
 
 REPAIRS = {
@@ -34,11 +34,11 @@ REPAIRS = {
     "yellow_bulb": "yellow_bulb_man",
     "toy_person_with_hat": "set_small_plastic_men_yellow_construction_worker",
 }
-"""Names as some recordings hold them (cut to 11 letters, or another word) -> the object, as the owners repair them."""
+"""Wrong name in some recordings (cut to 11 letters, or another word) -> object, from the owners' scripts."""
 
 
 def object_name(value: Any, repairs: dict[str, str]) -> str:
-    """An object_name attribute (bytes, text, or an array of one) as a repaired name."""
+    """Return the repaired name in an object_name attribute (bytes, text, or an array of one)."""
     value = np.asarray(value).reshape(-1)
     if len(value) != 1 or not isinstance(value[0], (bytes, str)):
         raise ValueError(f"it is {value.tolist()}, not one name")
@@ -50,13 +50,15 @@ def object_name(value: Any, repairs: dict[str, str]) -> str:
 
 
 def most_attempted(counts: Counter[str], num: int = 40) -> list[str]:
-    """The ``num`` objects with most attempts; ties go by name."""
+    """Return the ``num`` objects with most attempts; ties are sorted by name."""
     return sorted(counts, key=lambda name: (-counts[name], name))[:num]
 
 
 def doubtful(counts: Counter[str]) -> list[tuple[str, str]]:
-    """Pairs (name, the name it may stand for): the rarer begins the other, or differs from it by one letter. What the
-    authors list counts as right, and of names as rare as each other the longer one."""
+    """Return pairs (name, likely correct name): the first is a prefix of the second or differs by one letter.
+
+    Names in the authors' lists are considered correct, then frequent ones, then longer ones.
+    """
     listed = {*AUTHORS_TRAIN, *AUTHORS_TEST}
     names = sorted(counts, key=lambda name: (name not in listed, -counts[name], -len(name), name))
     pairs = []
@@ -71,7 +73,7 @@ def doubtful(counts: Counter[str]) -> list[tuple[str, str]]:
 
 
 def _one_edit(a: str, b: str) -> bool:
-    """Whether one letter added, dropped or changed turns ``a`` into ``b``."""
+    """Return whether ``a`` and ``b`` differ by one letter added, removed or changed."""
     a, b = sorted((a, b), key=len)
     same = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
     return a[same:] == b[same + 1 :] or a[same + 1 :] == b[same + 1 :]
@@ -79,13 +81,13 @@ def _one_edit(a: str, b: str) -> bool:
 
 def doubtful_text(counts: Counter[str]) -> str:
     pairs = [f"{name} ({counts[name]}) for {likely} ({counts[likely]})?" for name, likely in doubtful(counts)]
-    return f"{'; '.join(pairs)} repair with --data.repairs written=right" if pairs else ""
+    return f"{'; '.join(pairs)} repair with --data.repairs wrong=right" if pairs else ""
 
 
 def owners_shuffle(names: Sequence[str], seed: int) -> list[str]:
-    """Sorted ``names`` in the order of the owners' script: Python 2's random.shuffle after random.seed(seed)."""
-    dealt, generator = sorted(names), random.Random(seed)
-    for i in reversed(range(1, len(dealt))):
+    """Shuffle sorted ``names`` like the owners' script: Python 2's random.shuffle after random.seed(seed)."""
+    shuffled, generator = sorted(names), random.Random(seed)
+    for i in reversed(range(1, len(shuffled))):
         j = int(generator.random() * (i + 1))
-        dealt[i], dealt[j] = dealt[j], dealt[i]
-    return dealt
+        shuffled[i], shuffled[j] = shuffled[j], shuffled[i]
+    return shuffled

@@ -1,4 +1,4 @@
-"""``--data calandra``: the grasps of "The Feeling of Success" (Calandra et al., CoRL 2017) from their owners' HDF5 shards.
+"""``--data calandra``: grasps of "The Feeling of Success" (Calandra et al., CoRL 2017) from the published HDF5 shards.
 
     <path>/calandra_corl2017_000.h5 ... calandra_corl2017_037.h5       any of the 38
       /data/i0 ... /data/i249                                          one grasp each; 46 in the last shard
@@ -6,14 +6,13 @@
           gelsightA_<phase>, gelsightB_<phase>   uint8 [960, 1280, 3]   phase: before, during, after
           kinectA_rgb_<phase>                    uint8 [540, 960, 3]
 
-One item is one grasp, read phase by phase with plain h5py, so memory does not grow with the shard. 'before' is taken
-with the fingers open, 'during' with the fingers closed before the lift, 'after' 4 s after the lift attempt, when the
-outcome can be seen. A label therefore exists only in rows that it may be asked of (``ask``): no code can probe 'after'
-by oversight, and a task that uses it says so in its name, hence in every table.
+One item is one grasp, read phase by phase with h5py, so memory does not depend on the size of a shard. 'before' is taken
+with open fingers, 'during' with closed fingers before the lift, and 'after' 4 s after the lift attempt, when the outcome is
+visible. Only rows of the phases in ``ask`` are labelled, so 'after' cannot be probed by mistake, and a task that uses it has
+a name that says so.
 
-Sources: FACTS section 4; the owners' scripts (github.com/robertocalandra/the-feeling-of-success) for name repairs, the
-Kinect crop and the object-wise split; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for
-their 32 and 8 objects.
+Sources: the owners' scripts (github.com/robertocalandra/the-feeling-of-success) for name repairs, the Kinect crop and the
+split by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for their 32 and 8 objects.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from mvitac.registry import to_json, unknown
 from mvitac.system.files import brief, digest
 
 VERSION = 1
-"""Raised when the same shards would give another pack."""
+"""Version of this reader. Increase it when the same shards would give another pack."""
 PHASES = ("before", "during", "after")
 Phase = Literal["before", "during", "after"]
 NUM_SHARDS, NUM_PER_SHARD, NUM_GRASPS = 38, 250, 9296
@@ -52,7 +51,7 @@ SHARD = re.compile(r"calandra_corl2017_(\d{3})\.h5")
 
 
 KINECT_CROP = (0.06441159, 0.60563023, 0.13482023, 0.97554603)
-"""Top, bottom, left, right as shares of the image: the table and some space above it, as the owners crop it."""
+"""Top, bottom, left, right as fractions of the image: the owners' crop to the table and some space above it."""
 
 
 _CLASSES = ("failure", "success")
@@ -67,32 +66,33 @@ Ask = Literal["during", "before", "after", "authors"]
 
 @dataclass(frozen=True, kw_only=True)
 class CalandraConfig(DatasetConfig):
-    """Grasps of about 106 objects with two GelSights (stacked, 6 channels) and a Kinect; label success."""
+    """Grasps of about 106 objects with two GelSights (stacked, 6 channels) and a Kinect, labelled by success."""
 
     name: ClassVar[str] = "calandra"
+    phased: ClassVar[bool] = True
 
     path: Path = Path("data/calandra")
-    """Folder with the owners' shards calandra_corl2017_000.h5 to _037.h5, or with some of them."""
+    """Folder with some or all of the shards calandra_corl2017_000.h5 to _037.h5."""
     shards: tuple[int, ...] = ()
-    """Numbers of the shards to read (0 to 37); none given = all that are there."""
+    """Numbers of the shards to read (0 to 37); default: all in the folder."""
     split: str = "authors"
-    """authors: their published 32 training and 8 test objects. object: the owners' way, 75 % of all objects to train,
-    25 % to test, by split_seed. fold:K (K from 0, in order of names) or fold:NAME: leave this one object out."""
+    """authors: the 32 training and 8 test objects of the paper's authors. object: the owners' split, 75 % of all objects
+    in train and 25 % in test, by split_seed. fold:K (K from 0, sorted by name) or fold:NAME: leave this object out."""
     split_seed: int = 0
-    """Another number is another dealing of the objects (object), and another choice of val."""
+    """Random seed for the splits of objects (object) and for the choice of val."""
     val_share: float = 0.15
-    """Share of the training objects set aside to choose on (val); the authors and the owners have none."""
+    """Fraction of the training objects in the validation split; the authors and the owners have none."""
     ask: tuple[Ask, ...] = ("during",)
-    """What may be probed. during: success (the paper). before: success_before. after: success_after_leaks, which sees
-    the outcome. authors: success_trained_with_after, their protocol (train on all phases, choose and test on 'during')."""
+    """Tasks to probe. during: success (the paper). before: success_before. after: success_after_leaks, which shows the
+    outcome. authors: success_trained_with_after, their protocol (train on all phases, choose and test on 'during')."""
     phases: tuple[Phase, ...] = PHASES
-    """Which images become rows; without labels all of them serve pre-training."""
+    """Phases that become rows. All of them are used for pre-training."""
     kinect_crop: bool = False
-    """Cut the camera image to the table, as the owners do."""
+    """Crop the camera image to the table, as the owners do."""
     extra_objects: bool = False
     """Keep the objects outside the authors' 40 as unlabelled rows for pre-training (split authors)."""
     repairs: tuple[str, ...] = ()
-    """More object names to repair, as "written=right", beside those known."""
+    """Additional object names to repair, as "wrong=right"."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,13 +108,13 @@ class CalandraConfig(DatasetConfig):
         if self.split_seed < 0:
             raise ValueError(f"split_seed {self.split_seed}: give a number >= 0")
         if not 0 <= self.val_share < 1:
-            raise ValueError(f"val_share {self.val_share}: give a share of the training objects in [0, 1)")
+            raise ValueError(f"val_share {self.val_share}: give a fraction of the training objects in [0, 1)")
         for asked in self.ask:
             if (needed := "during" if asked == "authors" else asked) not in self.phases:
                 raise ValueError(f"ask {asked}: phases leaves {needed!r} out, add it")
         for text in self.repairs:
             if not re.fullmatch(r"[^=]+=[^=]+", text):
-                raise ValueError(f"repairs {text!r}: write it as written=right")
+                raise ValueError(f"repairs {text!r}: write it as wrong=right")
 
     def source(self) -> Source:
         return Calandra(self)
@@ -122,7 +122,7 @@ class CalandraConfig(DatasetConfig):
 
 @dataclass(frozen=True)
 class Grasp:
-    """What is known of one grasp before its images are read; ``damage`` says why they need not be tried."""
+    """Metadata of one grasp; ``damage`` is the reason if it cannot be read, else ""."""
 
     file: Path
     shard: int
@@ -133,7 +133,7 @@ class Grasp:
 
 
 class Calandra(Source):
-    """Item = grasp, in order of shard and number. Names and outcomes are read at once, images only by ``read``."""
+    """One item is one grasp, sorted by shard and number. Names and outcomes are read first, images by ``read``."""
 
     sizes_at = "files"
 
@@ -143,12 +143,12 @@ class Calandra(Source):
         repairs = REPAIRS | dict(text.split("=") for text in config.repairs)
         everything = [grasp for file in self._files for grasp in list_grasps(file, repairs)]
         self.counts = Counter(grasp.object for grasp in everything if not grasp.damage)
-        """Attempts per object, over all that was read, whatever the split keeps."""
+        """Attempts per object in all shards, including objects that the split leaves out."""
         if not self.counts:
             first = everything[0].damage if everything else "it holds no grasps"
             raise ValueError(f"{config.path}: no grasp can be read ({first}): download the shards again")
         self._splits = split_objects(config, sorted(self.counts))
-        # What a split leaves out is not read at all; what is damaged stays, to be listed.
+        # Objects that the split leaves out are not read; damaged grasps are kept, to be listed.
         self._grasps = [grasp for grasp in everything if grasp.damage or grasp.object in self._splits]
 
     def spec(self) -> DataSpec:
@@ -213,13 +213,13 @@ class Calandra(Source):
                     "shard": grasp.shard,
                 }
                 vision = crop_kinect(vision) if self.config.kinect_crop else vision
-                # Pixels of three bytes as elements: five times as fast as by channel.
+                # One element of three bytes per pixel: five times as fast as by channel.
                 both = np.concatenate([left.view("V3"), right.view("V3")], axis=2).view(np.uint8)
                 samples.append(Sample(vision=vision, touch=both, columns=columns))
         return samples
 
     def expected(self) -> list[Count]:
-        """Shards, grasps, and the paper's most attempted 40 against those of the authors' list."""
+        """Count shards and grasps, and compare the 40 most attempted objects with the authors' list."""
         have = {int(_number(file)) for file in self._files}
         absent = sorted(set(range(NUM_SHARDS)) - have)
         top, listed = most_attempted(self.counts), {*AUTHORS_TRAIN, *AUTHORS_TEST}
@@ -240,9 +240,9 @@ def _number(file: Path) -> str:
 
 
 def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
-    """The shards in folder ``path``, those numbered ``shards`` if any are; ValueError names what is missing."""
+    """Return the shards in folder ``path``, or those in ``shards``; ValueError names what is missing."""
     if not path.is_dir():
-        raise ValueError(f"{path} is no folder: give the one with calandra_corl2017_000.h5 and its neighbours")
+        raise ValueError(f"{path} is not a folder: give the one with calandra_corl2017_000.h5 and its neighbours")
     files = {int(_number(file)): file for file in sorted(path.iterdir()) if SHARD.fullmatch(file.name)}
     missing = [number for number in shards if number not in files]
     if missing or not files:
@@ -254,7 +254,7 @@ def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
 
 
 def list_grasps(file: Path, repairs: dict[str, str]) -> list[Grasp]:
-    """Every grasp of one shard with its name and outcome. One that cannot be opened at all counts as all its grasps."""
+    """Return every grasp of a shard with name and outcome. In a shard that cannot be opened, all grasps are damaged."""
     import h5py
 
     shard = int(_number(file))
@@ -263,7 +263,7 @@ def list_grasps(file: Path, repairs: dict[str, str]) -> list[Grasp]:
             data: Any = opened["data"]
             indices = sorted(int(name[1:]) for name in data if re.fullmatch(r"i\d+", name))
             return [_describe(data, Grasp(file, shard, index), repairs) for index in indices]
-    except (OSError, KeyError, RuntimeError, TypeError) as error:  # the families h5py has for damage
+    except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py raises these for damaged files
         damage = f"{file.name} cannot be read as HDF5 ({brief(error)}): download it again or leave it out of shards"
         num = NUM_GRASPS - NUM_PER_SHARD * shard if shard == NUM_SHARDS - 1 else NUM_PER_SHARD
         return [Grasp(file, shard, index, damage=damage) for index in range(num)]
@@ -297,13 +297,13 @@ def _image(file: Any, name: str, grasp: Grasp) -> np.ndarray:
 
 
 def crop_kinect(image: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3] cut to the table (``KINECT_CROP``)."""
+    """Crop uint8 [H, W, 3] to the table (``KINECT_CROP``)."""
     (height, width), (top, bottom, left, right) = image.shape[:2], KINECT_CROP
     return image[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
 
 
 def may_ask(asked: Ask, phase: str, split: str) -> bool:
-    """Whether a row of ``phase`` in ``split`` carries the label of task ``asked``."""
+    """Return whether a row of ``phase`` in ``split`` has the label of task ``asked``."""
     if split == "unlabelled":
         return False
     if asked == "authors":
@@ -312,15 +312,15 @@ def may_ask(asked: Ask, phase: str, split: str) -> bool:
 
 
 def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str]:
-    """Object -> split for the objects that take part; val is carved out of train, object by object."""
+    """Return object -> split, for the objects that are used. Val consists of objects taken from train."""
     if config.split == "authors":
         splits = {name: "train" for name in names if name in AUTHORS_TRAIN}
         splits |= {name: "test" for name in names if name in AUTHORS_TEST}
         others = {name: "unlabelled" for name in names if name not in splits} if config.extra_objects else {}
     elif config.split == "object":
-        dealt = owners_shuffle(names, config.split_seed)
-        num_train = int(0.75 * len(dealt))
-        splits, others = {name: "train" if i < num_train else "test" for i, name in enumerate(dealt)}, {}
+        shuffled = owners_shuffle(names, config.split_seed)
+        num_train = int(0.75 * len(shuffled))
+        splits, others = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}, {}
     else:
         out = config.split.removeprefix("fold:")
         if out.isdigit() and out not in names and int(out) < len(names):

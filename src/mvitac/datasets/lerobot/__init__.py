@@ -1,4 +1,4 @@
-"""LeRobot datasets, read and written."""
+"""Reads and writes LeRobot datasets."""
 
 from mvitac.datasets.lerobot import reader
 

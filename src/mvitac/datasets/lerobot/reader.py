@@ -7,8 +7,8 @@
     data/chunk-000/file-000.parquet                  per frame: timestamp within its episode, episode_index, features
     videos/<camera key>/chunk-000/file-000.mp4
 
-A row is a pair: both cameras at the time of a table row. In a video that is the frame whose presentation time is nearest,
-so streams of different rates meet; farther away than ``tolerance`` is a gap.
+A sample is a pair: both cameras at the time of a table row. From a video, the frame with the nearest presentation time is
+used, so cameras may have different rates. If it is farther away than ``tolerance``, the image is missing.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.table.video_times import nearest, timestamps
 from mvitac.registry import unknown
-from mvitac.system.files import digest, read_json
+from mvitac.system.files import brief, digest, read_json
 
 VERSION = "v3.0"
 FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)
-"""What a camera key that shows touch is usually called."""
+"""Usual names of tactile cameras."""
 RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
-"""The format's own columns -> what they are called in a pack."""
+"""Columns of the format -> names in a pack."""
 SCALARS = {"float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool", "string"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeRobotConfig(RowsConfig):
-    """A LeRobotDataset v3 on disk: two of its cameras as vision and touch, paired by time."""
+    """A LeRobotDataset v3 on disk: cameras as vision and touch, paired by time."""
 
     name: ClassVar[str] = "lerobot"
 
     path: Path = Path("dataset")
-    """The dataset's folder, with meta/info.json in it."""
+    """Folder of the dataset, with meta/info.json."""
     vision: str | None = None
-    """Camera key, e.g. observation.images.front; default: the first whose name does not sound like touch; "" = none."""
+    """Camera key, e.g. observation.images.front; default: the first one that is not tactile by its name; "" = none."""
     touch: tuple[str, ...] = ()
-    """Camera key, or two to stack; default: those whose names say touch, tactile, gelsight, digit or finger."""
+    """Camera key, or two to stack; default: those with touch, tactile, gelsight, digit or finger in their name."""
     tolerance: float = 0.04
-    """Seconds by which a video frame may miss the time it is wanted at."""
+    """Largest allowed time difference between a row and its video frame, in seconds."""
     every: int = 1
-    """Take every n-th row of each episode: neighbours in time are near-copies."""
+    """Use every n-th row of each episode, because consecutive rows are near-duplicates."""
     group: str | None = "episode"
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class LeRobotConfig(RowsConfig):
         return Manifest(self.path, self.path, columns, rows, digest([rows, where]), found)
 
     def _in_videos(self, info: dict[str, Any], key: str, rows: Sequence[dict[str, str]]) -> list[ImageRef | None]:
-        """The frame of camera ``key`` at each row's time, None where none is near enough."""
+        """Return the frame of camera ``key`` at each row's time; None if no frame is near enough."""
         episodes = {str(e["episode_index"]): e for e in _tables(self.path, "meta/episodes", f"videos/{key}/")}
         wanted: dict[str, list[int]] = {}
         for i, row in enumerate(rows):
@@ -86,7 +86,7 @@ class LeRobotConfig(RowsConfig):
         for name, numbers in wanted.items():
             episode = episodes.get(name)
             if episode is None or episode.get(f"videos/{key}/from_timestamp") is None:
-                raise ValueError(f"{self.path}: meta/episodes says nothing of {key} in episode {name}")
+                raise ValueError(f"{self.path}: meta/episodes has no entry for {key} in episode {name}")
             place = {part: episode[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")}
             file = self.path / info["video_path"].format(video_key=key, **place)
             if file not in times:
@@ -94,7 +94,7 @@ class LeRobotConfig(RowsConfig):
                     raise ValueError(f"{file} is missing: fetch the videos too, or leave {key} out")
                 times[file] = timestamps(file)
             start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
-            # Several episodes lie in one file: the nearest frame must not be another one's.
+            # One file has several episodes: the nearest frame must be of the same episode.
             low, high = np.searchsorted(times[file], [start - 1e-3, (np.inf if end is None else end) - 1e-3])
             when = start + np.array([float(rows[i]["timestamp"]) for i in numbers])
             at, away = nearest(times[file][low:high], when)
@@ -110,7 +110,7 @@ class LeRobotConfig(RowsConfig):
 
 
 def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], where: Path) -> dict[str, str]:
-    """Column -> camera key: as asked for under its own name, otherwise guessed under vision, touch, left and right."""
+    """Return column -> camera key: requested keys by their own name, guessed ones as vision, touch, left and right."""
     felt = [key for key in cameras if FELT.search(key) and key != vision]
     seen = [key for key in cameras if key not in felt]
     for key in (*touch, vision):
@@ -149,7 +149,7 @@ def _embedded(info: dict[str, Any]) -> list[str]:
 
 
 def _tables(root: Path, folder: str, *wanted: str) -> list[dict[str, Any]]:
-    """The rows of every parquet below ``folder``, with episode_index and the columns that begin with ``wanted``."""
+    """Return the rows of all parquet files in ``folder``: episode_index and the columns that begin with ``wanted``."""
     files = sorted((root / folder).glob("*/*.parquet"))
     if not files:
         raise ValueError(f"{root / folder} holds no parquet files: fetch the whole dataset")
@@ -165,9 +165,7 @@ def _open(file: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(file)
     except (pa.ArrowException, OSError) as error:
-        raise ValueError(
-            f"{file} is not a parquet file ({' '.join(str(error).split())[:120]}): fetch it again"
-        ) from None
+        raise ValueError(f"{file} is not a parquet file ({brief(error)}): fetch it again") from None
 
 
 def _tasks(root: Path) -> dict[int, str]:
@@ -182,7 +180,7 @@ def _tasks(root: Path) -> dict[int, str]:
 def _frames(
     root: Path, info: dict[str, Any], images: Sequence[str], every: int
 ) -> tuple[list[dict[str, str]], dict[str, list[ImageRef | None]]]:
-    """Every table row as text (scalar features only), and where the ``images`` of embedded cameras lie."""
+    """Return the table rows as text (scalar features only), and the references of embedded ``images``."""
     tasks = _tasks(root)
     scalars = [k for k, f in info["features"].items() if f["dtype"] in SCALARS and list(f.get("shape", [1])) == [1]]
     rows: list[dict[str, str]] = []

@@ -1,6 +1,6 @@
-"""A pack written as a LeRobotDataset v3, which lerobot's own library opens; its layout is told in ``lerobot``.
+"""Writes a pack as a LeRobotDataset v3 that the lerobot library opens (the layout is in ``reader.py``).
 
-Images are embedded as PNG, so that nothing is lost. An episode is a touch group; time is nominal (``fps``).
+Images are embedded as PNG, without loss. An episode is a touch group; timestamps are nominal (``fps``).
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from mvitac.datasets.lerobot.reader import RENAMED, VERSION
 from mvitac.system.files import check_place, write_json
 
 ROWS_PER_GROUP = 100
-"""Rows of a parquet row group: what a reader of one frame must fetch."""
+"""Rows per parquet row group, which is the smallest unit of reading."""
 FILE_BYTES = 100 << 20
-"""After which a data file is closed and the next begins, as lerobot does."""
+"""Size after which the next data file begins, as in lerobot."""
 FILES_PER_CHUNK = 1000
 TAKEN = {"timestamp", "task_index", "task", *RENAMED, *RENAMED.values()}
-"""Names of the format's own columns, there or where ``lerobot`` reads them: a pack's column of such a name gets another."""
+"""Column names reserved by the format or by our reader; a pack column of such a name is renamed."""
 NUM_FOR_STATS = 256
-"""Images looked at for their mean and spread."""
+"""Number of images used for mean and standard deviation."""
 ONE_FILE = "chunk-000/file-000.parquet"
 
 
 def check_fps(fps: float) -> None:
-    """ValueError if no LeRobotDataset can have this rate."""
+    """Raise ValueError unless a LeRobotDataset can have this rate."""
     if not (1 <= fps <= 1000 and fps == int(fps)):
         raise ValueError(f"fps {fps:g}: give the nominal rate, a whole number from 1 to 1000")
 
 
 def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
-    """Write ``pack`` to the new folder ``out`` and return how many rows it got: those that have every modality."""
+    """Write the rows of ``pack`` that have every modality to the new folder ``out``, and return their number."""
     check_fps(fps)
     check_place(out)
     if out.exists():
@@ -82,7 +82,7 @@ def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
 
 
 def _cameras(pack: Pack) -> dict[str, tuple[str, int]]:
-    """Camera key -> modality and first channel."""
+    """Return camera key -> modality and first channel."""
     keys = {"observation.images.vision": ("vision", 0)} if pack.spec.vision_channels else {}
     if pack.spec.touch_channels == 3:
         keys["observation.images.touch"] = ("touch", 0)
@@ -94,8 +94,10 @@ def _cameras(pack: Pack) -> dict[str, tuple[str, int]]:
 
 
 def _carried(pack: Pack) -> dict[str, tuple[str, str]]:
-    """Feature -> table column and lerobot's name for its type; a column's own name must not hold a /. What a pack notes of
-    its own image files stays behind."""
+    """Return feature -> table column and lerobot's name of its type.
+
+    Columns about the pack's image files (checksums, lengths, has_<modality>) and names with a / are left out.
+    """
     own = {f"{kind}_{modality}" for kind in ("crc", "bytes") for modality in pack.spec.modalities}
     carried: dict[str, tuple[str, str]] = {}
     for field in pack.table.schema:
@@ -131,7 +133,7 @@ def _features(pack: Pack) -> dict[str, Any]:
 def _write_data(
     pack: Pack, rows: np.ndarray, starts: np.ndarray, fps: int, out: Path, features: dict[str, Any]
 ) -> list[tuple[int, int]]:
-    """The data files; returns (chunk, file) of every episode, each of which lies in one file."""
+    """Write the data files; return (chunk, file) of each episode, which is in a single file."""
     picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     kinds = {
         "int64": pa.int64(),
@@ -167,7 +169,7 @@ def _write_data(
 def _tables(
     pack: Pack, rows: np.ndarray, start: int, end: int, episode: int, fps: int, schema: pa.Schema
 ) -> Iterator[pa.Table]:
-    """Rows ``start`` to ``end`` of the dataset, an episode, in pieces that fit into memory."""
+    """Yield the rows ``start`` to ``end`` (one episode) in pieces that fit into memory."""
     for first in range(start, end, ROWS_PER_GROUP):
         piece = np.arange(first, min(first + ROWS_PER_GROUP, end))
         columns: dict[str, Any] = {
@@ -216,7 +218,7 @@ def _task(pack: Pack) -> str:
 
 
 def _write_tasks(pack: Pack, out: Path) -> None:
-    """The one task, its text being the index of the pandas frame that lerobot reads."""
+    """Write the only task. Its text is the index of the pandas data frame that lerobot reads."""
     index = "__index_level_0__"
     column = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None, "name": "task_index"}
     column = {**column, "field_name": "task_index"}
@@ -227,23 +229,23 @@ def _write_tasks(pack: Pack, out: Path) -> None:
 
 
 def _stats(pack: Pack, rows: np.ndarray, starts: np.ndarray, fps: int) -> dict[str, Any]:
-    """min, max, mean, std and count per feature: of images per channel in [0, 1], from evenly chosen rows."""
-
-    def summary(values: np.ndarray, axes: tuple[int, ...], shape: tuple[int, ...]) -> dict[str, Any]:
-        found = {name: getattr(values, name)(axis=axes) for name in ("min", "max", "mean", "std")}
-        stats = {name: value.astype(float).reshape(shape).tolist() for name, value in found.items()}
-        return {**stats, "count": [len(values)]}
-
+    """Return min, max, mean, std and count per feature; of images per channel in [0, 1], from evenly spaced rows."""
     some = rows[np.unique(np.linspace(0, len(rows) - 1, NUM_FOR_STATS).astype(int))]
     stats = {}
     for key, (modality, channel) in _cameras(pack).items():
         images = pack.images[modality][some][..., channel : channel + 3].astype(np.float32) / 255
-        stats[key] = summary(images, (0, 1, 2), (3, 1, 1))
+        stats[key] = _summary(images, (0, 1, 2), (3, 1, 1))
     places = np.arange(len(rows))
     episodes = np.searchsorted(starts, places, side="right") - 1
     numbers = {name: pack.column(c)[rows] for name, (c, kind) in _carried(pack).items() if kind != "string"}
     numbers |= {"index": places, "episode_index": episodes, "frame_index": places - starts[episodes]}
     numbers |= {"timestamp": numbers["frame_index"] / fps, "task_index": np.zeros(len(rows))}
     for name, values in numbers.items():
-        stats[name] = summary(np.asarray(values, float), (0,), (1,))
+        stats[name] = _summary(np.asarray(values, float), (0,), (1,))
     return stats
+
+
+def _summary(values: np.ndarray, axes: tuple[int, ...], shape: tuple[int, ...]) -> dict[str, Any]:
+    found = {name: getattr(values, name)(axis=axes) for name in ("min", "max", "mean", "std")}
+    stats = {name: value.astype(float).reshape(shape).tolist() for name, value in found.items()}
+    return {**stats, "count": [len(values)]}

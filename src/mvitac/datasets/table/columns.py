@@ -1,90 +1,151 @@
-"""From a manifest's text to a pack's columns: labels, controls, groups, ids."""
+"""Converts a manifest's text cells to a pack's columns: labels, controls, groups, splits and ids."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from mvitac.data.pack import SPLITS
 from mvitac.data.spec import Task
+from mvitac.datasets.table.image_columns import Background, Refs
 from mvitac.datasets.table.manifest import Manifest, number_of
+from mvitac.datasets.table.splits import BY_GROUP, assign_splits, check_leak, check_sides, check_split_names
 
 MAX_ONE_HOT = 64
 
 
-def read_task(
-    where: str, column: str, rows: Sequence[dict[str, str]], counts: Sequence[bool]
-) -> tuple[Task, list[int]]:
-    """The task of a label column, and its class number per row (-1 = unlabelled or not counted)."""
-    cells = [row[column] if counted else "" for row, counted in zip(rows, counts, strict=True)]
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """The rows of a manifest that become samples; all lists have one entry per row."""
+
+    manifest: Manifest
+    numbers: list[int]
+    """Row numbers in the manifest, counted from 1."""
+    rows: list[dict[str, str]]
+    refs: Refs
+    backgrounds: list[Background]
+    """One per touch column; empty for raw images."""
+
+    @property
+    def where(self) -> str:
+        """Name of the table, for error messages."""
+        return str(self.manifest.file)
+
+    def filled(self, column: str, what: str) -> list[str]:
+        """Return the cells of ``column``; ValueError if one of them is empty."""
+        empty = [number for number, row in zip(self.numbers, self.rows, strict=True) if not row[column]]
+        if empty:
+            hint = f"; write one of {', '.join(SPLITS)}" if what == "split" else ""
+            raise ValueError(
+                f"{self.where}: column {column!r} ({what}) is empty in {len(empty)} rows, first row {empty[0]}{hint}"
+            )
+        return [row[column] for row in self.rows]
+
+    def ids(self) -> list[str]:
+        """Return the column "id" if there is one, else the row numbers."""
+        if "id" not in self.manifest.columns:
+            return [f"{number:06d}" for number in self.numbers]
+        ids = self.filled("id", "id")
+        twice = [name for name, count in Counter(ids).items() if count > 1]
+        if twice:
+            raise ValueError(f"{self.where}: id {twice[0]!r} occurs in several rows: ids must differ")
+        return ids
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grouping:
+    """The group and touch group of each row, and what they are called."""
+
+    groups: list[str]
+    group_by: str
+    touch_groups: list[str]
+    touch_group_by: str
+
+
+def read_task(selected: Selection, column: str, counts: Sequence[bool]) -> tuple[Task, list[int]]:
+    """Return the task of a label column and its class number per row, -1 if unlabelled or not in ``counts``."""
+    cells = [row[column] if counted else "" for row, counted in zip(selected.rows, counts, strict=True)]
     names = {cell for cell in cells if cell}
     labelled = sum(bool(cell) for cell in cells)
     if len(names) < 2:
         what = f"only the class {min(names)!r}" if names else "no labels"
-        raise ValueError(f"{where}: column {column!r} has {what} in {len(rows)} rows: a task needs two classes")
+        raise ValueError(
+            f"{selected.where}: column {column!r} has {what} in {len(cells)} rows: a task needs two classes"
+        )
     if len(names) == labelled >= 10:
         raise ValueError(
-            f"{where}: column {column!r} has another value in each of its {labelled} rows (e.g. {min(names)!r}):"
-            " classes must repeat; is it a measurement or a name?"
+            f"{selected.where}: column {column!r} has another value in each of its {labelled} rows (e.g."
+            f" {min(names)!r}): classes must repeat; is it a measurement or a name?"
         )
     if all(number_of(name) is not None for name in names):
         classes = sorted(names, key=lambda name: (float(name), name))
     else:
         classes = sorted(names)
-    places = {name: i for i, name in enumerate(classes)}
-    return Task(name=column, classes=tuple(classes)), [places.get(cell, -1) for cell in cells]
+    labels = {name: i for i, name in enumerate(classes)}
+    return Task(name=column, classes=tuple(classes)), [labels.get(cell, -1) for cell in cells]
 
 
 def read_controls(
-    where: str,
-    controls: dict[str, tuple[str, ...]],
-    numbers: Sequence[int],
-    rows: Sequence[dict[str, str]],
-    targets: Sequence[Sequence[int]],
+    selected: Selection, controls: dict[str, tuple[str, ...]], labels: Sequence[Sequence[int]]
 ) -> tuple[dict[str, list[float]], dict[str, tuple[str, ...]]]:
-    """Numeric columns for the pack, and which of them every control uses."""
-    labelled = [any(target[i] >= 0 for target in targets) for i in range(len(rows))]
-    made: dict[str, dict[str, list[float]]] = {}
-    for column in dict.fromkeys(c for columns in controls.values() for c in columns):
-        cells = [row[column] for row in rows]
-        empty = [n for n, cell, counted in zip(numbers, cells, labelled, strict=True) if counted and not cell]
-        if empty:
-            raise ValueError(
-                f"{where}: control column {column!r} is empty in {len(empty)} labelled rows, first row {empty[0]}"
-            )
-        values = [number_of(cell) for cell in cells]
-        if all(value is not None or not cell for value, cell in zip(values, cells, strict=True)):
-            # An unlabelled row is never probed; 0 stands for its gap.
-            made[column] = {column: [value or 0.0 for value in values]}
-            continue
-        names = sorted({cell for cell in cells if cell})
-        if len(names) > MAX_ONE_HOT:
-            raise ValueError(
-                f"{where}: control column {column!r} has {len(names)} values that are not numbers, e.g. {names[0]!r}:"
-                f" at most {MAX_ONE_HOT} become one-hot"
-            )
-        made[column] = {f"{column}={name}": [float(cell == name) for cell in cells] for name in names}
+    """Return numeric pack columns for ``controls``, and the names of the columns that each control uses."""
+    labelled = [any(task[i] >= 0 for task in labels) for i in range(len(selected.rows))]
+    made = {c: _numeric(selected, c, labelled) for c in dict.fromkeys(c for given in controls.values() for c in given)}
     columns = {name: values for each in made.values() for name, values in each.items()}
     return columns, {name: tuple(c for column in given for c in made[column]) for name, given in controls.items()}
 
 
-def filled(where: str, numbers: Sequence[int], rows: Sequence[dict[str, str]], column: str, what: str) -> list[str]:
-    """The cells of ``column``, none of them empty."""
-    empty = [number for number, row in zip(numbers, rows, strict=True) if not row[column]]
+def _numeric(selected: Selection, column: str, labelled: Sequence[bool]) -> dict[str, list[float]]:
+    """Return ``column`` as numbers, or one-hot columns if it holds text."""
+    cells = [row[column] for row in selected.rows]
+    empty = [n for n, cell, needed in zip(selected.numbers, cells, labelled, strict=True) if needed and not cell]
     if empty:
-        hint = f"; write one of {', '.join(SPLITS)}" if what == "split" else ""
         raise ValueError(
-            f"{where}: column {column!r} ({what}) is empty in {len(empty)} rows, first row {empty[0]}{hint}"
+            f"{selected.where}: control column {column!r} is empty in {len(empty)} labelled rows, first row {empty[0]}"
         )
-    return [row[column] for row in rows]
+    values = [number_of(cell) for cell in cells]
+    if all(value is not None or not cell for value, cell in zip(values, cells, strict=True)):
+        return {column: [value or 0.0 for value in values]}  # an empty cell is unlabelled, so never probed: any number
+    names = sorted({cell for cell in cells if cell})
+    if len(names) > MAX_ONE_HOT:
+        raise ValueError(
+            f"{selected.where}: control column {column!r} has {len(names)} values that are not numbers, e.g."
+            f" {names[0]!r}: at most {MAX_ONE_HOT} become one-hot"
+        )
+    return {f"{column}={name}": [float(cell == name) for cell in cells] for name in names}
 
 
-def read_ids(where: str, manifest: Manifest, numbers: Sequence[int], rows: Sequence[dict[str, str]]) -> list[str]:
-    """The column "id" if there is one, else the row numbers."""
-    if "id" not in manifest.columns:
-        return [f"{number:06d}" for number in numbers]
-    ids = filled(where, numbers, rows, "id", "id")
-    twice = [name for name, count in Counter(ids).items() if count > 1]
-    if twice:
-        raise ValueError(f"{where}: id {twice[0]!r} stands in several rows: ids must differ")
-    return ids
+def split_rows(
+    selected: Selection,
+    column: str,
+    grouping: Grouping,
+    tasks: Sequence[Task],
+    labels: Sequence[Sequence[int]],
+    *,
+    shares: tuple[float, float],
+    seed: int,
+    allow_leak: bool,
+) -> list[str]:
+    """Return the split of each row: read from ``column``, or assigned by group, and checked.
+
+    Args:
+        shares: Fractions of the groups in test and in val, for ``BY_GROUP``.
+        allow_leak: Accept a group, touch group or image in more than one split.
+    """
+    where = selected.where
+    if column == BY_GROUP:
+        splits = assign_splits(grouping.groups, labels, *shares, seed)
+    else:
+        splits = selected.filled(column, "split")
+        check_split_names(where, column, selected.numbers, splits)
+    if not allow_leak:
+        check_leak(where, column, f"groups ({grouping.group_by})", grouping.groups, splits)
+        check_leak(where, column, f"touch groups ({grouping.touch_group_by})", grouping.touch_groups, splits)
+        for name, refs in selected.refs.items():
+            there = [i for i, ref in enumerate(refs) if ref]
+            images = [os.path.normpath(str(refs[i])) for i in there]
+            check_leak(where, column, f"{name} images", images, [splits[i] for i in there])
+    check_sides(where, column, splits, tasks, labels, len(set(grouping.groups)))
+    return splits

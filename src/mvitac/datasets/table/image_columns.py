@@ -1,6 +1,6 @@
-"""The images that a table's rows name: found, there or allowed to be missing, and what each touch is compared with.
+"""Finds and checks the images that a table's rows refer to, and the background of each touch image.
 
-Rows are given by their numbers, counted from 1; ``places`` holds one list per image column.
+Row numbers count from 1, row indices from 0.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ from mvitac.datasets.table.image_refs import ImageRef
 from mvitac.datasets.table.manifest import Condition, Manifest
 
 NUM_NO_CONTACT = 16
-"""No-contact frames whose mean is a sensor's background."""
-Places = dict[str, list[ImageRef | None]]
+"""Number of no-contact frames that are averaged to a sensor's background."""
+Refs = dict[str, list[ImageRef | None]]
+"""Image column -> one reference per row; None where the row has no image."""
+Background = dict[int, tuple[ImageRef, ...]]
+"""Row number -> the no-contact images whose mean is subtracted from the row's touch image."""
 
 
 def image_columns(manifest: Manifest, vision: str | None, touch: tuple[str, ...]) -> tuple[str | None, tuple[str, ...]]:
-    """The columns of vision and touch images, as asked for ("" = none) or found by their usual names."""
+    """Return the columns of vision and touch images: those asked for ("" = none), else those with the usual names."""
     have = (*manifest.columns, *manifest.found)
     vision = ("vision" if "vision" in have else None) if vision is None else vision or None
     if touch:
@@ -36,119 +39,122 @@ def image_columns(manifest: Manifest, vision: str | None, touch: tuple[str, ...]
     return vision, touch
 
 
-def read_backgrounds(
+def backgrounds_from_columns(
+    manifest: Manifest, refs: Refs, touch: Sequence[str], kept: Sequence[int], columns: tuple[str, ...]
+) -> list[Background]:
+    """Read the background of each touch column from a column of its own (default: "background")."""
+    if not columns and "background" not in (*manifest.columns, *manifest.found):
+        raise ValueError(
+            f"{manifest.file} has no column 'background': difference images need background columns, or no_contact rows"
+        )
+    columns = columns or ("background",)
+    if len(columns) != len(touch):
+        raise ValueError(
+            f"background {' '.join(columns)}: difference images of touch {' '.join(touch)} need as many background"
+            " columns, or no_contact rows"
+        )
+    for column in columns:
+        manifest.check(column)
+    result = []
+    for column in columns:
+        found = manifest.refs(column)
+        empty = next((i + 1 for i in kept if found[i] is None and any(refs[t][i] for t in touch)), None)
+        if empty:
+            raise ValueError(f"{manifest.file} row {empty} has no {column} path: difference images need one")
+        result.append({i + 1: (ref,) for i in kept if (ref := found[i])})
+    return result
+
+
+def backgrounds_from_rows(
     manifest: Manifest,
-    places: Places,
+    refs: Refs,
     touch: Sequence[str],
     kept: Sequence[int],
     sensor: str | None,
-    columns: tuple[str, ...],
     no_contact: Sequence[Condition],
-) -> list[dict[int, tuple[ImageRef, ...]]]:
-    """Per touch column: row number -> the no-contact images that it is compared with.
-
-    They stand in ``columns`` beside the touch, or are the first of the rows of its ``sensor`` that meet ``no_contact``.
-    """
-    if not no_contact:
-        if not columns and "background" not in (*manifest.columns, *manifest.found):
-            raise ValueError(
-                f"{manifest.file} has no column 'background': difference images need background columns, or no_contact rows"
-            )
-        columns = columns or ("background",)
-        if len(columns) != len(touch):
-            raise ValueError(
-                f"background {' '.join(columns)}: difference images of touch {' '.join(touch)} need as many background"
-                " columns, or no_contact rows"
-            )
-        for column in columns:
-            manifest.check(column)
-        result = []
-        for column in columns:
-            found = manifest.places(column)
-            empty = next((i + 1 for i in kept if found[i] is None and any(places[t][i] for t in touch)), None)
-            if empty:
-                raise ValueError(f"{manifest.file} row {empty} has no {column} path: difference images need one")
-            result.append({i + 1: (place,) for i in kept if (place := found[i])})
-        return result
-    by_sensor: dict[str, list[int]] = {}
+) -> list[Background]:
+    """Use the first rows of each sensor that meet ``no_contact`` as the background of that sensor's rows."""
+    names = {i: manifest.rows[i][sensor] if sensor else "" for i in kept}
+    empty_rows: dict[str, list[int]] = {}
     for i in kept:
         if all(condition.holds(manifest.rows[i]) for condition in no_contact):
-            by_sensor.setdefault(manifest.rows[i][sensor] if sensor else "", []).append(i)
+            empty_rows.setdefault(names[i], []).append(i)
     result = []
     for column in touch:
-        means = {
-            s: tuple(p for i in rows if (p := places[column][i]))[:NUM_NO_CONTACT] for s, rows in by_sensor.items()
+        images = {
+            s: tuple(r for i in rows if (r := refs[column][i]))[:NUM_NO_CONTACT] for s, rows in empty_rows.items()
         }
         for i in kept:
-            name = manifest.rows[i][sensor] if sensor else ""
-            if not means.get(name):
+            if not images.get(names[i]):
                 raise ValueError(
-                    f"{manifest.file} row {i + 1}: no row meets {' and '.join(map(str, no_contact))} for its sensor {name!r}"
+                    f"{manifest.file} row {i + 1}: no row meets {' and '.join(map(str, no_contact))} for its sensor"
+                    f" {names[i]!r}"
                 )
-        result.append({i + 1: means[manifest.rows[i][sensor] if sensor else ""] for i in kept})
+        result.append({i + 1: images[names[i]] for i in kept})
     return result
 
 
 def check_present(
     manifest: Manifest,
-    places: Places,
+    refs: Refs,
     vision: str | None,
     touch: Sequence[str],
     numbers: Sequence[int],
     allow_missing: bool,
 ) -> dict[str, list[bool]]:
-    """Which rows lack which modality, for those modalities that some rows lack; ValueError unless that is allowed."""
+    """Return, for each modality that some rows lack, which rows lack it; ValueError unless ``allow_missing``."""
     missing: dict[str, list[bool]] = {}
-    for modality, columns in (("vision", [vision] if vision else []), ("touch", touch)):
-        gaps = [[places[c][i] is None for c in columns] for i in range(len(numbers))]
+    by_modality = {"vision": [vision] if vision else [], "touch": touch}
+    for modality, columns in by_modality.items():
+        gaps = [[refs[c][i] is None for c in columns] for i in range(len(numbers))]
         for number, gap in zip(numbers, gaps, strict=True):
             if any(gap) and not (allow_missing and all(gap)):
-                column = columns[gap.index(True)]
                 hint = (
                     "allow_missing accepts rows without a modality" if all(gap) else "stacked sensors need both images"
                 )
                 raise ValueError(
-                    f"{manifest.file} row {number} has no {column} path: fill it, or leave the row out (only); {hint}"
+                    f"{manifest.file} row {number} has no {columns[gap.index(True)]} path: fill it, or leave the row out"
+                    f" (only); {hint}"
                 )
         lacking = [bool(gap) and all(gap) for gap in gaps]
         if all(lacking) and columns:
             raise ValueError(f"{manifest.file}: {modality} is empty in every row: leave it out by {modality}=''")
         if any(lacking):
             missing[modality] = lacking
-    present = [m for m, columns in (("vision", vision), ("touch", touch)) if columns]
+    present = [m for m, columns in by_modality.items() if columns]
     for i, number in enumerate(numbers):
-        if missing and all(missing.get(m, [False] * len(numbers))[i] for m in present):
+        if missing and all(m in missing and missing[m][i] for m in present):
             raise ValueError(f"{manifest.file} row {number} has neither image: leave it out (only)")
     return missing
 
 
 def check_files(
-    manifest: Manifest,
-    places: Places,
-    backgrounds: Sequence[dict[int, tuple[ImageRef, ...]]],
-    numbers: Sequence[int],
+    manifest: Manifest, refs: Refs, backgrounds: Sequence[Background], numbers: Sequence[int]
 ) -> tuple[list[int], dict[str, Stamp]]:
-    """Sizes of the files that the rows name, for the fingerprint, and the stamp of each by its path; ValueError for any
-    that is missing or empty."""
+    """Check that every image file exists and is not empty.
+
+    Returns:
+        The file size of each image of each row (for the fingerprint), and the stamp of each file by its path.
+    """
     stamps: dict[str, Stamp] = {}
     missing: list[str] = []
-    every: list[int] = []
+    sizes: list[int] = []
     for i, number in enumerate(numbers):
-        named = [(column, found[i]) for column, found in places.items()]
-        named += [("background", place) for b in backgrounds for place in b.get(number, ())]
-        for column, place in named:
-            if place is None:
+        named = [(column, found[i]) for column, found in refs.items()]
+        named += [("background", ref) for b in backgrounds for ref in b.get(number, ())]
+        for column, ref in named:
+            if ref is None:
                 continue
-            if place.path not in stamps:
-                stamps[place.path] = stamp_of(place.path)
-            size = stamps[place.path][0]
-            every.append(size)
+            if ref.path not in stamps:
+                stamps[ref.path] = stamp_of(ref.path)
+            size = stamps[ref.path][0]
+            sizes.append(size)
             if size <= 0:
-                name = manifest.rows[number - 1].get(column) or Path(place.path).name
+                name = manifest.rows[number - 1].get(column) or Path(ref.path).name
                 missing.append(f"row {number} {column} {name}{' (0 bytes)' if size == 0 else ''}")
     if missing:
         raise ValueError(
-            f"{manifest.file}: {len(missing)} of {len(every)} image files are missing or empty, e.g."
+            f"{manifest.file}: {len(missing)} of {len(sizes)} image files are missing or empty, e.g."
             f" {'; '.join(missing[:3])} (paths are relative to {manifest.root})"
         )
-    return every, stamps
+    return sizes, stamps

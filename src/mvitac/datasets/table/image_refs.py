@@ -1,6 +1,6 @@
-"""Where an image lies: in a file of its own, in a video, in a tar, in a cell of a parquet table.
+"""References to images: in a file, a video, a tar or a cell of a parquet table.
 
-A reader names places; whoever packs reads those that lie together in one pass.
+References with the same container (a video, a row group) are read together in one pass.
 """
 
 from __future__ import annotations
@@ -20,34 +20,40 @@ from PIL import Image
 
 from mvitac.data import video
 from mvitac.data.images import decode
+from mvitac.system.files import brief
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 
 
 Damage = dict["ImageRef", str]
-"""A place whose image is damaged -> what is wrong with it."""
+"""Reference of a damaged image -> what is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageRef(ABC):
-    """One image of a dataset; sorts and hashes by where it lies."""
+    """One image of a dataset; sorted and hashed by its location."""
 
     path: str
 
-    def together(self) -> Hashable | None:
-        """What must be opened to read it and is worth opening once for many; None if it is read alone."""
+    def container(self) -> Hashable | None:
+        """Return what is opened once to read many images from it; None if the image is read by itself."""
         return None
 
     def within(self) -> tuple[int, ...]:
-        """Which bytes of the file it is, where the table of rows does not decide that."""
+        """Return the bytes of the file that hold the image, if the table of rows does not determine them."""
         return ()
 
     @staticmethod
     @abstractmethod
-    def read(places: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        """``places``, ascending and all of one kind and ``together``, each with its image as RGB.
+    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+        """Yield each reference with its image as RGB.
 
-        A damaged one is left out and put into ``lost``; ValueError or OSError if what holds them cannot be opened.
+        Args:
+            refs: References in ascending order, all of one class and with one container.
+            lost: Receives the damaged images, which are not yielded.
+
+        Raises:
+            ValueError, OSError: If the container cannot be opened.
         """
 
 
@@ -59,8 +65,8 @@ class File(ImageRef):
         return self.path
 
     @staticmethod
-    def read(places: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        return _each(places, lambda place: decode(place.path), lost)
+    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+        return _each(refs, lambda ref: decode(ref.path), lost)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -72,12 +78,12 @@ class Frame(ImageRef):
     def __str__(self) -> str:
         return f"{self.path} frame {self.index}"
 
-    def together(self) -> Hashable:
+    def container(self) -> Hashable:
         return self.path
 
     @staticmethod
-    def read(places: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        path, at = places[0].path, {place.index: place for place in places}  # type: ignore[attr-defined]
+    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+        path, at = refs[0].path, {ref.index: ref for ref in refs}  # type: ignore[attr-defined]
         why: dict[int, str] = {}
         for index, image in video.frames(path, list(at), lost=why):
             yield at[index], Image.fromarray(image)
@@ -86,7 +92,7 @@ class Frame(ImageRef):
 
 @dataclass(frozen=True, slots=True, order=True)
 class TarMember(ImageRef):
-    """``size`` bytes from ``offset`` on, which are an image file: a member of a tar that is not compressed."""
+    """An image file inside an uncompressed tar: ``size`` bytes from ``offset``."""
 
     offset: int
     size: int
@@ -98,13 +104,13 @@ class TarMember(ImageRef):
         return self.offset, self.size
 
     @staticmethod
-    def read(places: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        def image(place: Any) -> Image.Image:
-            with open(place.path, "rb") as file:
-                file.seek(place.offset)
-                return decode(io.BytesIO(file.read(place.size)), str(place))
+    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+        def image(ref: Any) -> Image.Image:
+            with open(ref.path, "rb") as file:
+                file.seek(ref.offset)
+                return decode(io.BytesIO(file.read(ref.size)), str(ref))
 
-        return _each(places, image, lost)
+        return _each(refs, image, lost)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -118,62 +124,62 @@ class ParquetCell(ImageRef):
     def __str__(self) -> str:
         return f"{self.path} row group {self.group} row {self.row} {self.column}"
 
-    def together(self) -> Hashable:
+    def container(self) -> Hashable:
         return (self.path, self.group)
 
     @staticmethod
-    def read(places: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        first: ParquetCell = places[0]  # type: ignore[assignment]
+    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+        first: ParquetCell = refs[0]  # type: ignore[assignment]
         try:
             values = pq.ParquetFile(first.path).read_row_group(first.group, columns=[first.column]).column(0)
         except (pa.ArrowException, OSError) as error:
-            raise ValueError(f"{first.path} cannot be read ({' '.join(str(error).split())[:120]})") from None
+            raise ValueError(f"{first.path} cannot be read ({brief(error)})") from None
 
-        def image(place: Any) -> Image.Image:
-            value = values[place.row].as_py()
+        def image(ref: Any) -> Image.Image:
+            value = values[ref.row].as_py()
             if isinstance(value, dict):
                 beside = Path(first.path).parent / (value.get("path") or "")
                 value = value.get("bytes") or (beside.read_bytes() if beside.is_file() else None)
             if not value:
-                raise ValueError(f"{place} holds no image")
-            return decode(io.BytesIO(value), str(place))
+                raise ValueError(f"{ref} holds no image")
+            return decode(io.BytesIO(value), str(ref))
 
-        yield from _each(places, image, lost)
+        yield from _each(refs, image, lost)
 
 
 def _each(
-    places: Sequence[ImageRef], image: Callable[[Any], Image.Image], lost: Damage
+    refs: Sequence[ImageRef], image: Callable[[Any], Image.Image], lost: Damage
 ) -> Iterator[tuple[ImageRef, Image.Image]]:
-    """``places`` one by one, each with its ``image``; the damaged ones go to ``lost``."""
-    for place in places:
+    """Yield each reference with its ``image``; damaged ones are put in ``lost``."""
+    for ref in refs:
         try:
-            found = image(place)
+            found = image(ref)
         except (ValueError, OSError) as error:
-            lost[place] = str(error)
+            lost[ref] = str(error)
         else:
-            yield place, found
+            yield ref, found
 
 
-def read_all(places: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-    """Every distinct one of ``places``, which lie together, with its image (RGB); the damaged ones go to ``lost``."""
-    distinct = sorted(set(places))  # type: ignore[type-var]
+def read_all(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+    """Yield each distinct reference, all of one container, with its image (RGB); damaged ones are put in ``lost``."""
+    distinct = sorted(set(refs))  # type: ignore[type-var]
     if distinct:
         yield from type(distinct[0]).read(distinct, lost)
 
 
 @functools.lru_cache(maxsize=64)
-def mean_image(places: tuple[ImageRef, ...]) -> np.ndarray:
-    """The mean of several images of one size, uint8 [H, W, 3]: what a sensor sees without contact."""
+def mean_image(refs: tuple[ImageRef, ...]) -> np.ndarray:
+    """Return the mean of images of one size, uint8 [H, W, 3]: the sensor's background."""
     total, num = None, 0
-    for place in places:
+    for ref in refs:
         lost: Damage = {}
-        for _, read in read_all([place], lost):
+        for _, read in read_all([ref], lost):
             image = np.asarray(read)
             if total is not None and image.shape != total.shape:
-                raise ValueError(f"{place} is {image.shape[1]} x {image.shape[0]}: backgrounds must be of one size")
+                raise ValueError(f"{ref} is {image.shape[1]} x {image.shape[0]}: backgrounds must be of one size")
             total = image.astype(np.float64) if total is None else total + image
             num += 1
         if lost:
-            raise ValueError(lost[place])
+            raise ValueError(lost[ref])
     assert total is not None
     return np.rint(total / num).astype(np.uint8)

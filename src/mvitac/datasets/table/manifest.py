@@ -1,6 +1,6 @@
-"""A table that says what belongs together: read from a manifest, or from the folders that amount to one.
+"""A table of samples, read from a manifest file or made from class folders.
 
-Cells are text, however they were stored; rows are counted from 1, the header not counted.
+Cells are text, whatever the file format. Rows are counted from 1, without the header.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ import pyarrow.parquet as pq
 from mvitac.data.images import IMAGES
 from mvitac.data.pack import SPLITS
 from mvitac.datasets.table.image_refs import VIDEOS, File, Frame, ImageRef
-from mvitac.datasets.table.splits import meant
+from mvitac.datasets.table.splits import likely_split
 from mvitac.registry import unknown
-from mvitac.system.files import digest, digest_file
+from mvitac.system.files import brief, digest, digest_file
 
 MANIFESTS = (".csv", ".parquet", ".jsonl")
 COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
@@ -33,25 +33,25 @@ COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": o
 
 @dataclass(frozen=True)
 class Manifest:
-    """Rows as text, however they were stored; "" is an empty cell, NaN or null."""
+    """Rows as text, whatever the file format; "" is an empty cell, NaN or null."""
 
     file: Path
-    """What to call it in errors."""
+    """Name for error messages."""
     root: Path
-    """What its paths are relative to."""
+    """Folder that paths are relative to."""
     columns: tuple[str, ...]
     rows: list[dict[str, str]]
     digest: str
     found: dict[str, list[ImageRef | None]] = field(default_factory=dict)
-    """Image columns that a reader resolved itself; the others hold paths."""
+    """Image columns that the reader resolved itself; other image columns hold paths."""
     labels: tuple[str, ...] = ()
-    """Columns that are labels unless others are asked for."""
+    """Default label columns."""
 
     @classmethod
     def of(
         cls, root: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]] | None = None
     ) -> Manifest:
-        """The table of ``rows`` that a reader made of what lies below ``root``."""
+        """Return the table of ``rows`` that a reader made from the files below ``root``."""
         columns = tuple(dict.fromkeys(name for row in rows for name in row))
         return cls(root, root, columns, rows, digest(rows), found or {})
 
@@ -59,45 +59,45 @@ class Manifest:
         if column not in self.columns and column not in self.found:
             raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
 
-    def places(self, column: str) -> list[ImageRef | None]:
-        """Where each row's image of ``column`` lies; None where the cell is empty.
+    def refs(self, column: str) -> list[ImageRef | None]:
+        """Return each row's image in ``column``; None where the cell is empty.
 
-        A path to a video needs the frame's number, from 0, in column <column>_frame or, if there is none, frame.
+        For a video, the frame number (from 0) is in column <column>_frame or, if that does not exist, frame.
         """
         if column in self.found:
             return self.found[column]
-        root, places = str(self.root), []
+        root, refs = str(self.root), []
         counter = f"{column}_frame" if f"{column}_frame" in self.columns else "frame"
         for number, row in enumerate(self.rows, 1):
             cell = row[column]
             path = os.path.join(root, cell)
             if not cell:
-                places.append(None)
+                refs.append(None)
             elif not cell.lower().endswith(VIDEOS):
-                places.append(File(path))
+                refs.append(File(path))
             elif (row.get(counter) or "").isdecimal():
-                places.append(Frame(path, int(row[counter])))
+                refs.append(Frame(path, int(row[counter])))
             else:
                 raise ValueError(
                     f"{self.file} row {number}: {column} {cell} is a video, column {counter!r} says"
                     f" {row.get(counter, 'nothing')!r}: give the frame's number, from 0"
                 )
-        return places
+        return refs
 
 
 def text_of(value: Any) -> str:
-    """A cell as text that does not depend on the file format: whole numbers without '.0', NaN and null as ''."""
+    """Return a cell as text, the same for each file format: whole numbers without '.0', NaN and null as ''."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     text = str(value).strip()
     if text.lower() == "nan":
         return ""
-    # pandas writes an integer column with one gap as 1.0, 2.0, ...: still the classes 1 and 2.
+    # pandas writes an integer column with a missing value as 1.0, 2.0, ...: these are the classes 1 and 2.
     return re.sub(r"^(-?\d+)\.0+$", r"\1", text) if ".0" in text else text
 
 
 def number_of(text: str) -> float | None:
-    """``text`` as a finite number, or None; 1_2 is a name, though Python reads a number."""
+    """Return ``text`` as a finite number, or None. 1_2 is not a number here, although Python accepts it."""
     try:
         value = float("" if "_" in text else text)
     except ValueError:
@@ -106,7 +106,7 @@ def number_of(text: str) -> float | None:
 
 
 def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
-    """The folder ``inside`` a clone of ``url`` at ``path`` (or itself) that holds ``pattern``; else ValueError."""
+    """Return folder ``inside`` of a clone of ``url`` at ``path``, or ``path`` itself; it must contain ``pattern``."""
     for root in (path / inside, path):
         if next(root.glob(pattern), None) is not None:
             return root
@@ -115,7 +115,7 @@ def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
 
 
 def find_manifest(path: Path) -> Path | None:
-    """The manifest that ``path`` is or holds; None if it is a folder without one."""
+    """Return the manifest at ``path`` or in that folder; None if the folder has none."""
     if path.is_dir():
         found = [path / f"manifest{suffix}" for suffix in MANIFESTS if (path / f"manifest{suffix}").is_file()]
         if len(found) > 1:
@@ -124,12 +124,12 @@ def find_manifest(path: Path) -> Path | None:
     if not path.is_file():
         raise ValueError(f"{path} does not exist: give a manifest ({', '.join(MANIFESTS)}) or a folder as path")
     if path.suffix.lower() not in MANIFESTS:
-        raise ValueError(f"{path} is no manifest: its name must end in {', '.join(MANIFESTS)}")
+        raise ValueError(f"{path} is not a manifest: its name must end in {', '.join(MANIFESTS)}")
     return path
 
 
 def read_manifest(file: Path) -> Manifest:
-    """Read ``file``; ValueError for anything that is not a table with named columns and at least one row."""
+    """Read a manifest; ValueError unless it is a table with named columns and at least one row."""
     try:
         columns, rows = {".csv": _read_csv, ".jsonl": _read_jsonl, ".parquet": _read_parquet}[file.suffix.lower()](file)
     except UnicodeDecodeError as error:
@@ -179,9 +179,7 @@ def _read_parquet(file: Path) -> tuple[list[str], list[dict[str, str]]]:
     try:
         table = pq.ParquetFile(file).read()
     except (pa.ArrowException, OSError) as error:
-        raise ValueError(
-            f"{file} is not a parquet file ({' '.join(str(error).split())[:120]}): write it again"
-        ) from None
+        raise ValueError(f"{file} is not a parquet file ({brief(error)}): write it again") from None
     _check_header(file, table.column_names)
     columns = {name: [text_of(v) for v in table.column(name).to_pylist()] for name in table.column_names}
     return table.column_names, [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
@@ -195,41 +193,15 @@ def _check_header(file: Path, columns: Sequence[str]) -> None:
 
 
 def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bool = False) -> Manifest:
-    """The manifest that a tree of class folders amounts to (see ``folder``'s docstring).
+    """Return the manifest of a tree of class folders (the layouts are in ``mvitac.datasets.folder``).
 
-    ``pictures`` is what a tree without folders for the modalities shows; ``allow_missing`` leaves a cell empty where an
-    image has no counterpart.
+    Args:
+        pictures: Modality of the images if the tree has no folders for modalities.
+        allow_missing: Leave a cell empty where an image has no counterpart.
     """
-    splits = [split for split in SPLITS if (root / split).is_dir()]
-    for other in sorted(root.iterdir()) if splits else ():
-        if other.name not in SPLITS and other.is_dir() and _images_below(other):
-            hint = f"write {wanted!r} instead" if (wanted := meant(other.name)) else "take it away"
-            raise ValueError(f"{root} has images in folder {other.name!r} beside {' and '.join(splits)}: {hint}")
     rows: list[dict[str, str]] = []
-    for split in splits or [""]:
-        base = root / split
-        named = [name for name in ("vision", "touch", "left", "right") if (base / name).is_dir()]
-        found = {name: _images_below(base / name) for name in named} or {pictures: _images_below(base)}
-        have = list(found)
-        if not named and not any("/" in key for key in found[pictures]):
-            raise ValueError(
-                f"{base} has no manifest.csv (.parquet, .jsonl) and no folder vision, touch, left or right"
-                " nor class folders with images: make them, or give another path"
-            )
-        for key in sorted(set().union(*found.values())):
-            lacking = next((name for name in have if key not in found[name]), None)
-            if lacking and not allow_missing:
-                other = next(found[name][key] for name in have if key in found[name])
-                raise ValueError(
-                    f"{other} has no counterpart {base / lacking / key}.*: add it, remove the other, or allow_missing"
-                )
-            parts = key.split("/")
-            if len(parts) < 2:
-                where = next(found[name][key] for name in have if key in found[name])
-                raise ValueError(f"{where} is not in a class folder: put it in one, named by its class")
-            row = {name: found[name][key].relative_to(root).as_posix() if key in found[name] else "" for name in have}
-            group = "/".join(parts[:-1]) if len(parts) > 2 else f"{split}/{key}"
-            rows.append({**row, "label": parts[0], "group": group, **({"split": split} if split else {})})
+    for split in _split_folders(root) or [""]:
+        rows += _split_rows(root, split, pictures, allow_missing)
     columns = list(dict.fromkeys(name for row in rows for name in row))
     for number, row in enumerate(rows, 1):
         if len(row) < len(columns) and not allow_missing:
@@ -241,6 +213,45 @@ def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bo
     if not rows:
         raise ValueError(f"{root} holds no images ({', '.join(IMAGES)}): put them in <class> folders")
     return Manifest(root, root, tuple(columns), rows, digest(rows), labels=("label",))
+
+
+def _split_folders(root: Path) -> list[str]:
+    """Return the folders of ``root`` named after splits; ValueError if other folders next to them hold images."""
+    splits = [split for split in SPLITS if (root / split).is_dir()]
+    for other in sorted(root.iterdir()) if splits else ():
+        if other.name not in SPLITS and other.is_dir() and _images_below(other):
+            hint = f"write {wanted!r} instead" if (wanted := likely_split(other.name)) else "remove it"
+            raise ValueError(f"{root} has images in folder {other.name!r} beside {' and '.join(splits)}: {hint}")
+    return splits
+
+
+def _split_rows(root: Path, split: str, pictures: str, allow_missing: bool) -> list[dict[str, str]]:
+    """Return the rows of the class folders in folder ``split`` ("" = ``root`` itself)."""
+    base = root / split
+    named = [name for name in ("vision", "touch", "left", "right") if (base / name).is_dir()]
+    found = {name: _images_below(base / name) for name in named} or {pictures: _images_below(base)}
+    if not named and not any("/" in key for key in found[pictures]):
+        raise ValueError(
+            f"{base} has no manifest.csv (.parquet, .jsonl) and no folder vision, touch, left or right"
+            " nor class folders with images: make them, or give another path"
+        )
+    rows = []
+    for key in sorted(set().union(*found.values())):
+        first = next(images[key] for images in found.values() if key in images)
+        lacking = next((name for name, images in found.items() if key not in images), None)
+        if lacking and not allow_missing:
+            raise ValueError(
+                f"{first} has no counterpart {base / lacking / key}.*: add it, remove the other, or allow_missing"
+            )
+        label, *below = key.split("/")
+        if not below:
+            raise ValueError(f"{first} is not in a class folder: put it in one, named by its class")
+        row = {
+            name: images[key].relative_to(root).as_posix() if key in images else "" for name, images in found.items()
+        }
+        group = key.rpartition("/")[0] if len(below) > 1 else f"{split}/{key}"
+        rows.append({**row, "label": label, "group": group, **({"split": split} if split else {})})
+    return rows
 
 
 def _images_below(folder: Path) -> dict[str, Path]:
@@ -256,7 +267,7 @@ def _images_below(folder: Path) -> dict[str, Path]:
 
 @dataclass(frozen=True)
 class Condition:
-    """One row filter: column, one of = != <= >=, value."""
+    """A row filter: a column, one of = != <= >=, and a value."""
 
     column: str
     sign: str
@@ -276,7 +287,7 @@ class Condition:
         return f"{self.column}{self.sign}{self.value}"
 
     def holds(self, row: dict[str, str]) -> bool:
-        """Whether ``row`` meets it; an empty cell is neither <= nor >= anything."""
+        """Return whether ``row`` meets the condition; an empty cell is neither <= nor >= anything."""
         cell, wanted = row[self.column], text_of(self.value)
         if self.sign in COMPARE:
             number = number_of(cell)

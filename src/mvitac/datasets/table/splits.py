@@ -1,4 +1,4 @@
-"""Which rows learn, choose and score: whole groups dealt to splits, and splits given by a table held to account."""
+"""Train/val/test splits: assign whole groups to splits, or validate a given split column."""
 
 from __future__ import annotations
 
@@ -20,10 +20,20 @@ BY_GROUP = "by-group"
 def assign_splits(
     groups: Sequence[str], targets: Sequence[Sequence[int]], test_share: float, val_share: float, seed: int
 ) -> list[str]:
-    """A split per row, whole groups dealt to train, val and test, stratified over the first label's classes.
+    """Assign whole groups to train, val and test, stratified by the classes of the first label.
 
-    The first group of every class goes to train, every next one to the split that lacks most: a class of one group is
-    never tested. Groups without any label are "unlabelled" where others have some.
+    The first group of each class goes to train and each further group to the split with the largest deficit, so a class
+    with one group is never tested. Groups without any label are "unlabelled" if other groups are labelled.
+
+    Args:
+        groups: Group of each row.
+        targets: For each task, the class number of each row (-1 = unlabelled).
+        test_share: Fraction of groups in test.
+        val_share: Fraction of groups in val.
+        seed: Random seed.
+
+    Returns:
+        The split of each row.
     """
     votes: dict[str, Counter[int]] = {group: Counter() for group in groups}
     known: set[str] = set()
@@ -33,45 +43,60 @@ def assign_splits(
             known.add(group)
     strata: dict[int, list[str]] = defaultdict(list)
     for group in sorted(known):
-        # Ties go to the smaller class number, so that the dealing does not depend on the order of rows.
+        # Ties go to the smaller class number, so that the result does not depend on the order of rows.
         strata[min(votes[group], key=lambda c: (-votes[group][c], c), default=-1)].append(group)
     shares = {"train": 1 - test_share - val_share, "test": test_share, "val": val_share}
     rng = np.random.default_rng(seed)
-    dealt: dict[str, str] = {}
+    assigned: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for stratum in rng.permutation(sorted(strata)).tolist():
         for place, j in enumerate(rng.permutation(len(strata[stratum])).tolist()):
-            lacks = {name: share * (len(dealt) + 1) - counts[name] for name, share in shares.items() if share > 0}
+            lacks = {name: share * (len(assigned) + 1) - counts[name] for name, share in shares.items() if share > 0}
             choice = "train" if place == 0 else max(lacks, key=lambda name: lacks[name])
-            dealt[strata[stratum][j]] = choice
+            assigned[strata[stratum][j]] = choice
             counts[choice] += 1
-    return [dealt.get(group, "unlabelled") for group in groups]
+    return [assigned.get(group, "unlabelled") for group in groups]
 
 
-def by_video(root: Path, numbers: Sequence[int], places: Iterable[Sequence[ImageRef | None]]) -> tuple[str, list[str]]:
-    """What a group is where no column names it, and every row's: frames of one video are one group, and so are videos that
-    a row shows side by side; a row of single images is alone. ``places`` has a list per image column."""
-    columns = list(places)
+def group_by_video(
+    root: Path, numbers: Sequence[int], refs: Iterable[Sequence[ImageRef | None]]
+) -> tuple[str, list[str]]:
+    """Group rows that no column groups: by video, with videos that occur in the same row as one group.
+
+    A row of image files is its own group.
+
+    Args:
+        root: Folder that names of videos are relative to.
+        numbers: Row numbers.
+        refs: For each image column, one reference per row.
+
+    Returns:
+        What a group is ("video" or "row"), and the group of each row.
+    """
+    columns = list(refs)
     videos = [
-        [os.path.relpath(place.path, root) for column in columns if isinstance(place := column[i], Frame)]
+        [os.path.relpath(ref.path, root) for column in columns if isinstance(ref := column[i], Frame)]
         for i in range(len(numbers))
     ]
-    beside: dict[str, str] = {}
-
-    def first(video: str) -> str:
-        while (other := beside.setdefault(video, video)) != video:
-            video = other
-        return video
-
+    parent: dict[str, str] = {}  # union-find
     for shown in videos:
         for video in shown[1:]:
-            beside[first(video)] = first(shown[0])
-    groups = [first(shown[0]) if shown else f"{number:06d}" for number, shown in zip(numbers, videos, strict=True)]
+            parent[_root(parent, video)] = _root(parent, shown[0])
+    groups = [
+        _root(parent, shown[0]) if shown else f"{number:06d}" for number, shown in zip(numbers, videos, strict=True)
+    ]
     return "video" if any(videos) else "row", groups
 
 
-def meant(name: str) -> str | None:
-    """The split that is usually meant by ``name``, if any."""
+def _root(parent: dict[str, str], name: str) -> str:
+    """Return the representative of the set of ``name`` in a union-find structure."""
+    while (other := parent.setdefault(name, name)) != name:
+        name = other
+    return name
+
+
+def likely_split(name: str) -> str | None:
+    """Return the split that ``name`` usually stands for, if any."""
     near = {"validation": "val", "valid": "val", "dev": "val", "eval": "val", "training": "train"}
     near |= {"testing": "test", "unseen": "test", "unlabeled": "unlabelled", **{split: split for split in SPLITS}}
     return near.get(name.lower())
@@ -80,31 +105,36 @@ def meant(name: str) -> str | None:
 def check_split_names(where: str, column: str, numbers: Sequence[int], splits: Sequence[str]) -> None:
     for number, split in zip(numbers, splits, strict=True):
         if split not in SPLITS:
-            wanted = meant(split)
+            wanted = likely_split(split)
             hint = f"; write {wanted!r} instead" if wanted else f"; or split={BY_GROUP} ignores the column"
             raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}{hint}")
 
 
 def check_leak(where: str, split: str, what: str, values: Sequence[str], splits: Sequence[str]) -> None:
-    """Refuse a value that is on two sides; train and unlabelled are one side, as pre-training sees both."""
+    """Raise ValueError if a value occurs in more than one split.
+
+    Train and unlabelled count as one split, because pre-training uses both.
+    """
     sides: dict[str, set[str]] = defaultdict(set)
     for value, side in zip(values, splits, strict=True):
         sides[value].add("train" if side == "unlabelled" else side)
     leaks = [value for value, found in sides.items() if len(found) > 1]
     if leaks:
-        advice = "give the group that holds them together" if split == BY_GROUP else f"split={BY_GROUP} splits by group"
+        advice = (
+            "give the group that holds them together" if split == BY_GROUP else f"split={BY_GROUP} assigns whole groups"
+        )
         raise ValueError(
-            f"{where}: split {split!r} leaks: {len(leaks)} of {len(sides)} {what} are on two sides, e.g. {leaks[0]!r}"
-            f" in {' and '.join(sorted(sides[leaks[0]]))}; {advice}, or allow_leak accepts it"
+            f"{where}: split {split!r} leaks: {len(leaks)} of {len(sides)} {what} are in more than one split, e.g."
+            f" {leaks[0]!r} in {' and '.join(sorted(sides[leaks[0]]))}; {advice}, or allow_leak accepts it"
         )
 
 
 def check_sides(
     where: str, split: str, splits: Sequence[str], tasks: Sequence[Task], targets: Sequence[Sequence[int]], num: int
 ) -> None:
-    """Something to pre-train on; for every task something to learn from and to be scored on."""
+    """Check that there are rows to pre-train on and, for each task, labelled rows in train and test."""
     counts = Counter(splits)
-    what = f"dealing {num} groups" if split == BY_GROUP else f"column {split!r}"
+    what = f"assigning {num} groups" if split == BY_GROUP else f"column {split!r}"
     if not counts["train"] + counts["unlabelled"]:
         raise ValueError(f"{where}: {what} gives no rows of train or unlabelled: nothing to pre-train on")
     for task, target in zip(tasks, targets, strict=True):
@@ -117,10 +147,10 @@ def check_sides(
 
 
 def folds(groups: Sequence[str], strata: Sequence[str], num: int, val_every: int = 2) -> dict[str, list[str]]:
-    """Columns fold1 ... fold<num> with a split per row: every group is test in one of them.
+    """Return columns fold1 ... fold<num>, each a split per row; each group is in test in exactly one fold.
 
-    Groups are dealt in turn, stratum by stratum, so that each fold has its share of every stratum; of the next fold's
-    groups every ``val_every``-th is val.
+    Groups are assigned in turn, stratum by stratum, so that each fold has its share of each stratum. Of the groups tested
+    in the next fold, every ``val_every``-th is in val.
     """
     home = dict(zip(reversed(groups), reversed(strata), strict=True))
     shuffled = np.random.default_rng(0).permutation(sorted(home)).tolist()
@@ -135,17 +165,31 @@ def folds(groups: Sequence[str], strata: Sequence[str], num: int, val_every: int
     return columns
 
 
+def add_folds(rows: Sequence[dict[str, str]], strata: Sequence[str], num: int, val_every: int = 2) -> None:
+    """Add the columns of ``folds`` to ``rows``, with their column object as the group."""
+    for column, splits in folds([row["object"] for row in rows], strata, num, val_every).items():
+        for row, split in zip(rows, splits, strict=True):
+            row[column] = split
+
+
 SCALE = 1_000_000
-"""Shares are counted in millionths, as integers, so that the dealing is the same on every machine."""
+"""Fractions are integers in millionths, so that the result is the same on every machine."""
 
 
 def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.ndarray:
-    """Side number [G] of each group, given its rows of each class, ``counts`` [G, C].
+    """Assign groups to splits so that each split gets its share of the rows and of the groups of each class.
 
-    From a dealing drawn by ``seed`` one group is moved, or two are exchanged, as long as that brings the sides nearer to
-    their ``shares`` of each class's rows and of each class's groups (sum of squared differences). Groups decide how far an
-    interval is from useless, rows how far a score is from noise: both count the same. A class of a single group cannot be
-    shared out and does not count.
+    Starts from a random assignment and moves one group, or exchanges two, as long as that lowers the sum of squared
+    differences from ``shares``. Rows and groups count equally: the number of rows limits the precision of a score, the
+    number of groups its confidence interval. A class with a single group does not count.
+
+    Args:
+        counts: [G, C], number of rows of each group in each class.
+        shares: Fraction of each split.
+        seed: Random seed of the initial assignment.
+
+    Returns:
+        [G] int64, the index in ``shares`` of each group's split.
     """
     num = len(counts)
     if not num:
@@ -159,7 +203,7 @@ def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.nda
     while True:
         over = np.stack([weight[side == s].sum(0) for s in range(len(shares))]) - target  # [S, F]
         now = (over**2).sum(1)  # [S]
-        # Moving g from its side to s changes the cost of these two only.
+        # Moving g from its side to s changes only the cost of these two.
         leave = ((over[side] - weight) ** 2).sum(1) - now[side]  # [G]
         enter = ((over[None] + weight[:, None]) ** 2).sum(2) - now  # [G, S]
         gain = leave[:, None] + enter
@@ -168,7 +212,7 @@ def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.nda
             group, to = divmod(int(gain.argmin()), len(shares))
             side[group] = to
             continue
-        change = weight[None] - weight[:, None]  # [G, G, F]: what g's side gains if g gives way to h
+        change = weight[None] - weight[:, None]  # [G, G, F]: change of g's side if h replaces g
         one = ((over[side][:, None] + change) ** 2).sum(2) - now[side][:, None]
         gain = one + one.T
         gain[side[:, None] == side] = 0

@@ -1,4 +1,4 @@
-"""How long a video is, and which of its frames to take: known before any is decoded."""
+"""Frame counts and times of a video, read without decoding it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from av.packet import Packet
 
 
 def num_frames(path: Path) -> int:
-    """How many frames of ``path`` are shown, counted without decoding them; ValueError if it is no video or has none."""
+    """Return the number of displayed frames; ValueError if ``path`` is not a video or has none."""
     try:
         with av.open(str(path)) as container:
             num = sum(map(_is_shown, container.demux(video=0)))
@@ -23,13 +23,13 @@ def num_frames(path: Path) -> int:
 
 
 def spread(num: int, length: int, start: float = 0.0, end: float = 1.0) -> list[int]:
-    """At most ``num`` different frame numbers, evenly spread from the share ``start`` to ``end`` of ``length`` frames."""
+    """Return at most ``num`` distinct frame numbers, evenly spaced between fractions ``start`` and ``end`` of ``length``."""
     places = np.linspace(start * (length - 1), end * (length - 1), num)
     return sorted({int(place) for place in np.rint(places)})
 
 
 def timestamps(path: Path) -> np.ndarray:
-    """Ascending presentation times in seconds [N] of the frames that ``path`` shows; nothing is decoded."""
+    """Return the presentation times in seconds [N], ascending, of the displayed frames."""
     try:
         with av.open(str(path)) as container:
             base = float(container.streams.video[0].time_base or 0)
@@ -40,12 +40,12 @@ def timestamps(path: Path) -> np.ndarray:
 
 
 def _is_shown(packet: Packet) -> bool:
-    """Not what an edit list cuts off (a trim without re-encoding): neither a player nor ``mvitac.data.video`` counts that."""
+    """Return False for frames cut off by an edit list: neither a player nor ``mvitac.data.video`` counts them."""
     return packet.size > 0 and not packet.is_discard
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each of ``wanted`` [M] the place of the nearest of ascending ``times`` [N], and how far away it is (seconds)."""
+    """Return the index in ascending ``times`` [N] nearest to each of ``wanted`` [M], and the distance in seconds."""
     if not len(times):
         return np.zeros(len(wanted), int), np.full(len(wanted), np.inf)
     after = np.clip(np.searchsorted(times, wanted), 1, max(1, len(times) - 1))

@@ -1,4 +1,4 @@
-"""Touch and Go (Yang et al., 2022) as its owners ship it."""
+"""Touch and Go (Yang et al., 2022), read as published."""
 
 from mvitac.datasets.touch_and_go import reader
 

@@ -1,8 +1,8 @@
-"""Touch and Go's list files: what each names, which touches they make up, and how recordings are dealt to sides.
+"""Touch and Go's list files: the labels of frames, the touches they form, and the splits of recordings.
 
 train.txt  test.txt               category of 20          rows "<rec>/<10 digits>.jpg,<label>", -1 = inconclusive
 train_rough.txt  test_rough.txt   1 rough, 0 smooth
-label.txt                         every labelled frame, in place of the four
+label.txt                         every labelled frame, if the other lists are missing
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ CLASSES = (
     *("rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others"),
 )
 SOFT = (7, 8, 9, 11, 13)
-"""Categories that the owners call soft; every other is hard."""
+"""Categories that the owners call soft; the others are hard."""
 LISTS_AT = "https://github.com/fredfyyang/Touch-and-Go, folder 'Visuo-tactile contrastive learning/dataset'"
 LIST_FILES = ("train.txt", "test.txt", "train_rough.txt", "test_rough.txt", "label.txt")
 NUM_ROWS = {"train.txt": 91_982, "test.txt": 29_879, "train_rough.txt": 35_119, "test_rough.txt": 8_085}
-"""Rows of the lists as their owners publish them."""
+"""Number of rows of the published lists."""
 ROW = re.compile(r"^[ \t]*([^/,\s]+)/(\d{10})\.jpg,(-?\d{1,9})[ \t]*$", re.MULTILINE)
 
 
 @dataclass(slots=True)
 class Frame:
-    """One pair and what the lists say of it."""
+    """One pair, its labels and its split."""
 
     recording: str
     number: int
     category: int = -1
     rough: int = -1
     listed: str = ""
-    """train or test: the category list it is in."""
+    """train or test: the category list that it is in."""
     listed_rough: str = ""
     split: str = "unlabelled"
     split_rough: str = "unlabelled"
@@ -59,7 +59,7 @@ class Frame:
 
 
 def read_list(file: Path, num_classes: int) -> list[tuple[str, int, int]]:
-    """(recording, frame, label) per row, -1 = inconclusive; ValueError names the line that is none."""
+    """Return (recording, frame, label) per row, -1 = inconclusive; ValueError names an invalid line."""
     try:
         text = file.read_text(encoding="utf-8")
     except UnicodeDecodeError:
@@ -73,49 +73,40 @@ def read_list(file: Path, num_classes: int) -> list[tuple[str, int, int]]:
     rows = [(recording, int(frame), int(label)) for recording, frame, label in found]
     for number, (_, _, label) in enumerate(rows, 1):
         if not -1 <= label < num_classes:
-            raise ValueError(f"{file} line {number}: label {label} is none of -1 to {num_classes - 1}")
+            raise ValueError(f"{file} line {number}: label {label} is not in -1 to {num_classes - 1}")
     return rows
 
 
 def read_lists(folder: Path) -> list[Frame]:
-    """Every frame with a label in the lists of ``folder`` (or in its label.txt alone), by recording and number."""
+    """Return every labelled frame in the lists of ``folder`` (or in label.txt alone), sorted by recording and number."""
     known: dict[tuple[str, int], Frame] = {}
-
-    def add(name: str, side: str, num_classes: int, rough: bool) -> None:
-        for recording, number, label in read_list(folder / name, num_classes):
-            frame = known.get((recording, number))
-            if frame is None:
-                frame = known[recording, number] = Frame(recording, number)
-            if frame.listed_rough if rough else frame.listed:
-                raise ValueError(
-                    f"{folder / name}: {recording}/{number:010d}.jpg is listed twice: fetch the lists again"
-                )
-            if rough:
-                frame.listed_rough, frame.rough = side, label
-            else:
-                frame.listed, frame.category = side, label
-
-    present = [
-        name for name in ("train.txt", "test.txt", "train_rough.txt", "test_rough.txt") if (folder / name).is_file()
-    ]
+    present = [name for name in LIST_FILES[:4] if (folder / name).is_file()]
     if {"train.txt", "test.txt"} <= set(present):
-        add("train.txt", "train", len(CLASSES), False)
-        add("test.txt", "test", len(CLASSES), False)
         if len(present) == 3:
             raise ValueError(f"{folder} has {present[2]} without its counterpart: fetch both, or remove it")
-        if len(present) == 4:
-            add("train_rough.txt", "train", 2, True)
-            add("test_rough.txt", "test", 2, True)
+        for name in present:
+            _add_list(known, folder / name, name.split(".")[0].removesuffix("_rough"), "rough" in name)
     elif not present and (folder / "label.txt").is_file():
-        add("label.txt", "label", len(CLASSES), False)
+        _add_list(known, folder / "label.txt", "label", False)
     else:
         raise ValueError(f"{folder} has no train.txt and test.txt: they are in {LISTS_AT}; give their folder as lists")
     labelled = [frame for frame in known.values() if frame.category >= 0 or frame.rough >= 0]
     return sorted(labelled, key=lambda frame: (frame.recording, frame.number))
 
 
+def _add_list(known: dict[tuple[str, int], Frame], file: Path, split: str, rough: bool) -> None:
+    for recording, number, label in read_list(file, 2 if rough else len(CLASSES)):
+        frame = known.setdefault((recording, number), Frame(recording, number))
+        if frame.listed_rough if rough else frame.listed:
+            raise ValueError(f"{file}: {recording}/{number:010d}.jpg is listed twice: fetch the lists again")
+        if rough:
+            frame.listed_rough, frame.rough = split, label
+        else:
+            frame.listed, frame.category = split, label
+
+
 def find_touches(listed: Sequence[Frame]) -> None:
-    """Give every frame the number of its run's first frame; a run is consecutive frames of one recording and category."""
+    """Set ``touch`` of each frame: the first frame of its run of consecutive frames of one recording and category."""
     last = Frame("", -2)
     for frame in listed:
         other = frame.category != last.category and min(frame.category, last.category) >= 0
@@ -125,7 +116,7 @@ def find_touches(listed: Sequence[Frame]) -> None:
 
 
 def leaks(listed: Iterable[Frame]) -> list[str]:
-    """What the two sides of the owners' lists share, in words."""
+    """Return notes on what train and test of the owners' lists share."""
     by_side: dict[str, set[str]] = defaultdict(set)
     rough_test = seen = 0
     for frame in listed:
@@ -140,7 +131,7 @@ def leaks(listed: Iterable[Frame]) -> list[str]:
 
 
 def by_recording(listed: Sequence[Frame], shares: tuple[float, ...], seed: int) -> dict[str, int]:
-    """Side number of every recording, stratified over categories and rough/smooth together."""
+    """Return the split number of each recording, stratified by category and rough/smooth together."""
     names = sorted({frame.recording for frame in listed})
     place = {name: i for i, name in enumerate(names)}
     counts = np.zeros((len(names), len(CLASSES) + 2), np.int64)
@@ -153,18 +144,18 @@ def by_recording(listed: Sequence[Frame], shares: tuple[float, ...], seed: int) 
 
 
 def assign_by_recording(listed: Sequence[Frame], test_share: float, val_share: float, seed: int) -> None:
-    """Put every frame on the side that its recording is dealt, for all tasks alike."""
-    dealt = by_recording(listed, (1 - test_share - val_share, val_share, test_share), seed)
+    """Set the split of each frame to that of its recording, for all tasks."""
+    splits = by_recording(listed, (1 - test_share - val_share, val_share, test_share), seed)
     for frame in listed:
-        frame.split = frame.split_rough = ("train", "val", "test")[dealt[frame.recording]]
+        frame.split = frame.split_rough = ("train", "val", "test")[splits[frame.recording]]
 
 
 def assign_official(listed: Sequence[Frame], val_share: float, seed: int) -> None:
-    """Put every frame on the side that its lists say, ``val_share`` of train's recordings on val."""
+    """Set the split of each frame to that of the owners' lists, with ``val_share`` of train's recordings in val."""
     learnt = [frame for frame in listed if "train" in (frame.listed, frame.listed_rough)]
     held = by_recording(learnt, (1 - val_share, val_share), seed) if val_share else {}
     for frame in listed:
         learn = "val" if held.get(frame.recording) else "train"
-        # What the rough lists alone name is no part of the owners' pre-training: "test" keeps it out.
+        # Frames that only the rough lists name are not in the owners' pre-training, so they are "test" here.
         frame.split = learn if frame.listed == "train" else "test"
         frame.split_rough = learn if frame.listed_rough == "train" else "test"

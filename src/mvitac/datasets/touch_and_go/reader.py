@@ -1,13 +1,13 @@
-"""``--data touch-and-go``: Touch and Go (Yang et al., NeurIPS 2022) as its owners ship it.
+"""``--data touch-and-go``: Touch and Go (Yang et al., NeurIPS 2022), read as published.
 
-    <root>/label.txt                            every labelled frame, "<rec>/<10 digits>.jpg,<int>"
+    <root>/label.txt                            all labelled frames, "<rec>/<10 digits>.jpg,<int>"
     <root>/dataset/<rec>/video.mp4              camera, 640 x 480
-                         gelsight.mp4           touch; frame i of one belongs to frame i of the other, from 0
-                         video_frame/<10 digits>.jpg   gelsight_frame/<10 digits>.jpg    as the owners extract them
+                         gelsight.mp4           touch; frame i pairs with frame i of the camera, from 0
+                         video_frame/<10 digits>.jpg   gelsight_frame/<10 digits>.jpg    as extracted by the owners' script
 
-Images come straight from the two videos, only the frames that are wanted and each video once, or from the extracted
-JPEGs. The owners' lists are in their repository (see touch_and_go_lists). One pack holds all three tasks; a frame that a
-task's lists do not name has label -1 there.
+Images are read directly from the two videos (only the wanted frames, each video once) or from extracted JPEGs. The lists
+are in the owners' repository (see ``lists.py``). One pack has all three tasks; a frame that is not in a task's lists has
+label -1.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ from mvitac.registry import to_json
 from mvitac.system.files import digest, digest_file
 
 VERSION = 1
-"""Raised when the same tree would give another pack."""
+"""Version of this reader. Increase it when the same files would give another pack."""
 CHUNK = 256
-"""Frames of one recording that a packing process holds at a time (100 MB of pairs at 256 px)."""
+"""Frames of one recording that a worker holds at a time (100 MB of pairs at 256 px)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TouchAndGoConfig(DatasetConfig):
-    """Touch and Go: a person touches things in the wild with a GelSight, filmed by a camera; 20 materials, hard/soft,
-    rough/smooth. Get the recordings from its homepage (touch-and-go.github.io) and the four list files from the owners'
-    repository; give the folder that holds dataset/ as root. A first pack of everything:
+    """Touch and Go: a person touches objects with a GelSight, filmed by a camera. Labels are 20 materials, hard/soft and
+    rough/smooth. Download the recordings from touch-and-go.github.io and the four list files from the owners' repository.
+    To pack everything:
 
     mvitac data pack --data touch-and-go --data.root DOWNLOAD --data.lists LISTS --out packs/tag
     """
@@ -64,29 +64,29 @@ class TouchAndGoConfig(DatasetConfig):
     name: ClassVar[str] = "touch-and-go"
 
     root: Path = Path("touch_and_go")
-    """The download: the folder with dataset/<recording>/ in it, or the one with the recordings themselves."""
+    """Folder of the download: with dataset/<recording>/ in it, or with the recordings themselves."""
     lists: Path | None = None
-    """Folder with train.txt, test.txt, train_rough.txt and test_rough.txt; default: root, else root's label.txt serves
-    (then there is no rough/smooth and no official split)."""
+    """Folder with train.txt, test.txt, train_rough.txt and test_rough.txt; default: root. If root has only label.txt,
+    there is no rough/smooth task and no official split."""
     split: Literal["by-recording", "official"] = "by-recording"
-    """by-recording: no recording on two sides, so a score is about places never seen. official: the owners' lists, as the
-    paper uses them; 100 of their 106 test recordings are also in train, and results will say so."""
+    """by-recording: each recording is in one split, so scores are for unseen places. official: the owners' lists, as in
+    the paper; 100 of their 106 test recordings are also in train, which results note."""
     modalities: Literal["both", "vision", "touch"] = "both"
-    """touch packs where only the GelSight videos were downloaded."""
+    """Which images to pack, e.g. touch if only the GelSight videos were downloaded."""
     frames: Literal["auto", "video", "jpeg"] = "auto"
-    """video: from the mp4 files. jpeg: from the extracted folders. auto: the mp4 where there is one."""
+    """video: read the mp4 files. jpeg: read the extracted folders. auto: the mp4 if it exists."""
     partial: bool = False
-    """Pack the recordings that are there and name the missing ones, instead of stopping."""
+    """Pack the available recordings and list the missing ones, instead of stopping."""
     unlabelled: int = 0
-    """Also take every n-th frame that has no label (-1, or not listed) for pre-training, from recordings without test
-    or val frames; 0 = none. Most of these show an untouched gel."""
+    """Also use every n-th unlabelled frame (-1 or not listed) for pre-training, from recordings without test or val
+    frames; 0 = none. Most of these show an untouched gel."""
     test_share: float = 0.25
-    """Share of the recordings that only score (by-recording)."""
+    """Fraction of recordings in the test split (by-recording)."""
     val_share: float | None = None
-    """Share of the recordings, all taken from train, that choose; default .15 by-recording and 0 official, whose lists
-    have none (the probe then sets aside a fifth of train's recordings)."""
+    """Fraction of recordings in the validation split, taken from train; default: 0.15 (by-recording) or 0 (official,
+    where the probe sets aside a fifth of train's recordings)."""
     split_seed: int = 0
-    """Another number is another dealing of the recordings."""
+    """Random seed for assigning recordings to splits."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -103,7 +103,7 @@ class TouchAndGoConfig(DatasetConfig):
 
     @property
     def val_part(self) -> float:
-        """``val_share`` with its default resolved."""
+        """``val_share`` or its default."""
         return self.val_share if self.val_share is not None else 0.15 if self.split == "by-recording" else 0.0
 
     def source(self) -> Source:
@@ -111,60 +111,41 @@ class TouchAndGoConfig(DatasetConfig):
 
 
 class TouchAndGo(Source):
-    """One item is up to ``CHUNK`` wanted frames of one recording, in ascending order: one forward pass of each video."""
+    """One item is up to ``CHUNK`` frames of one recording, ascending, read in one forward pass of each video."""
 
     sizes_at = "recordings"
 
     def __init__(self, config: TouchAndGoConfig) -> None:
-        folder = _lists_folder(config)
-        listed = read_lists(folder)
+        self._config, self._lists = config, _lists_folder(config)
+        listed = read_lists(self._lists)
         if config.split == "official" and listed[0].listed == "label":
-            raise ValueError(f"{folder} has no train.txt and test.txt, which the official split is: see {LISTS_AT}")
-        self._lists, self._num_listed = folder, len(listed)
-        names = sorted({frame.recording for frame in listed})
-        wanted = MODALITIES if config.modalities == "both" else (config.modalities,)
-        recordings, missing = find_recordings(config.root, names, wanted, config.frames)
-        if config.unlabelled:
-            others = sorted(on_disk(config.root).keys() - set(names))
-            recordings += find_recordings(config.root, others, wanted, config.frames)[0]
-        if not recordings or (missing and not config.partial):
-            hint = "" if config.modalities != "both" else "; modalities=touch needs only gelsight"
-            advice = f"fetch them from {HOMEPAGE}, or let partial pack what is there{hint}"
-            raise ValueError(f"{config.root}: {missing_report(missing, len(names))}; {advice}")
+            raise ValueError(
+                f"{self._lists} has no train.txt and test.txt, which the official split needs: see {LISTS_AT}"
+            )
+        self._num_listed = len(listed)
+        self._num_names = len({frame.recording for frame in listed})
+        recordings, missing = _find_recordings(config, sorted({frame.recording for frame in listed}))
+        self._missing = missing
         listed = [frame for frame in listed if frame.recording not in missing]
         find_touches(listed)
         if config.split == "official":
             assign_official(listed, config.val_part, config.split_seed)
         else:
             assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
-        extra = _unlabelled(listed, recordings, config) if config.unlabelled else []
-        if config.unlabelled and not extra:
-            raise ValueError(
-                f"unlabelled {config.unlabelled} adds no frame: recordings with test or val frames give none, and"
-                f" split {config.split} leaves no other with frames to spare; leave it out"
-            )
-
-        self._config = config
-        self._missing, self._num_names = missing, len(names)
         self._recordings = {recording.name: recording for recording in recordings}
-        by_name: dict[str, list[Frame]] = defaultdict(list)
-        for frame in [*listed, *extra]:
-            by_name[frame.recording].append(frame)
-        self._chunks: list[list[Frame]] = []
-        for name in sorted(by_name):
-            own = sorted(by_name[name], key=lambda frame: frame.number)
-            self._chunks += [own[i : i + CHUNK] for i in range(0, len(own), CHUNK)]
+        self._chunks = _chunks([*listed, *_unlabelled(listed, recordings, config)])
         self._stamps = [
             one_stamp(self._recordings[chunk[0].recording].stamps([frame.number for frame in chunk]))
             for chunk in self._chunks
         ]
         notes = leaks(listed) if config.split == "official" else []
         if missing:
-            notes.append(missing_report(missing, len(names)))
+            notes.append(missing_report(missing, self._num_names))
         self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes))
+        lists = [file for file in sorted(self._lists.glob("*.txt")) if file.name in LIST_FILES]
         self._fingerprint = {
             "reader": f"touch-and-go {VERSION}",
-            "lists": {file.name: digest_file(file) for file in sorted(folder.glob("*.txt")) if file.name in LIST_FILES},
+            "lists": {file.name: digest_file(file) for file in lists},
             "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
             "recordings": digest([recording.state() for recording in recordings]),
             "missing": dict(sorted(missing.items())),
@@ -186,7 +167,7 @@ class TouchAndGo(Source):
         return self._stamps
 
     def expected(self) -> list[Count]:
-        """The lists against their published lengths; the recordings and frames they name against those that are there."""
+        """Compare the lists with their published lengths, and with the recordings and frames on disk."""
         counts = []
         for name in NUM_ROWS:
             if (self._lists / name).is_file():
@@ -232,12 +213,40 @@ class TouchAndGo(Source):
 def _lists_folder(config: TouchAndGoConfig) -> Path:
     folder = config.lists or config.root
     if not folder.is_dir():
-        raise ValueError(f"{folder} is no folder: give the one with the lists; get them from {LISTS_AT}")
+        raise ValueError(f"{folder} is not a folder: give the one with the lists; get them from {LISTS_AT}")
     return folder
 
 
+def _find_recordings(config: TouchAndGoConfig, names: list[str]) -> tuple[list[Recording], dict[str, str]]:
+    """Return the recordings to pack, and why each other one of ``names`` cannot be used."""
+    modalities = MODALITIES if config.modalities == "both" else (config.modalities,)
+    recordings, missing = find_recordings(config.root, names, modalities, config.frames)
+    if config.unlabelled:
+        others = sorted(on_disk(config.root).keys() - set(names))
+        recordings += find_recordings(config.root, others, modalities, config.frames)[0]
+    if not recordings or (missing and not config.partial):
+        hint = "" if config.modalities != "both" else "; modalities=touch needs only gelsight"
+        advice = f"fetch them from {HOMEPAGE}, or let partial pack what is there{hint}"
+        raise ValueError(f"{config.root}: {missing_report(missing, len(names))}; {advice}")
+    return recordings, missing
+
+
+def _chunks(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """Divide frames into items: up to ``CHUNK`` frames of one recording, ascending."""
+    by_name: dict[str, list[Frame]] = defaultdict(list)
+    for frame in frames:
+        by_name[frame.recording].append(frame)
+    chunks = []
+    for name in sorted(by_name):
+        own = sorted(by_name[name], key=lambda frame: frame.number)
+        chunks += [own[i : i + CHUNK] for i in range(0, len(own), CHUNK)]
+    return chunks
+
+
 def _unlabelled(listed: Sequence[Frame], recordings: Sequence[Recording], config: TouchAndGoConfig) -> list[Frame]:
-    """Every n-th frame without a label of the recordings that neither choose nor score."""
+    """Return every n-th unlabelled frame of the recordings without val and test frames."""
+    if not config.unlabelled:
+        return []
     scored = {f.recording for f in listed if {"val", "test"} & {f.split, f.split_rough if f.rough >= 0 else ""}}
     known = defaultdict(dict)
     for frame in listed:
@@ -249,9 +258,14 @@ def _unlabelled(listed: Sequence[Frame], recordings: Sequence[Recording], config
         own, start = known[recording.name], 0
         for number in range(recording.num_frames()):
             if number in own:
-                start = number + 1  # between two touches: a run of its own
+                start = number + 1  # frames between two touches are a run of their own
             elif number % config.unlabelled == 0:
                 extra.append(Frame(recording.name, number, touch=start))
+    if not extra:
+        raise ValueError(
+            f"unlabelled {config.unlabelled} adds no frame: recordings with test or val frames give none, and"
+            f" split {config.split} leaves no other with frames to spare; leave it out"
+        )
     return extra
 
 
@@ -271,7 +285,7 @@ def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
 
 
 def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...]) -> DataSpec:
-    # The rough/smooth lists divide other recordings than the category lists do.
+    # The rough/smooth lists have another split than the category lists.
     own = "split_rough" if config.split == "official" else "split"
     tasks = [Task(name="category", classes=CLASSES), Task(name="soft", classes=("hard", "soft"))]
     return DataSpec(

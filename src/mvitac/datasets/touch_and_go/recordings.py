@@ -1,6 +1,6 @@
-"""Touch and Go's recordings as they lie on disk: which are there, what they lack, and single frames of them.
+"""Touch and Go's recordings on disk: find them, report what is missing, read frames.
 
-Each modality of a recording is an mp4 file, or a folder of JPEGs named by frame number (see touch_and_go for the layout).
+Each modality of a recording is an mp4 file or a folder of JPEGs named by frame number (the layout is in ``reader.py``).
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ STEMS = {"vision": "video", "touch": "gelsight"}
 
 @dataclass(frozen=True)
 class Recording:
-    """Where a recording's images are: for each modality an mp4 file or a folder of JPEGs."""
+    """A recording; ``places`` maps each modality to an mp4 file or a folder of JPEGs."""
 
     name: str
     places: dict[str, Path]
 
     def num_frames(self) -> int:
-        """Frames that all modalities have."""
+        """Return the number of frames that all modalities have."""
         return min(num_frames(p) if p.suffix else _num_jpegs(p) for p in self.places.values())
 
     def state(self) -> list[Any]:
-        """What is there of it, and how large its videos are."""
+        """Return the recording's files and the sizes of its videos, for the fingerprint."""
         return [self.name, *([p.name, self._movies[p][0] if p.suffix else 0] for p in self.places.values())]
 
     def stamps(self, numbers: Sequence[int]) -> Iterator[Stamp]:
-        """Of the files that hold the frames ``numbers``."""
+        """Yield the stamps of the files with frames ``numbers``."""
         for place in self.places.values():
             if place.suffix:
                 yield self._movies[place]
@@ -62,13 +62,13 @@ def _base(root: Path) -> Path:
     base = root / "dataset" if (root / "dataset").is_dir() else root
     if not base.is_dir():
         raise ValueError(
-            f"{base} is no folder: give the download (with dataset/ in it) as root; get it from {HOMEPAGE}"
+            f"{base} is not a folder: give the download (with dataset/ in it) as root; get it from {HOMEPAGE}"
         )
     return base
 
 
 def on_disk(root: Path) -> dict[str, str]:
-    """Recording -> its folder; some mirrors append the material, as in 20220319_002026_rock."""
+    """Return recording -> folder; some mirrors append the material, as in 20220319_002026_rock."""
     names = sorted(entry.name for entry in os.scandir(_base(root)) if entry.is_dir())
     return {name[:15]: name for name in names if re.fullmatch(r"\d{8}_\d{6}(_.*)?", name)}
 
@@ -76,7 +76,7 @@ def on_disk(root: Path) -> dict[str, str]:
 def find_recordings(
     root: Path, names: Iterable[str], modalities: Sequence[str], frames: Literal["auto", "video", "jpeg"]
 ) -> tuple[list[Recording], dict[str, str]]:
-    """The recordings among ``names`` that have all ``modalities``, and why each of the others cannot be used."""
+    """Return the recordings in ``names`` with all ``modalities``, and why each of the others cannot be used."""
     base, folders = _base(root), on_disk(root)
     found, missing = [], {}
     for name in names:
@@ -98,7 +98,7 @@ def find_recordings(
 
 
 def missing_report(missing: dict[str, str], num: int) -> str:
-    """'3 of 126 listed recordings cannot be packed: no folder (2): a, b; no video.mp4 (1): c'."""
+    """Return e.g. '3 of 126 listed recordings cannot be packed: no folder (2): a, b; no video.mp4 (1): c'."""
     by_reason: dict[str, list[str]] = defaultdict(list)
     for name, why in missing.items():
         by_reason[why].append(name)
@@ -116,8 +116,10 @@ Shape = tuple[int, int]
 def read_frames(
     place: Path, numbers: list[int], size: int, lost: dict[int, str]
 ) -> dict[int, tuple[Shape, np.ndarray]]:
-    """By frame number the shape in which one modality lies there and its image [size, size, 3]; what cannot be had goes
-    to ``lost`` with its reason."""
+    """Return frame number -> original shape and image [size, size, 3] of one modality.
+
+    Frames that cannot be read are put in ``lost`` with the reason.
+    """
     if place.suffix:
         why: dict[int, str] = {}
         shape = frame_shape(place)
