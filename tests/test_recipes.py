@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
@@ -128,3 +129,7 @@ def test_a_new_dataset_says_itself_that_its_rows_are_phases() -> None:
     assert recipe("modern", Phased()).positives == "same-image"
     assert recipe("paper", Phased()).augment.vision.grayscale == 0
     assert recipe("paper", PackConfig()).augment.vision.grayscale == 0.2
+
+
+def test_a_recipe_takes_an_open_pack(pack: Pack) -> None:
+    assert recipe("smoke", pack) == recipe("smoke", PackConfig(path=pack.path))

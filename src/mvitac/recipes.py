@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields, replace
 
+from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig
@@ -172,12 +174,12 @@ def with_method(run: Run, method: str) -> Run:
     return replace(run, method=replace(new, **{name: getattr(run.method, name) for name in changed}))
 
 
-def recipe(name: str, data: DatasetConfig | None = None) -> Run:
+def recipe(name: str, data: DatasetConfig | Pack | None = None) -> Run:
     """Return the named recipe as a ``Run``.
 
     Args:
         name: One of ``RECIPES``: paper, authors, modern, demo, quick, smoke.
-        data: Dataset to train on. Default: simulated touches of materials, as in `mvitac demo`.
+        data: Dataset to train on, or an open pack. Default: simulated touches of materials, as in `mvitac demo`.
 
     Raises:
         ValueError: If there is no such recipe.
@@ -188,4 +190,6 @@ def recipe(name: str, data: DatasetConfig | None = None) -> Run:
     """
     if name not in RECIPES:
         raise unknown("recipe", name, RECIPES)
+    if isinstance(data, Pack):
+        data = PackConfig(path=data.path)
     return RECIPES[name](data or default(DatasetConfig, "materials"))

@@ -1,8 +1,9 @@
 """Two hundred bad inputs: each ends in one line that says what was given and what to do, exit code 2, nothing left behind.
 
 Every case runs ``mvitac.cli.main.main`` in this process. While it runs, training, packing and probing are traps: a
-mistake that is noticed only after the work began fails its case. ``{tmp}``, ``{pack}``, ``{run}`` and ``{out}`` in a command stand for
-the test's own folder, a good pack, a good finished run (all copies where they are spoilt) and a free place for output.
+mistake that is noticed only after the work began fails its case. ``{tmp}``, ``{pack}``, ``{run}`` and ``{out}`` in a
+command stand for the test's own folder, a good pack, a good finished run (all copies where they are spoilt) and a free
+place for output.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from PIL import Image
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data import build as packing
+from mvitac.data import build_parts
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
@@ -94,7 +96,7 @@ def refused(
         if not work:
             for module, name in (
                 (batches_module, "make_views"),
-                (packing, "_write_part"),
+                (build_parts, "_write_part"),
                 (probe_module, "features"),
             ):
                 monkeypatch.setattr(module, name, trap(name))
