@@ -29,7 +29,7 @@ TORCH_MEMBERS = re.compile(
     r"data/weights/(weight_\d+|model_weights_config\.json)|data/constants/(tensor_\d+|model_constants_config\.json)"
     r"|data/sample_inputs/model\.pt|models/model\.json|archive_format|archive_version|byteorder|\.data/\w+"
 )
-"""Files that torch.export writes of a model; no compiled libraries or pickled objects, which torch would run."""
+"""Files that torch.export writes of a model; not among them: compiled libraries and pickled objects, which it would run."""
 Images = Mapping[str, np.ndarray]
 Call = Callable[[list[np.ndarray]], list[np.ndarray]]
 
