@@ -162,3 +162,13 @@ def test_shows_itself_in_a_notebook(artifact: Path) -> None:
     page = model._repr_html_()
     assert f"<td>touch</td><td>{width}</td>" in page
     assert all(f"<td>{task}</td><td>{', '.join(classes)}</td>" in page for task, classes in model.classes.items())
+
+
+def test_embed_takes_images_in_batches(smoke_run: Path, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that memory does not grow with their number; the result is that of one batch."""
+    model, images = mvitac.load(smoke_run), pack.images["touch"][:10]
+    whole, sizes, features = model.embed(touch=images)["touch"], [], model.features
+    monkeypatch.setattr("mvitac.model.EMBED_BATCH", 4)
+    monkeypatch.setattr(model, "features", lambda m, x, **how: sizes.append(len(x)) or features(m, x, **how))
+    torch.testing.assert_close(model.embed(touch=images)["touch"], whole, atol=1e-4, rtol=1e-4)
+    assert sizes == [4, 4, 2]

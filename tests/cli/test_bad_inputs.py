@@ -145,7 +145,6 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("command", "pretrian", ["'pretrian'", "did you mean 'pretrain'"]),
     ("command-far", "xyzzy", ["'xyzzy'", "choose from", "pretrain"]),
     ("option-for-command", "--frobnicate", ["'--frobnicate'", "choose from"]),
-    ("data-alone", "data", ["data simulate", "data pack"]),
     ("subcommand", "data simulte materials", ["'data simulte'", "did you mean 'data simulate'"]),
     ("simulate-nothing", "data simulate", ["grasps|materials"]),
     ("simulate-unknown", "data simulate graps --out {out}", ["'graps'", "did you mean 'grasps'"]),

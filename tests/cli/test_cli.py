@@ -70,6 +70,12 @@ def test_help_names_every_command_in_80_columns() -> None:
         assert f"  {name} " in HELP, name
 
 
+@pytest.mark.parametrize("command", ["data", "data --help", "data simulate --help", "data pack --help"])
+def test_data_commands_explain_themselves(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command.split()) == 0
+    assert capsys.readouterr().out.startswith("usage: mvitac data")
+
+
 def test_pretrain_help_is_golden(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Every field of a run with its default and meaning. After a wanted change: MVITAC_GOLDEN=1 pytest -k golden"""
     import os
