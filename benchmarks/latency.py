@@ -26,7 +26,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.engine import Call, Engine, cosines
-from mvitac.deploy.export import Tolerance, export
+from mvitac.deploy.export import ExportConfig, export
 from mvitac.deploy.export_module import ExportModule
 from mvitac.model import fresh
 from mvitac.nn.encoders import EncoderConfig
@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "OpenVINO bf16": {"kind": "openvino", "precision": "bf16"},
     "OpenVINO int8": {"kind": "openvino", "int8": True},
 }
-ANY = Tolerance(min_cosine=0.5, accuracy_loss=100.0)
+ANY = ExportConfig(min_cosine=0.5, accuracy_loss=100.0, num_rows=64)
 """The figures say what is lost; nothing is refused here."""
 
 
@@ -89,7 +89,7 @@ def main() -> None:
     for name, how in VARIANTS.items():
         out = folder / name.replace(" ", "-")
         if not out.exists():
-            report = export(model, pack, out, tolerance=ANY, num_rows=64, threads=options.threads, **how)
+            report = export(model, pack, out, replace(ANY, threads=options.threads, **how))
             print(name, "exported:", json.dumps(report["cosine"]), file=sys.stderr)
         engine = Engine(out, threads=options.threads)
         sizes[name] = engine.meta["report"]["size_mb"]

@@ -52,7 +52,7 @@ from mvitac.system.files import write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training.step import Step
-from mvitac.training.views import feed_parts
+from mvitac.training.views import load_chunks
 from mvitac.transforms import random_views
 from mvitac.transforms.random_views import ViewAugment, draw
 
@@ -243,7 +243,7 @@ def in_torch(call: Callable[[], object]) -> Callable[[], object]:
 
 def feed(run: Run, pack: Pack, device: torch.device) -> Any:
     """The loop's own parts of one step after another, without end."""
-    return feed_parts(run, pack, pack.rows("train"), 2, device, World(), 0, 10**9)
+    return load_chunks(run, pack, pack.rows("train"), 2, device, World(), 0, 10**9)
 
 
 def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:

@@ -93,7 +93,7 @@ def predict(x: np.ndarray, y: np.ndarray, rows: ProbeSplit) -> np.ndarray:
 
 
 def play(p: np.ndarray, y: np.ndarray, objects: np.ndarray, hands: np.ndarray, threshold: float) -> dict[str, Any]:
-    """Episodes and lifts that held, by object, and mean grasps tried: a record of ``mvitac.evaluation.scores.interval``."""
+    """Episodes and held lifts by object, and the mean number of grasps: a record for ``evaluation.scores.interval``."""
     lifted, tried = decide(p[hands], threshold)
     thing, held = objects[hands[:, 0]], y[hands[np.arange(len(hands)), lifted]]
     num = int(objects.max()) + 1

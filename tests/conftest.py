@@ -67,8 +67,8 @@ def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """That artifact, exported for ONNX Runtime."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.export import export
+    from mvitac.deploy.export import ExportConfig, export
 
     out = tmp_path_factory.mktemp("export") / "onnx"
-    export(load(artifact), pack, out, kind="onnx")
+    export(load(artifact), pack, out, ExportConfig(kind="onnx"))
     return out

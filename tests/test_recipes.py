@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import pytest
 
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.recipes import RECIPES, recipe
@@ -35,7 +37,7 @@ def test_no_grayscale_for_grasping() -> None:
 
 
 def test_authors_constants() -> None:
-    """FACTS section 1, third column."""
+    """https://github.com/ligerfotis/mvitac at commit a5b572d."""
     run = recipe("authors", GraspsConfig())
     method = run.method
     assert isinstance(method, MViTacConfig)
@@ -57,10 +59,31 @@ def test_every_recipe_survives_its_record(name: str, data: MaterialsConfig) -> N
     assert run.__doc__ and RECIPES[name].__doc__
 
 
+def test_data_is_chosen_by_a_recipe_never_by_the_run_itself() -> None:
+    with pytest.raises(TypeError, match="data"):
+        Run()  # pyright: ignore[reportCallIssue]
+    value = to_json(recipe("smoke"))
+    del value["data"]
+    with pytest.raises(ValueError, match="field 'data' is missing"):
+        Run.load(value)
+
+
+def test_records_hold_every_setting_digests_only_what_was_there_before() -> None:
+    run = recipe("paper")
+    assert to_json(run)["augment"]["gel_flip"] == "plain" and to_json(run)["method"]["pairs"] == "crossed"
+    value = to_json(run, for_digest=True)
+    assert not {"gel_flip"} & value["augment"].keys() and "pairs" not in value["method"]
+    assert "noise" not in value["augment"]["vision"] and "noise" in to_json(run)["augment"]["touch"]
+
+
 def test_digest_is_of_the_outcome() -> None:
     run = recipe("demo")
     assert replace(run, log_every=3, device="cpu").digest() == run.digest()
     assert replace(run, data=replace(run.data, workers=7)).digest() == run.digest()
+    assert replace(run, data=replace(run.data, quality=50)).digest() == run.digest()  # raw pixels have no quality
+    jpeg = replace(run.data, store="jpeg")
+    digests = {replace(run, data=d).digest() for d in (run.data, jpeg, replace(jpeg, quality=50))}
+    assert len(digests) == 3
     assert replace(run, seed=5).digest() != run.digest()
     assert replace(run, augment=replace(run.augment, gel_flip="colour")).digest() != run.digest()
     noisy = replace(run.augment.touch, noise=5.0)
@@ -97,3 +120,16 @@ def test_a_grasps_phases_are_not_each_others_positives(name: str) -> None:
     """Alike before, during and after the grip would mean blind to the contact."""
     assert recipe(name, GraspsConfig()).positives == "same-image"
     assert recipe(name, MaterialsConfig()).positives == "same-touch"
+
+
+def test_a_new_dataset_says_itself_that_its_rows_are_phases() -> None:
+    class Phased(PackConfig):
+        phased = True
+
+    assert recipe("modern", Phased()).positives == "same-image"
+    assert recipe("paper", Phased()).augment.vision.grayscale == 0
+    assert recipe("paper", PackConfig()).augment.vision.grayscale == 0.2
+
+
+def test_a_recipe_takes_an_open_pack(pack: Pack) -> None:
+    assert recipe("smoke", pack) == recipe("smoke", PackConfig(path=pack.path))

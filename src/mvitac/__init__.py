@@ -1,9 +1,9 @@
-"""mvitac: learn from paired camera and optical-tactile images without labels, and say what the features are worth.
+"""mvitac: learn representations of paired camera and optical-tactile images without labels, and evaluate them.
 
-    model = mvitac.load("runs/demo/seed0")                      # a run, an artifact, owner/name on the Hub
+    model = mvitac.load("runs/demo/seed0")                      # a run, an artifact, or owner/name on the Hub
     features = model.embed(vision=photos, touch=presses)        # {"vision": [N, 512], "touch": [N, 512]}
 
-Names are imported on first use, so that ``import mvitac`` costs nothing.
+Names are imported on first use, so that ``import mvitac`` is fast.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``python -m mvitac`` is the command ``mvitac``."""
+"""``python -m mvitac`` runs the command ``mvitac``."""
 
 from mvitac.cli.main import main
 

@@ -1,13 +1,13 @@
-"""Recipes: functions that return a whole ``Run``, each a ``replace`` of another, so that the difference documents it."""
+"""Recipes: functions that return a complete ``Run``. Each changes another recipe, so the code shows the differences."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
 
+from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.calandra.reader import CalandraConfig
-from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
+from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig
@@ -17,21 +17,24 @@ from mvitac.transforms.random_views import Augment, ViewAugment
 
 
 def paper(data: DatasetConfig) -> Run:
-    """As printed in the paper: ResNet-18 from ImageNet, Adam at lr .03 without a schedule, batch 256, 240 epochs.
+    """The settings printed in the paper: ResNet-18 from ImageNet, Adam at lr .03 without a schedule, batch 256, 240 epochs.
 
-    Grayscale views are left out for grasping (appendix B). One 24 GB GPU. What the paper leaves open (m, lambda_inter,
-    hidden width) is said in the method's fields. lr .03 is very high for Adam; expect to see what it does.
+    No grayscale views for grasping (appendix B). Needs one 24 GB GPU. The fields of ``MViTacConfig`` say which values the
+    paper leaves open (m, lambda_inter, hidden width). lr .03 is very high for Adam: expect unstable training.
     """
-    views = ViewAugment(grayscale=0.0) if isinstance(data, (GraspsConfig, CalandraConfig)) else ViewAugment()
+    views = ViewAugment(grayscale=0.0) if data.phased else ViewAugment()
     return Run(recipe="paper", data=data, augment=Augment(vision=views, touch=views))
 
 
 def authors(data: DatasetConfig) -> Run:
-    """The choices of the authors' released code (FACTS section 1), without its defects.
+    """The settings of the authors' released code, without its defects.
 
-    Against `paper`: lr 1e-3 with weight decay 1e-6 and StepLR, wide heads with dropout, flips that come out at 25 %,
-    grayscale also for grasping, the two gels of a stacked pair augmented independently. Not repeated: key heads that are
-    never updated, key towers that do not start as copies, and a last short batch (kept there, dropped here).
+    The code is https://github.com/ligerfotis/mvitac at commit a5b572d.
+
+    Differences from `paper`: lr 1e-3 with weight decay 1e-6 and StepLR; wide heads with dropout; flips with an effective
+    probability of 25 %; grayscale also for grasping; the two gels of a stacked image are augmented independently. Not
+    repeated: key heads that are never updated, key towers that do not start as copies of the query towers, and the last
+    short batch of an epoch.
     """
     views = ViewAugment(flip=0.25, grayscale=0.2)
     base = paper(data)
@@ -45,56 +48,58 @@ def authors(data: DatasetConfig) -> Run:
 
 
 def modern(data: DatasetConfig) -> Run:
-    """What current practice does, each change with its reason, and what it was worth in 300 steps of `demo`'s networks with
-    momentum keys (docs/results/ablation.md; "level": within the noise).
+    """Current practice. The list gives the reason and the measured effect of each change.
 
-    - keys end-to-end: gradients through both views instead of a momentum tower, as in SimCLR. After 1,150 steps 10 points
-      of category, 8 of rough and nearly twice the retrieval of momentum keys, for steps that take a third to a half as
-      much again (docs/results/materials_1150.md).
-    - inter-modal losses of all pairs of views, which are there anyway, and no flips of touch, which no real press shows:
-      together 3 points of category (4 by touch, 2.7 by vision) on top of that, behind on nothing (the same page); the
-      flips alone 1.8, all pairs 1.1, neither apart. Other methods gain 2 to 2.6 by leaving out the flips.
-    - AdamW 1e-3 with warm-up and cosine (MoCo v3): Adam at a constant .03 throws the ImageNet start away. From scratch,
-      too, 8 points of category (one seed).
-    - BatchNorm in the heads (SimCLR v2, MoCo v3): keeps the embeddings from collapsing early at small batches.
-      Level (three seeds: without it +1.2, p .61).
-    - momentum .99 rising to 1 (BYOL, MoCo v3) for the methods that have one: the keys settle as the queries do.
-      Level from 0 to .999 (one seed).
-    - one-per-touch batches: consecutive frames of one touch are near-duplicates, and as negatives they teach nonsense.
-      Level on simulated touches, which have no consecutive frames (one seed).
-    - same-touch positives: two views of one image share lamp, background and sensor, which solves L_vv and L_tt without
-      looking at the material (docs/simulator.md has the figures); another row of the touch shares only the thing. After
-      1,150 steps 21 points of category, 7 of soft, 20 of rough, and 31 of category with end-to-end keys, which are worth
-      nothing without: the largest ingredient. Not for grasps: rows of one differ by before, during and after, and what
-      tells these apart is the contact itself.
-    - all four losses, also where positives are of the same image: on simulated grasps leaving out the intra-modal ones is
-      worth 6.7 points (docs/results/grasps_1150.md), seen on test; not taken before another world has shown it.
-    - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16 a step takes ten times as
-      long and more. Scores of the two are level but for one of nine (docs/speed.md).
+    Unless noted, effects are measured in 300 steps of `demo`'s networks with momentum keys (docs/results/ablation.md).
+    "No difference" means a difference within the noise. Points are percentage points of accuracy.
+
+    - End-to-end keys: gradients through both views instead of a momentum tower, as in SimCLR. After 1,150 steps: 10 points
+      of category, 8 of rough, and almost twice the retrieval score of momentum keys. Steps take a third to a half longer
+      (docs/results/materials_1150.md).
+    - Inter-modal losses on all pairs of views, and no flips of touch, which no real press shows. Together 3 points of
+      category (4 by touch, 2.7 by vision) on top of end-to-end keys, and no score is worse (same page). Alone: no flips
+      1.8, all pairs 1.1, neither significant. Other methods gain 2 to 2.6 without the flips.
+    - AdamW with lr 1e-3, warm-up and cosine schedule (MoCo v3): Adam at a constant .03 destroys the ImageNet weights. Also
+      from scratch, 8 points of category (one seed).
+    - BatchNorm in the heads (SimCLR v2, MoCo v3): prevents an early collapse of the embeddings with small batches. No
+      difference (three seeds: without it +1.2, p .61).
+    - Momentum .99 rising to 1 (BYOL, MoCo v3), for methods that have one: the keys converge with the queries. No
+      difference from 0 to .999 (one seed).
+    - one-per-touch batches: consecutive frames of one touch are near-duplicates and wrong as negatives. No difference on
+      simulated touches, which have no consecutive frames (one seed).
+    - same-touch positives: two views of one image share lamp, background and sensor, which is enough to minimise L_vv and
+      L_tt without the material (docs/simulator.md has the figures). Another row of the same touch group shares only the
+      object. The largest effect: after 1,150 steps 21 points of category, 7 of soft, 20 of rough; with end-to-end keys 31
+      of category, and end-to-end keys gain nothing without it. Not used for grasps: the rows of a grasp differ in its
+      phase (before, during, after), and the phases differ in the contact itself.
+    - All four losses, also with same-image positives: on simulated grasps, training without the intra-modal losses gains
+      6.7 points (docs/results/grasps_1150.md). This was seen on test data and is not adopted until another dataset
+      confirms it.
+    - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16, a step takes ten times as
+      long or more. The scores of the two differ in one of nine cases only (docs/speed.md).
     """
     base = paper(data)
-    phased = isinstance(data, (GraspsConfig, CalandraConfig))
     return replace(
         base,
         recipe="modern",
         method=MViTacConfig(head_norm=True, keys="end-to-end", pairs="all", momentum_end=1.0),
         optim=Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=1e-4, schedule="cosine", warmup=0.05),
         sampler="one-per-touch",
-        positives="same-image" if phased else "same-touch",
+        positives="same-image" if data.phased else "same-touch",
         augment=replace(base.augment, touch=replace(base.augment.touch, flip=0.0)),
         precision="auto",
     )
 
 
 def demo(data: DatasetConfig) -> Run:
-    """`modern` in minutes on a laptop's CPU: ResNet-10 from scratch at 48 px, 1,150 steps of 64 pairs.
+    """`modern` for a laptop's CPU, in minutes: ResNet-10 from scratch at 48 px, 1,150 steps of 64 pairs.
 
-    - the paper's momentum keys: it is there to show the paper's method.
-    - ResNet-10 (timm's resnet10t) at 48 px, for more steps in the same minutes; its score against ResNet-18 is not measured.
-    - batch 64 for twice the steps of batch 128, and temperature .2 (docs/simulator.md has the scores of each).
-    - whole images are probed at 72 px, the scale at which crops of them were learned.
-    - momentum .9 throughout: keys at .99 rising to 1 remember more steps than a short run has.
-    - crops of 40 % and more, no grayscale, lr 2e-3: easier views for few steps.
+    - The paper's momentum keys, because the demo shows the paper's method.
+    - ResNet-10 (timm's resnet10t) at 48 px: more steps in the same time. Its score was not compared with ResNet-18's.
+    - Batch 64 for twice the steps of batch 128, and temperature .2 (docs/simulator.md has the scores of each).
+    - Whole images are probed at 72 px, because crops show them at that scale during training.
+    - Constant momentum .9: with .99 rising to 1 the keys would average over more steps than a short run has.
+    - Crops of at least 40 % of the area, no grayscale, lr 2e-3: easier views for few steps.
     """
     base = modern(data)
     views = ViewAugment(scale=(0.4, 1.0), grayscale=0.0)
@@ -112,14 +117,14 @@ def demo(data: DatasetConfig) -> Run:
 
 
 def quick(data: DatasetConfig) -> Run:
-    """`demo` in a third of the time: end-to-end keys instead of the paper's momentum keys, 1,200 steps of 32 pairs.
+    """`demo` with half the pairs: end-to-end keys instead of the paper's momentum keys, 1,350 steps of 32 pairs.
 
-    This is what `mvitac demo` trains, so that it takes at most 12 minutes on two cores without fast bf16.
+    `mvitac demo` trains this recipe. It takes at most 12 minutes on two cores without fast bf16.
 
-    - keys end-to-end, inter-modal losses of all pairs of views, no flips of touch, as in `modern`: a pair takes half as
-      much time again, and teaches far more. The paper's momentum keys are in `demo`, which the published tables use.
-    - batch 32 for twice the steps of batch 64, and the learning rate divided by the square root of 2.
-    - batch and number of steps were chosen on split val, never on test (docs/simulator.md).
+    - End-to-end keys, inter-modal losses on all pairs of views, and no flips of touch, as in `modern`: a pair takes 1.5
+      times as long, and the scores are much higher. The published tables use `demo`, with the paper's momentum keys.
+    - Batch 32 for twice the steps of batch 64, and the learning rate divided by the square root of 2.
+    - Batch size and number of steps were chosen on split val, seed 0, never on test (docs/simulator.md).
     """
     base = demo(data)
     return replace(
@@ -129,12 +134,12 @@ def quick(data: DatasetConfig) -> Run:
         optim=replace(base.optim, lr=1.4e-3),
         augment=replace(base.augment, touch=replace(base.augment.touch, flip=0.0)),
         batch_size=32,
-        steps=1200,
+        steps=1350,
     )
 
 
 def smoke(data: DatasetConfig) -> Run:
-    """`demo` in seconds, for tests: a tiny trunk at 32 px, batch 16, 8 steps. Its scores mean nothing."""
+    """`demo` in seconds, for tests: a tiny trunk at 32 px, batch 16, 8 steps. Its scores have no meaning."""
     base = demo(data)
     return replace(
         base,
@@ -156,22 +161,35 @@ RECIPES: dict[str, Callable[[DatasetConfig], Run]] = {
 
 
 def with_method(run: Run, method: str) -> Run:
-    """``run`` with another method: its own defaults, but for what the run's recipe changed in fields that both have.
+    """Replace the method of ``run``, and keep what the run's recipe changed in fields that both methods have.
 
-    So a method that is compared with MViTac gets the head and the momentum that the recipe's budget asks for.
+    A method that is compared with MViTac thus gets the head and the momentum that the recipe sets for its budget. Its other
+    fields have the method's own defaults.
     """
     if method == run.method.name:
         return run
-    usual = default(MethodConfig, run.method.name)
-    changed = {f.name: getattr(run.method, f.name) for f in fields(usual)}
-    changed = {name: value for name, value in changed.items() if value != getattr(usual, name)}
-    chosen = default(MethodConfig, method)
-    mine = {f.name for f in fields(chosen)}
-    return replace(run, method=replace(chosen, **{name: value for name, value in changed.items() if name in mine}))
+    old, new = default(MethodConfig, run.method.name), default(MethodConfig, method)
+    common = {f.name for f in fields(old)} & {f.name for f in fields(new)}
+    changed = {name for name in common if getattr(run.method, name) != getattr(old, name)}
+    return replace(run, method=replace(new, **{name: getattr(run.method, name) for name in changed}))
 
 
-def recipe(name: str, data: DatasetConfig | None = None) -> Run:
-    """The named recipe on ``data`` (default: simulated materials); ValueError names the choices."""
+def recipe(name: str, data: DatasetConfig | Pack | None = None) -> Run:
+    """Return the named recipe as a ``Run``.
+
+    Args:
+        name: One of ``RECIPES``: paper, authors, modern, demo, quick, smoke.
+        data: Dataset to train on, or an open pack. Default: simulated touches of materials, as in `mvitac demo`.
+
+    Raises:
+        ValueError: If there is no such recipe.
+
+    Example:
+        >>> recipe("demo").data.name
+        'materials'
+    """
     if name not in RECIPES:
         raise unknown("recipe", name, RECIPES)
-    return RECIPES[name](data or MaterialsConfig())
+    if isinstance(data, Pack):
+        data = PackConfig(path=data.path)
+    return RECIPES[name](data or default(DatasetConfig, "materials"))

@@ -70,16 +70,27 @@ LATER = {"later": True}
 files and digests stay valid."""
 
 
-def to_json(config: Any) -> Any:
-    """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``."""
+LATER_IN_DIGEST = {"later in digest": True}
+"""Metadata of a field that is always written, but is omitted from digests at its default, so that old digests stay valid."""
+
+
+def to_json(config: Any, *, for_digest: bool = False) -> Any:
+    """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``.
+
+    Args:
+        config: A config, or a container of configs and plain values.
+        for_digest: Leave out the fields of ``LATER_IN_DIGEST`` that have their default.
+    """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        written = [f for f in dataclasses.fields(config) if f.metadata != LATER or getattr(config, f.name) != f.default]
-        fields = {f.name: to_json(getattr(config, f.name)) for f in written}
+        omitted = (LATER, LATER_IN_DIGEST) if for_digest else (LATER,)
+        all_fields = dataclasses.fields(config)
+        written = [f for f in all_fields if f.metadata not in omitted or getattr(config, f.name) != f.default]
+        fields = {f.name: to_json(getattr(config, f.name), for_digest=for_digest) for f in written}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
-        return {str(key): to_json(value) for key, value in config.items()}
+        return {str(key): to_json(value, for_digest=for_digest) for key, value in config.items()}
     if isinstance(config, (list, tuple)):
-        return [to_json(value) for value in config]
+        return [to_json(value, for_digest=for_digest) for value in config]
     return str(config) if isinstance(config, Path) else config
 
 

@@ -439,7 +439,7 @@ def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch
     for pack, name in ((small, "prefetch"), (decoded, "MainThread")):
         makers.clear()
         run, rows = run_on(pack), pack.rows("train")
-        for parts in views.feed_parts(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
+        for parts in views.load_chunks(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
             assert len(parts[0]().rows) == run.batch_size
         assert makers == [name] * 3
 

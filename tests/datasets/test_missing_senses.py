@@ -15,7 +15,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import search
-from mvitac.deploy.export import _examples, export
+from mvitac.deploy.export import ExportConfig, _examples, export
 from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.publish import fit_readouts
 from mvitac.evaluation import probe as probe_module
@@ -123,7 +123,7 @@ def test_published_probes_are_of_what_is_there(holes: Pack, model: Model) -> Non
 
 
 def test_an_export_is_checked_and_calibrated_on_what_is_there(holes: Pack, model: Model, tmp_path: Path) -> None:
-    report = export(model, holes, tmp_path / "x", kind="torch", modalities=("touch",))
+    report = export(model, holes, tmp_path / "x", ExportConfig(kind="torch", modalities=("touch",)))
     assert report["num_rows"] == len(holes.rows("test", having=("touch",))) < len(holes.rows("test"))
     examples = _examples(ExportModule(model, ("touch",)), holes)
     assert len(examples) == len(holes.rows("train", "unlabelled", having=("touch",)))

@@ -463,7 +463,7 @@ def test_label_txt_alone_serves_and_knows_no_official_split(tree: Path, tmp_path
     (tmp_path / "label.txt").write_text("".join(f"{n}/{i:010d}.jpg,{i % 3 - 1}\n" for n in NAMES for i in range(9)))
     spec = TouchAndGoConfig(root=tree, lists=tmp_path).source().spec()
     assert [task.name for task in spec.tasks] == ["category", "soft"]
-    with pytest.raises(ValueError, match="which the official split is"):
+    with pytest.raises(ValueError, match="which the official split needs"):
         TouchAndGoConfig(root=tree, lists=tmp_path, split="official").source()
 
 

@@ -24,7 +24,7 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import export_module as graphs
 from mvitac.deploy.engine import Engine, cosines
-from mvitac.deploy.export import Tolerance, export, parity, reference
+from mvitac.deploy.export import ExportConfig, export, parity, reference
 from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.publish import with_readouts
 from mvitac.model import Model
@@ -33,7 +33,7 @@ from mvitac.system.files import digest, digest_file, write_json
 from mvitac.training.loop import train
 from support.toy import reordered, toy_pack
 
-EXACT = Tolerance(min_cosine=0.9999, accuracy_loss=0.0)
+EXACT = ExportConfig(min_cosine=0.9999, accuracy_loss=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +49,15 @@ def run_graph(graph: ExportModule):
     return call
 
 
-def check(model: Model, graph: ExportModule, pack: Pack, tolerance: Tolerance = EXACT) -> dict:
+def check(model: Model, graph: ExportModule, pack: Pack, config: ExportConfig = EXACT) -> dict:
     rows = pack.rows("test")
-    return parity(graph, run_graph(graph), model, pack, rows, reference(model, graph, pack, rows), tolerance)
+    return parity(graph, run_graph(graph), model, pack, rows, reference(model, graph, pack, rows), config)
 
 
 @pytest.fixture(scope="module")
 def openvino(model: Model, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("export") / "openvino"
-    export(model, pack, out, kind="openvino", int8=True, tolerance=Tolerance(min_cosine=0.9, accuracy_loss=10))
+    export(model, pack, out, ExportConfig(kind="openvino", int8=True, min_cosine=0.9, accuracy_loss=10))
     return out
 
 
@@ -125,8 +125,8 @@ def test_int8_reports_what_it_keeps_and_runs(openvino: Path, pack: Pack, model: 
 
 OPENED_WITHOUT_VNNI = """
 import sys
-from mvitac.quantise import this_machine
-from mvitac.runtime import Engine
+from mvitac.deploy.engine import Engine
+from mvitac.deploy.quantise import this_machine
 
 print(this_machine("openvino"))
 for folder in sys.argv[1:]:
@@ -146,8 +146,8 @@ def test_int8_on_a_cpu_without_vnni(
 ) -> None:
     """There 8-bit weights saturate: auto takes 7-bit ones, and an 8-bit export from elsewhere says what to do."""
     monkeypatch.setattr(exports, "this_machine", lambda kind: "avx2")
-    tolerance = Tolerance(min_cosine=0.95, accuracy_loss=10)
-    export(model, pack, tmp_path / "auto", kind="openvino", int8=True, tolerance=tolerance)
+    config = ExportConfig(kind="openvino", int8=True, min_cosine=0.95, accuracy_loss=10)
+    export(model, pack, tmp_path / "auto", config)
     found = subprocess.run(
         [sys.executable, "-c", OPENED_WITHOUT_VNNI, tmp_path / "auto", openvino],
         env={**os.environ, "ONEDNN_MAX_CPU_ISA": "AVX2"},  # OpenVINO obeys it
@@ -198,7 +198,7 @@ def test_rows_that_check_and_calibrate_are_of_every_class(
 
     monkeypatch.setattr(exports, "reference", checked)
     with pytest.raises(Stop):
-        export(model, pack, tmp_path / "x", kind="torch", num_rows=len(pack.rows("test")) // 3)
+        export(model, pack, tmp_path / "x", ExportConfig(kind="torch", num_rows=len(pack.rows("test")) // 3))
     assert np.bincount(labels[seen], minlength=3).min() >= 1 and set(pack.column("split")[seen]) == {"test"}
 
 
@@ -255,7 +255,7 @@ def test_corrupted_weights_in_the_graph_leave_no_export(
 
     monkeypatch.setattr(ExportModule, "forward", corrupted)
     with pytest.raises(ValueError, match="not the trained model"):
-        export(model, pack, tmp_path / "x", kind="torch")
+        export(model, pack, tmp_path / "x", ExportConfig(kind="torch"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -305,7 +305,7 @@ def test_a_pickle_or_a_library_in_a_torch_export_is_never_run(smoke_run: Path, p
     buffer = io.BytesIO()
     torch.save({"a": Payload()}, buffer)
     good = tmp_path / "good"
-    export(mvitac.load(smoke_run), pack, good, kind="torch", modalities=("touch",))
+    export(mvitac.load(smoke_run), pack, good, ExportConfig(kind="torch", modalities=("touch",)))
     with zipfile.ZipFile(good / "model.pt2") as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     inputs = next(name for name in members if "sample_inputs" in name)
@@ -359,11 +359,11 @@ def test_impossible_requests_are_refused_first(
         ({"modalities": ("smell",)}, "no smell encoder"),
     ):
         with pytest.raises(ValueError, match=message):
-            export(model, pack, tmp_path / "x", **options)
+            export(model, pack, tmp_path / "x", ExportConfig(**options))
     larger = toy_pack(tmp_path / "p", size=40)
-    for options in ({"pack": larger}, {"pack": pack, "int8": True, "calibrate": larger}):
+    for given, calibrate, config in ((larger, None, ExportConfig()), (pack, larger, ExportConfig(int8=True))):
         with pytest.raises(ValueError, match="p cannot check this model"):
-            export(model, out=tmp_path / "x", **options)
+            export(model, given, tmp_path / "x", config, calibrate=calibrate)
     monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))
     with pytest.raises(ValueError, match="at 32 px minus their background"):
         export(model, pack, tmp_path / "x")

@@ -42,7 +42,7 @@ def test_byol(z: tuple[torch.Tensor, torch.Tensor]) -> None:
 
 def test_vicreg(z: tuple[torch.Tensor, torch.Tensor]) -> None:
     method = VICReg(VICRegConfig(hidden=16), Toy().spec(), TINY)
-    ours = method.contrast({f"{m}_{i}": z[i] for m in ("vision", "touch") for i in (0, 1)})
+    ours = method.contrast({(m, i): z[i] for m in ("vision", "touch") for i in (0, 1)})
     torch.testing.assert_close(ours["vision"], loss.VICRegLoss()(*z))
 
 
@@ -52,6 +52,6 @@ def test_dino(z: tuple[torch.Tensor, torch.Tensor]) -> None:
     theirs = loss.DINOLoss(output_dim=16, teacher_temp=0.04, student_temp=0.1, warmup_teacher_temp_epochs=0)
     theirs.center.copy_(method.centre[0][None, None])
     views = [torch.randn(12, 16) for _ in range(4)]
-    names = [f"{m}_{kind}{i}" for m in ("vision", "touch") for kind, i in (("s", 0), ("s", 1), ("t", 0), ("t", 1))]
+    names = [(tower, m, i) for m in ("vision", "touch") for tower in ("student", "teacher") for i in (0, 1)]
     ours = method.contrast(dict(zip(names, [*views, *views], strict=True)))
     torch.testing.assert_close(ours["vision"], theirs(views[2:], views[:2]))

@@ -22,7 +22,7 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.engine import open_engine
-from mvitac.deploy.export import export
+from mvitac.deploy.export import ExportConfig, export
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.experiments.collect import forecast, gather, lay_out
 from mvitac.experiments.jobs import do, do_all
@@ -58,7 +58,14 @@ def auto(pack: Pack, **changes: object) -> Run:
 
 def test_recipes_ask_for_auto_but_those_that_are_fixed() -> None:
     asked = {name: recipe(name).precision for name in RECIPES}
-    assert asked == {"paper": "fp32", "authors": "fp32", "modern": "auto", "demo": "auto", "smoke": "fp32"}
+    assert asked == {
+        "paper": "fp32",
+        "authors": "fp32",
+        "modern": "auto",
+        "demo": "auto",
+        "quick": "auto",
+        "smoke": "fp32",
+    }
 
 
 @pytest.mark.parametrize(
@@ -104,7 +111,7 @@ def test_auto_on_gpus(capability: tuple[int, int], expected: str, monkeypatch: p
 
 def test_nothing_below_train_takes_auto_for_fp32(pack: Pack) -> None:
     run = auto(pack)
-    with pytest.raises(AssertionError, match="what auto means is decided before"):
+    with pytest.raises(AssertionError, match="auto is resolved earlier"):
         Step(run, run.method.build(pack.spec, run.encoder), CPU)
 
 
@@ -250,7 +257,7 @@ def test_a_bf16_export_needs_a_cpu_that_can_check_it(
     with pytest.raises(
         ValueError, match=r"--precision bf16: this CPU does not compute bf16 itself.*leave --precision out"
     ):
-        export(mvitac.load(smoke_run), pack, tmp_path / "e", kind="openvino", precision="bf16")
+        export(mvitac.load(smoke_run), pack, tmp_path / "e", ExportConfig(kind="openvino", precision="bf16"))
     assert not (tmp_path / "e").exists()
 
 

@@ -148,10 +148,10 @@ def test_the_loop_keeps_whole_banks_when_the_number_of_processes_changes(
 
 
 def test_a_batch_that_does_not_divide_is_named(pack: Pack, tmp_path: Path) -> None:
-    from mvitac.training.loop import _check_world
+    from mvitac.training.setup import check_divisible
 
-    with pytest.raises(ValueError, match="batch_size 16 is not the same whole number of pairs for each of 3 processes"):
-        _check_world(recipe("smoke"), World(0, 3))
+    with pytest.raises(ValueError, match="batch_size 16 is not divisible by 3 processes: give a multiple of 3"):
+        check_divisible(recipe("smoke"), World(0, 3))
 
 
 def test_a_world_of_one_does_nothing() -> None:

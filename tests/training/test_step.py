@@ -148,7 +148,7 @@ def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="chunk 5: give a divisor of batch_size 16"):
         replace(RUN, chunk=5)
     run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, method=SupervisedConfig())
-    with pytest.raises(ValueError, match="'supervised' takes its loss pair by pair"):
+    with pytest.raises(ValueError, match="'supervised' supports neither several processes nor --chunk"):
         train(run, tmp_path / "r", quiet=True)
 
 

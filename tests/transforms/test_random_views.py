@@ -241,5 +241,5 @@ def test_without_noise_a_view_is_what_it_was() -> None:
 
 
 def test_coloured_flips_of_nothing_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"flips nothing at touch\.flip 0: give --augment\.touch\.flip 0\.5"):
+    with pytest.raises(ValueError, match=r"has no effect at touch\.flip 0: also give --augment\.touch\.flip 0\.5"):
         Augment(gel_flip="colour", touch=ViewAugment(flip=0.0))

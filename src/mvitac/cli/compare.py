@@ -3,75 +3,63 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+from rich.console import Console
+
 from mvitac.cli.options import parse, selectors
+from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.evaluate import ProbeConfig
+from mvitac.experiments.collect import forecast
+from mvitac.experiments.cross_validation import gather_folds, lay_out_folds, together
+from mvitac.experiments.jobs import do_all, submit
+from mvitac.experiments.paper_plans import PLANS, find_plan
+from mvitac.experiments.plan import Plan, setting
+from mvitac.experiments.table_formats import write_tables
+from mvitac.recipes import RECIPES
+from mvitac.registry import default, to_json, unknown
+from mvitac.system.files import check_place, write_json
 
 
-def compare(argv: list[str]) -> None:
-    """mvitac compare --plan table1|table2|ablation|FILE [--data D] [--recipe R] [--seeds N] [--jobs N] [--dry-run]"""
-    given, rest = selectors(argv, ("--plan", "--data", "--recipe"))
-    from typing import Annotated
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    data: DatasetConfig
+    out: Path
+    """Folder of the comparison: runs, controls, tables. The same command continues where it stopped."""
+    rows: tuple[str, ...] = ()
+    """Labels of the rows to run and to show beside the reference, e.g. --rows SSVTP "TAG (CMC)"; none = all. The tables
+    in --out then hold these only; runs of other rows stay, and the same command without --rows shows them again."""
+    seeds: int
+    """Runs per row, seeds 0 .. seeds - 1."""
+    folds: tuple[str, ...]
+    """Cross-validation: the field of the data that makes each fold, e.g. --folds split=fold1 split=fold2. Test groups
+    must differ between folds, and are pooled."""
+    set: tuple[str, ...] = ()
+    """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own values come
+    after."""
+    jobs: int | None = None
+    """Runs at a time; none = one per GPU, one on a machine without. The same command given again meanwhile, also on
+    another machine that shares the folder, takes the runs that no process has."""
+    device: str = "auto"
+    """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
+    imagenet: Path | None = None
+    """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
+    stress: bool
+    """Also score 1 % and 10 % of the labels, noisy test images, a modality missing at test time, and a leaking split."""
+    dry_run: bool = False
+    """Print the plan, what is finished and what is left, and stop."""
+    tables_only: bool = False
+    """Make the tables of what is finished and train nothing."""
+    slurm: str | None = None
+    """Submit the unfinished runs as a SLURM array (extra: slurm) with these submitit parameters, e.g.
+    slurm_partition=gpu,timeout_min=600,gpus_per_node=1, and stop; the same command without it makes the tables."""
 
-    import tyro
-    from rich.console import Console
 
-    from mvitac.datasets.base import DatasetConfig
-    from mvitac.evaluation.evaluate import ProbeConfig
-    from mvitac.experiments.collect import forecast
-    from mvitac.experiments.cross_validation import gather_folds, lay_out_folds, together
-    from mvitac.experiments.jobs import do_all, submit
-    from mvitac.experiments.paper_plans import PLANS, find_plan
-    from mvitac.experiments.plan import setting
-    from mvitac.experiments.table_formats import write_tables
-    from mvitac.recipes import RECIPES
-    from mvitac.registry import default, to_json, unknown
-    from mvitac.system.files import check_place, write_json
-
-    plan = find_plan(given.get("--plan", "table1"))
-    if "--recipe" in given and given["--recipe"] not in RECIPES:
-        raise unknown("recipe", given["--recipe"], RECIPES)
-    usual = "grasps" if plan.name == "table2" else "materials"
-    chosen = (
-        default(DatasetConfig, given["--data"]) if "--data" in given else plan.data or default(DatasetConfig, usual)
-    )
-
-    @dataclass(frozen=True, kw_only=True)
-    class Options:
-        data: Annotated[type(chosen), tyro.conf.arg(name="data", help=chosen.__doc__)] = chosen  # type: ignore[valid-type]
-        out: Path = Path("runs") / f"compare-{plan.name}-{chosen.name}"
-        """Folder of the comparison: runs, controls, tables. The same command goes on where it stopped."""
-        rows: tuple[str, ...] = ()
-        """Labels of the rows to run and to show beside the reference, e.g. --rows SSVTP "TAG (CMC)"; none = all. The tables
-        in --out are then of these; runs of others stay, and the same command without --rows shows them again."""
-        seeds: int = plan.seeds
-        """Runs per row, seeds 0 .. seeds - 1."""
-        folds: tuple[str, ...] = plan.folds
-        """Cross-validation: the data's fields that make each fold, e.g. --folds split=fold1 split=fold2; test groups, which
-        must differ, are pooled."""
-        set: tuple[str, ...] = ()
-        """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own come after."""
-        jobs: int | None = None
-        """Runs at a time; none = one per GPU, one on a machine without. The same command given again meanwhile, also on
-        another machine that shares the folder, does the runs that nobody is at."""
-        device: str = "auto"
-        """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
-        imagenet: Path | None = None
-        """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
-        stress: bool = plan.stress
-        """Also score 1 % and 10 % of the labels, noisy test images, a modality missing at test time, and a leaking split."""
-        dry_run: bool = False
-        """Print the plan, what is finished and what is left, and stop."""
-        tables_only: bool = False
-        """Make the tables of what is finished and train nothing."""
-        slurm: str | None = None
-        """Submit the unfinished runs as a SLURM array (extra: slurm) with these submitit parameters, e.g.
-        slurm_partition=gpu,timeout_min=600,gpus_per_node=1, and stop; the same command without it makes the tables."""
-
-    Options.__doc__ = f"""Many runs into one table: methods x settings x seeds, beside controls and the paper's numbers.
+_MANUAL = """Many runs into one table: methods x settings x seeds, beside controls and the paper's numbers.
 
     First choose, then change single fields below:
-      --plan {"|".join(PLANS)}|FILE.toml|FILE.json  (default table1)
-      --data {"|".join(DatasetConfig.choices)}  (default: the plan's, else materials; grasps for table2)
-      --recipe {"|".join(RECIPES)}  (default: the plan's, {plan.recipe})
+      --plan {plans}|FILE.toml|FILE.json  (default table1)
+      --data {data}  (default: the plan's, else materials; grasps for table2)
+      --recipe {recipes}  (default: the plan's, {recipe})
 
     A plan of your own, in TOML (in JSON the same fields):
       recipe = "demo"
@@ -87,43 +75,62 @@ def compare(argv: list[str]) -> None:
       method = "mvitac"               # the default
       set = {{ "method.temperature" = 0.2, "optim.lr" = 1e-3 }}
     """
-    options = parse(Options, rest, "compare")
-    if options.jobs is not None and not 1 <= options.jobs <= 1024:
-        raise ValueError(f"jobs {options.jobs}: give 1 to 1024 runs at a time")
-    extra = dict(setting(text) for text in options.set)
-    plan = replace(
-        plan.only(options.rows),
-        data=options.data,
-        recipe=given.get("--recipe", plan.recipe),
-        seeds=options.seeds,
-        folds=options.folds,
-        stress=options.stress,
-        set={**plan.set, **extra},
-    )
-    session = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities, imagenet=options.imagenet)
+
+
+def compare(argv: list[str]) -> None:
+    """mvitac compare --plan table1|table2|ablation|FILE [--data D] [--recipe R] [--seeds N] [--jobs N] [--dry-run]"""
+    chosen, rest = selectors(argv, ("--plan", "--data", "--recipe"))
+    plan = find_plan(chosen.get("--plan", "table1"))
+    options = _parse(chosen, rest, plan)
+    plan = _changed(plan, chosen.get("--recipe", plan.recipe), options)
+    config = ProbeConfig(probes=plan.probes, tasks=plan.tasks, modalities=plan.modalities, imagenet=options.imagenet)
     if not options.dry_run:
         check_place(options.out / "plan.json")
-    console = Console(markup=False)
-    say = lambda text: console.print(text, soft_wrap=True, highlight=False)  # noqa: E731
-    works = lay_out_folds(plan, options.out, session, options.device)
+    works = lay_out_folds(plan, options.out, config, options.device)
     work = together(works)
-    for line in forecast(work):
-        say(line)
+    print("\n".join(forecast(work)), flush=True)
     if options.dry_run:
         return
     write_json(options.out / "plan.json", to_json(plan))
     if options.slurm is not None:
-        say(submit(work, options.slurm))
+        print(submit(work, options.slurm))
         return
     if not options.tables_only:
-        do_all(work, options.jobs or _num_gpus(), say, console)
-    written = write_tables(gather_folds(plan, works, options.out, session), options.out)
-    say(written[0].read_text())
-    for path in written:
-        say(f"written: {path}")
+        jobs = options.jobs or max(1, torch.cuda.device_count())
+        do_all(work, jobs, lambda text: print(text, flush=True), Console(markup=False))
+    written = write_tables(gather_folds(plan, works, options.out, config), options.out)
+    print(written[0].read_text(), *(f"written: {path}" for path in written), sep="\n")
 
 
-def _num_gpus() -> int:
-    import torch
+def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
+    """The options, with the plan's own values as defaults."""
+    if chosen.get("--recipe", plan.recipe) not in RECIPES:
+        raise unknown("recipe", chosen.get("--recipe", plan.recipe), RECIPES)
+    data = default(DatasetConfig, chosen["--data"]) if "--data" in chosen else plan.data
+    data = data or default(DatasetConfig, "grasps" if plan.name == "table2" else "materials")
+    usual = _Options(
+        data=data,
+        out=Path("runs") / f"compare-{plan.name}-{data.name}",
+        seeds=plan.seeds,
+        folds=plan.folds,
+        stress=plan.stress,
+    )
+    choices = {"plans": PLANS, "data": DatasetConfig.choices, "recipes": RECIPES}
+    manual = _MANUAL.format(**{name: "|".join(values) for name, values in choices.items()}, recipe=plan.recipe)
+    options = parse(_Options, rest, "compare", default=usual, description=manual)
+    if options.jobs is not None and not 1 <= options.jobs <= 1024:
+        raise ValueError(f"jobs {options.jobs}: give 1 to 1024 runs at a time")
+    return options
 
-    return max(1, torch.cuda.device_count())
+
+def _changed(plan: Plan, recipe: str, options: _Options) -> Plan:
+    """``plan`` as the options change it."""
+    return replace(
+        plan.only(options.rows),
+        data=options.data,
+        recipe=recipe,
+        seeds=options.seeds,
+        folds=options.folds,
+        stress=options.stress,
+        set={**plan.set, **dict(setting(text) for text in options.set)},
+    )

@@ -1,20 +1,47 @@
-"""``mvitac data ...``: simulate, pack, look at what is in a pack."""
+"""``mvitac data ...``: simulate, pack and shard data, and look at what is in a pack."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from mvitac.cli.options import parse, selectors, short
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional
+
+from mvitac.cli.options import asks_help, check_json, parse, selectors, short
+from mvitac.data.build import build
+from mvitac.data.pack import SPLITS, Pack
+from mvitac.data.sharding import write_shards
+from mvitac.data.spec import Task
+from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.lerobot.writer import write_lerobot
+from mvitac.datasets.simulated import SimulatedConfig
+from mvitac.registry import default, unknown
+from mvitac.system.files import check_place, write_atomic, write_json
+
+
+@dataclass(frozen=True, kw_only=True)
+class _BuildOptions:
+    out: Path
+    """Folder of the new pack."""
+    data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
+    max_damaged: float = 0.0
+    """Share of the items that may be unreadable before packing stops; they are listed in pack.json."""
+    quiet: bool = False
+    """No progress bar."""
 
 
 def simulate(argv: list[str]) -> None:
     """mvitac data simulate materials|grasps --num ... --size ... --seed ... --out DIR"""
-    from mvitac.datasets.simulated import SimulatedConfig
-    from mvitac.registry import default, unknown
-
     names = sorted(cls.name for cls in SimulatedConfig.__subclasses__())
+    usage = f"mvitac data simulate {'|'.join(names)} --out DIR"
     if not argv or argv[0].startswith("-"):
-        raise ValueError(f"say what to simulate: mvitac data simulate {'|'.join(names)} --out DIR")
+        if asks_help(argv):
+            print(f"usage: {usage}\n\nThe options of one: mvitac data simulate KIND --help")
+            return
+        raise ValueError(f"name what to simulate: {usage}")
     if argv[0] not in names:
         raise unknown("kind to simulate", argv[0], names)
     _build(default(SimulatedConfig, argv[0]), argv[1:], f"data simulate {argv[0]}")
@@ -22,80 +49,56 @@ def simulate(argv: list[str]) -> None:
 
 def pack(argv: list[str]) -> None:
     """mvitac data pack --data NAME ... --out DIR"""
-    from mvitac import datasets
-    from mvitac.registry import default
-
     chosen, rest = selectors(argv, ("--data",))
     if "--data" not in chosen:
-        raise ValueError(
-            f"say which dataset: mvitac data pack --data {'|'.join(datasets.DatasetConfig.choices)} --out DIR"
-        )
-    _build(default(datasets.DatasetConfig, chosen["--data"]), short(rest), f"data pack --data {chosen['--data']}")
+        usage = f"mvitac data pack --data {'|'.join(DatasetConfig.choices)} --out DIR"
+        if asks_help(rest):
+            print(f"usage: {usage}\n\nThe options of one: mvitac data pack --data NAME --help")
+            return
+        raise ValueError(f"name the dataset: {usage}")
+    _build(default(DatasetConfig, chosen["--data"]), short(rest), f"data pack --data {chosen['--data']}")
 
 
 def _build(config: Any, argv: list[str], prog: str) -> None:
-    from typing import Annotated
-
-    import tyro
-    from rich.console import Console
-
-    from mvitac.data.build import build
-    from mvitac.system.files import check_place
-
-    @dataclass(frozen=True, kw_only=True)
-    class Options:
-        out: Path
-        """Folder of the new pack."""
-        data: Annotated[type(config), tyro.conf.arg(name="", help=config.__doc__)] = config  # type: ignore[valid-type]
-        max_damaged: float = 0.0
-        """Share of the items that may be unreadable before packing stops; they are listed in pack.json."""
-        quiet: bool = False
-        """No progress bar."""
-
-    Options.__doc__ = type(config).__doc__
-    options = parse(Options, argv, prog)
+    """Build a pack of ``config``, whose fields are the options."""
+    usual = _BuildOptions(out=tyro.MISSING, data=config)
+    options = parse(_BuildOptions, argv, prog, default=usual, description=type(config).__doc__ or "")
     check_place(options.out)
-    source = options.data.source()
+    data: Any = options.data
     pack = build(
-        source,
+        data.source(),
         options.out,
-        size=options.data.size,
-        workers=options.data.workers,
-        store=options.data.store,
-        quality=options.data.quality,
+        size=data.size,
+        workers=data.workers,
+        store=data.store,
+        quality=data.quality,
         max_damaged=options.max_damaged,
         quiet=options.quiet,
     )
-    console = Console(markup=False)
-    console.print(f"{pack.path}: {pack.num} samples at {pack.size} px", soft_wrap=True, highlight=False)
+    print(f"{pack.path}: {pack.num} samples at {pack.size} px")
     if lost := pack.meta["damaged"]:
-        text = f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {": ".join(lost[0])}'
-        console.print(text, soft_wrap=True, highlight=False)
+        first = ": ".join(lost[0])
+        print(f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {first}')
     for note in pack.spec.notes:
-        console.print(f"note: {note}", soft_wrap=True, highlight=False)
+        print(f"note: {note}")
+
+
+@dataclass(frozen=True)
+class _SheetOptions:
+    """A picture of everything a simulator makes, to check by eye."""
+
+    kind: Positional[Literal["materials", "grasps"]]
+    """Which simulator."""
+    out: Path | None = None
+    """The picture (default: KIND.png here)."""
+    seed: int = 0
+    """World seed."""
 
 
 def sheet(argv: list[str]) -> None:
     """mvitac data sheet materials|grasps [--out FILE.png]"""
-    from typing import Literal
-
-    import tyro
-    from rich.console import Console
-
-    @dataclass(frozen=True)
-    class Options:
-        """A picture of everything a simulator makes, for a person to judge."""
-
-        kind: tyro.conf.Positional[Literal["materials", "grasps"]]
-        """Which simulator."""
-        out: Path | None = None
-        """The picture (default: KIND.png here)."""
-        seed: int = 0
-        """World seed."""
-
-    options = parse(Options, argv, "data sheet")
+    options = parse(_SheetOptions, argv, "data sheet")
     from mvitac.sim import contact_sheet, grasps
-    from mvitac.system.files import write_atomic
 
     draw = {"materials": contact_sheet.contact_sheet, "grasps": grasps.contact_sheet}[options.kind]
     out = options.out or Path(f"{options.kind}.png")
@@ -104,115 +107,136 @@ def sheet(argv: list[str]) -> None:
     if options.seed < 0:
         raise ValueError(f"--seed {options.seed}: give a number >= 0")
     write_atomic(out, lambda file: draw(file, seed=options.seed))
-    Console(markup=False).print(f"{out}", soft_wrap=True, highlight=False)
+    print(out)
+
+
+@dataclass(frozen=True)
+class _ShardOptions:
+    """A pack in shards, for data larger than a machine's memory or disk: shards are read whole and in sequence.
+
+    mvitac data shard PACK s3://bucket/path
+
+    mvitac pretrain --data stream --data.url s3://bucket/path --data.cache /scratch/cache --data.cache-gb 50 ...
+
+    Rows of one touch stay together, touches come in random order. An interrupted shard is written again.
+    """
+
+    pack: Positional[Path]
+    """Folder of the pack."""
+    url: Positional[str]
+    """Where the shards go: a folder, file:///..., s3://bucket/path (needs mvitac[s3]), or any other URL that fsspec
+    opens."""
+    shard_mb: float = 64
+    """Maximum size of a shard in megabytes of images, camera and touch together."""
+    seed: int = 0
+    """Seed of the order of the touches."""
+    quiet: bool = False
+    """No progress bar."""
 
 
 def shard(argv: list[str]) -> None:
     """mvitac data shard PACK URL [--shard-mb 64]"""
-    from rich.console import Console
-    from tyro.conf import Positional
-
-    @dataclass(frozen=True)
-    class Options:
-        """A pack in shards, for data larger than a machine's memory or disk: shards are read whole and in sequence.
-
-        mvitac data shard PACK s3://bucket/path
-
-        mvitac pretrain --data stream --data.url s3://bucket/path --data.cache /scratch/cache --data.cache-gb 50 ...
-
-        Rows of one touch stay together, touches come in random order. What was interrupted is written again.
-        """
-
-        pack: Positional[Path]
-        """Folder of the pack."""
-        url: Positional[str]
-        """Where the shards go: a folder, file:///..., s3://bucket/path (needs mvitac[s3]), or whatever fsspec
-        opens."""
-        shard_mb: float = 64
-        """Megabytes of images per shard at most, camera and touch together."""
-        seed: int = 0
-        """Another number is another order of the touches."""
-        quiet: bool = False
-        """No progress bar."""
-
-    options = parse(Options, argv, "data shard")
-    from mvitac.data.pack import Pack
-    from mvitac.data.sharding import write_shards
-
+    options = parse(_ShardOptions, argv, "data shard")
     pack = Pack(options.pack)
     num = write_shards(pack, options.url, shard_mb=options.shard_mb, seed=options.seed, quiet=options.quiet)
-    Console(markup=False).print(f"{options.url}: {pack.num} samples in {num} shards", soft_wrap=True, highlight=False)
+    print(f"{options.url}: {pack.num} samples in {num} shards")
+
+
+@dataclass(frozen=True)
+class _InfoOptions:
+    """The splits of a pack: rows, groups and the most frequent class of each task."""
+
+    pack: Positional[Path]
+    """Folder of the pack."""
+    json: Path | None = None
+    """Also write what is printed to this file."""
 
 
 def info(argv: list[str]) -> None:
-    """mvitac data info PACK"""
-    import numpy as np
-    from rich.console import Console
-    from rich.table import Table
-    from tyro.conf import Positional
-
-    from mvitac.data.pack import SPLITS, Pack
-
-    @dataclass(frozen=True)
-    class Options:
-        pack: Positional[Path]
-        """Folder of the pack."""
-
-    pack = Pack(parse(Options, argv, "data info").pack)
+    """mvitac data info PACK [--json FILE]"""
+    options = parse(_InfoOptions, argv, "data info")
+    check_json(options.json)
+    pack = Pack(options.pack)
+    found = _describe(pack)
+    if options.json:
+        write_json(options.json, found)
     stored = "" if pack.store == "raw" else f", JPEG of quality {pack.meta['quality']}"
     title = f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px{stored}"
     table = Table(title=title, title_justify="left")
     for column in ("split", "rows", f"{pack.spec.group_by}s", *(f"{t.name}: majority" for t in pack.spec.tasks)):
         table.add_column(column)
-    for split in SPLITS:
-        rows = pack.rows(split)
-        if not len(rows):
-            continue
-        cells = []
-        for task in pack.spec.tasks:
-            labels = pack.column(f"label_{task.name}")[pack.rows(split, only=task.only, by=task.split)]
-            labels = labels[labels >= 0]
-            common = np.bincount(labels).argmax() if len(labels) else None
-            cells.append("" if common is None else f"{task.classes[common]} {100 * (labels == common).mean():.1f} %")
-        table.add_row(split, str(len(rows)), str(len(set(pack.column("group")[rows]))), *cells)
-    console = Console(markup=False)
-    console.print(table)
-    if len(gaps := [m for m in pack.spec.modalities if not pack.has(m).all()]):
-        whole = int(np.logical_and.reduce([pack.has(m) for m in pack.spec.modalities]).sum())
-        lacking = ", ".join(f"{int((~pack.has(m)).sum())} rows without {m}" for m in gaps)
-        console.print(f"{lacking}; {whole} whole pairs", soft_wrap=True, highlight=False)
-    console.print(f"source {pack.spec.source}; licence {pack.spec.licence}", soft_wrap=True, highlight=False)
+    for name, split in found["splits"].items():
+        cells = [f"{m['class']} {100 * m['share']:.1f} %" if m else "" for m in split["majority"].values()]
+        table.add_row(name, str(split["rows"]), str(split["groups"]), *cells)
+    Console(markup=False).print(table)
+    if lacking := ", ".join(f"{num} rows without {m}" for m, num in found["rows_without"].items()):
+        print(f"{lacking}; {found['whole_pairs']} whole pairs")
+    print(f"source {pack.spec.source}; licence {pack.spec.licence}")
     for note in pack.spec.notes:
-        console.print(f"note: {note}", soft_wrap=True, highlight=False)
+        print(f"note: {note}")
+
+
+def _describe(pack: Pack) -> dict[str, Any]:
+    """What ``info`` prints of a pack, JSON-ready."""
+    splits = {}
+    for split in SPLITS:
+        if len(rows := pack.rows(split)):
+            groups = len(set(pack.column("group")[rows]))
+            majority = {task.name: _majority(pack, task, split) for task in pack.spec.tasks}
+            splits[split] = {"rows": len(rows), "groups": groups, "majority": majority}
+    has = {m: pack.has(m) for m in pack.spec.modalities}
+    return {
+        "path": str(pack.path),
+        "name": pack.spec.name,
+        "rows": pack.num,
+        "size": pack.size,
+        "store": pack.store,
+        "group_by": pack.spec.group_by,
+        "splits": splits,
+        "rows_without": {m: int((~there).sum()) for m, there in has.items() if not there.all()},
+        "whole_pairs": int(np.logical_and.reduce(list(has.values())).sum()),
+        "source": pack.spec.source,
+        "licence": pack.spec.licence,
+        "notes": list(pack.spec.notes),
+        "digest": pack.digest,
+    }
+
+
+def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:
+    """The most frequent class of a task in ``split`` and its share of the labelled rows; None without labels."""
+    labels = pack.column(f"label_{task.name}")[pack.rows(split, only=task.only, by=task.split)]
+    labels = labels[labels >= 0]
+    if not len(labels):
+        return None
+    common = int(np.bincount(labels).argmax())
+    return {"class": task.classes[common], "share": float((labels == common).mean())}
+
+
+@dataclass(frozen=True)
+class _ShowOptions:
+    """A few pairs of every class or object, to check by eye."""
+
+    pack: Positional[Path]
+    """Folder of the pack."""
+    by: str = ""
+    """Task or table column, one strip per value (default: the first task, else the group)."""
+    split: str = ""
+    """Show rows of train, val, test or unlabelled only."""
+    num: int = 6
+    """Pairs per strip, of different groups if there are enough."""
+    limit: int = 40
+    """Maximum number of strips."""
+    side: int = 96
+    """Height of a picture in pixels."""
+    seed: int = 0
+    """Seed of the draw."""
+    out: Path | None = None
+    """A .png or an .html (default: NAME-OF-THE-PACK.png here)."""
 
 
 def show(argv: list[str]) -> None:
     """mvitac data show PACK [--by TASK|COLUMN] [--out FILE.png|FILE.html]"""
-    from rich.console import Console
-    from tyro.conf import Positional
-
-    @dataclass(frozen=True)
-    class Options:
-        """A few pairs of every class or object, for a person to judge."""
-
-        pack: Positional[Path]
-        """Folder of the pack."""
-        by: str = ""
-        """Task or table column, one strip per value; default: the first task, else the group."""
-        split: str = ""
-        """Show rows of train, val, test or unlabelled only."""
-        num: int = 6
-        """Pairs per strip, of different groups where there are so many."""
-        limit: int = 40
-        """Strips at most."""
-        side: int = 96
-        """Height of a picture in pixels."""
-        seed: int = 0
-        """Another number is another draw."""
-        out: Path | None = None
-        """A .png or an .html; default: <pack's name>.png here."""
-
-    options = parse(Options, argv, "data show")
+    options = parse(_ShowOptions, argv, "data show")
     out = options.out or Path(f"{options.pack.resolve().name}.png")
     if out.suffix.lower() not in (".png", ".html"):
         raise ValueError(f"--out {out}: give a name that ends in .png or .html")
@@ -220,9 +244,7 @@ def show(argv: list[str]) -> None:
         raise ValueError(f"--side {options.side}: give 16 to 1024 pixels")
     if options.seed < 0:
         raise ValueError(f"--seed {options.seed}: give a number >= 0")
-    from mvitac.data.pack import Pack
     from mvitac.report import contact_sheet
-    from mvitac.system.files import check_place, write_atomic
 
     check_place(out)
     pack = Pack(options.pack)
@@ -235,30 +257,25 @@ def show(argv: list[str]) -> None:
     else:
         picture = contact_sheet.to_image(pack, found, num_all, side=options.side)
         write_atomic(out, lambda file: picture.save(file, "PNG"))
-    Console(markup=False).print(f"{out}: {len(found)} of {num_all} strips", soft_wrap=True, highlight=False)
+    print(f"{out}: {len(found)} of {num_all} strips")
+
+
+@dataclass(frozen=True)
+class _LeRobotOptions:
+    """A pack as a LeRobotDataset v3: images unchanged (PNG), one episode per touch group."""
+
+    pack: Positional[Path]
+    """Folder of the pack."""
+    out: Path
+    """Folder of the new dataset."""
+    fps: int = 10
+    """Nominal rate of the rows of an episode: a pack holds no times."""
 
 
 def export_lerobot(argv: list[str]) -> None:
     """mvitac data export-lerobot PACK --out DIR [--fps 10]"""
-    from rich.console import Console
-    from tyro.conf import Positional
-
-    from mvitac.data.pack import Pack
-    from mvitac.datasets.lerobot.writer import write_lerobot
-
-    @dataclass(frozen=True)
-    class Options:
-        """A pack as a LeRobotDataset v3: images as they are (PNG), one episode per touch group."""
-
-        pack: Positional[Path]
-        """Folder of the pack."""
-        out: Path
-        """Folder of the new dataset."""
-        fps: int = 10
-        """Nominal rate of the rows of an episode: a pack knows no time."""
-
-    options = parse(Options, argv, "data export-lerobot")
+    options = parse(_LeRobotOptions, argv, "data export-lerobot")
     pack = Pack(options.pack)
     num = write_lerobot(pack, options.out, fps=options.fps)
     left = f"; {pack.num - num} rows that lack a modality left out" * (num < pack.num)
-    Console(markup=False).print(f"{options.out}: {num} frames{left}", soft_wrap=True, highlight=False)
+    print(f"{options.out}: {num} frames{left}")

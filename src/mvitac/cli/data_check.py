@@ -1,112 +1,102 @@
-"""``mvitac data check``: the doctor."""
+"""``mvitac data check``: what is wrong with a dataset."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from mvitac.cli.options import parse, selectors, short
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from tyro.conf import Positional
+
+from mvitac.cli.options import check_json, parse, selectors, short
+from mvitac.data.checks.contact_sheet import draw
+from mvitac.data.checks.examine import examine_pack, examine_source
+from mvitac.data.checks.finding import exit_code
+from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.table.table import RowsConfig
+from mvitac.registry import default
+from mvitac.system.files import check_place, write_atomic, write_json
 
 _COLOURS = {"ok": "green", "look": "yellow", "broken": "bold red", "not checkable": "dim"}
+_MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step.
+
+    Exit code: 0 all is well, 1 a person should look, 2 something is broken (or the command could not be run).
+    Heuristics only report "look", with their figures; "broken" is a fact. Nothing is changed.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    json: Path | None = None
+    """Also write every finding to this file."""
+    sheet: Path | None = None
+    """Also draw the suspicious rows into this PNG."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PackOptions(_Options):
+    pack: Positional[Path]
+    """Folder of the pack; for a source that is not packed yet: mvitac data check --data NAME ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SourceOptions(_Options):
+    data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
+    num: int = 0
+    """Number of items to read, evenly spread over the source; 0 = all."""
+    thumbnail: int = 64
+    """Side in pixels to which images are reduced for the examination."""
+    quiet: bool = False
+    """No progress bar."""
 
 
 def check(argv: list[str]) -> int:
     """mvitac data check PACK | --data NAME ... [--json FILE] [--sheet FILE.png]"""
-    from typing import Annotated
-
-    import tyro
-
-    from mvitac import datasets
-    from mvitac.data.checks.examine import examine_pack, examine_source
-    from mvitac.datasets.table.table import RowsConfig
-    from mvitac.registry import default
-
     chosen, rest = selectors(argv, ("--data",))
-
-    @dataclass(frozen=True, kw_only=True)
-    class Shared:
-        json: Path | None = None
-        """Also write every finding to this file."""
-        sheet: Path | None = None
-        """Also draw the suspicious rows into this PNG."""
-
-    manual = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step.
-
-    Exit code: 0 all is well, 1 somebody should look, 2 something is broken (or the command could not be run).
-    Heuristics say "look" and show their figures; only facts say "broken". Nothing is changed.
-    """
     if "--data" not in chosen:
-
-        @dataclass(frozen=True, kw_only=True)
-        class OfPack(Shared):
-            pack: tyro.conf.Positional[Path]
-            """Folder of the pack; for a source that is not packed yet: mvitac data check --data NAME ..."""
-
-        OfPack.__doc__ = manual
-        options = parse(OfPack, rest, "data check")
+        options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         _check_places(options)
-        findings, strips = examine_pack(options.pack)
-        return _tell(str(options.pack), findings, strips, options)
-
-    config: Any = default(datasets.DatasetConfig, chosen["--data"])
-
-    @dataclass(frozen=True, kw_only=True)
-    class OfSource(Shared):
-        data: Annotated[type(config), tyro.conf.arg(name="", help=config.__doc__)] = config  # type: ignore[valid-type]
-        num: int = 0
-        """Items to read, evenly spread over the source; 0 = all."""
-        thumbnail: int = 64
-        """Side in pixels at which the images are kept for the examination."""
-        quiet: bool = False
-        """No progress bar."""
-
-    OfSource.__doc__ = manual
-    options = parse(OfSource, short(rest), f"data check --data {chosen['--data']}")
+        return _report(str(options.pack), *examine_pack(options.pack), options)
+    name = f"--data {chosen['--data']}"
+    usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
+    options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
     _check_places(options)
     if options.num < 0:
-        raise ValueError(f"--num {options.num}: give how many items to read, 0 for all")
-    # What leaks is a finding here, beside all the others; packing refuses it.
-    leaky = {"allow_leak": True} if isinstance(options.data, RowsConfig) else {}
-    source = replace(options.data, **leaky).source()
+        raise ValueError(f"--num {options.num}: give the number of items to read, 0 for all")
+    data: Any = options.data
+    # A leak is a finding here, beside all the others; packing refuses it.
+    source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     findings, strips = examine_source(
-        source, num=options.num, size=options.thumbnail, workers=options.data.workers, quiet=options.quiet
+        source, num=options.num, size=options.thumbnail, workers=data.workers, quiet=options.quiet
     )
-    return _tell(f"--data {chosen['--data']}", findings, strips, options)
+    return _report(name, findings, strips, options)
 
 
-def _check_places(options: Any) -> None:
-    from mvitac.system.files import check_place
-
-    if options.sheet and options.sheet.suffix.lower() != ".png":
-        raise ValueError(f"--sheet {options.sheet}: the sheet is a PNG, give a name that ends in .png")
-    for path in (options.json, options.sheet):
-        if path:
-            check_place(path)
+def _check_places(options: _Options) -> None:
+    check_json(options.json)
+    if options.sheet:
+        if options.sheet.suffix.lower() != ".png":
+            raise ValueError(f"--sheet {options.sheet}: the sheet is a PNG, give a name that ends in .png")
+        check_place(options.sheet)
 
 
-def _tell(what: str, findings: Any, strips: Any, options: Any) -> int:
-    from dataclasses import asdict
-
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from mvitac.data.checks.contact_sheet import draw
-    from mvitac.data.checks.finding import exit_code
-    from mvitac.system.files import write_atomic, write_json
-
+def _report(what: str, findings: Sequence[Any], strips: Any, options: _Options) -> int:
+    """Print the findings, write the files that ``options`` name, and return the exit code."""
     code = exit_code(findings)
-    console = Console(markup=False)
     table = Table(title=f"{what}: {('ok', 'look', 'broken')[code]}", title_justify="left")
     for column in ("", "item", "what was found"):
         table.add_column(column, overflow="fold")
     for finding in findings:
-        told = finding.evidence + (f"\n-> {finding.advice}" if finding.advice else "")
-        table.add_row(Text(finding.verdict, style=_COLOURS[finding.verdict]), finding.item, told)
-    console.print(table)
+        text = finding.evidence + (f"\n-> {finding.advice}" if finding.advice else "")
+        table.add_row(Text(finding.verdict, style=_COLOURS[finding.verdict]), finding.item, text)
+    Console(markup=False).print(table)
     if options.json:
         write_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
-        console.print(f"written: {options.json}", soft_wrap=True, highlight=False)
+        print(f"written: {options.json}")
     if options.sheet:
         write_atomic(options.sheet, lambda file: draw(file, strips))
-        console.print(f"written: {options.sheet}", soft_wrap=True, highlight=False)
+        print(f"written: {options.sheet}")
     return code

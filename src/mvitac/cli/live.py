@@ -1,130 +1,175 @@
-"""``mvitac live``: a robot's eyes and fingers in, a prediction for every touch out."""
+"""``mvitac live``: predict from the frames of cameras and tactile sensors, one answer for every touch."""
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from mvitac.cli.options import parse
+import tyro
+from rich.console import Console, Group
+from rich.live import Live as Screen
+from rich.table import Table
+from rich.text import Text
+from tyro.conf import Positional
+
+from mvitac.cli.options import check_json, parse
+from mvitac.live.contact import LiveConfig
+from mvitac.system.files import write_json
 
 if TYPE_CHECKING:
     from mvitac.deploy.engine import Engine
+    from mvitac.live.display import Window
     from mvitac.live.predictor import Live
+
+_REDRAW = 0.1
+"""Seconds between two pictures of the terminal or the window."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    """Predict from live frames: only the newest frame counts, old ones are never used, every fault is reported. Ctrl-C ends
+    it with a summary.
+
+    A SOURCE is a camera (its number, /dev/videoN or serial:NAME; @WIDTHxHEIGHT and @FPS after it ask for that mode, e.g.
+    serial:D20345@320x240@60), a video file, a folder of pictures[@FPS], or sim[:SEED].
+    To finish a recording after a crash: mvitac live --finish DIR
+    """
+
+    model: Positional[str]
+    """Folder of an export (fastest); or of a run or an artifact, or owner/name on the Hub, which is exported first."""
+    vision: str | None = None
+    """SOURCE of the camera."""
+    touch: tuple[str, ...] = ()
+    """SOURCE of the touch sensor, or of both of a gripper: left right. Without any source, all are simulated."""
+    index: Path | None = None
+    """Show the nearest known touches from this index."""
+    record: Path | None = None
+    """Record the frames in this new folder."""
+    record_as: Literal["pack", "lerobot"] = "pack"
+    """Format of the recording: a pack, or a LeRobotDataset v3 (one episode per touch)."""
+    record_fps: float = 10.0
+    """Pairs per second to record; a whole number for lerobot."""
+    window: bool = False
+    """Also show the frames and answers in a window; q or Esc in it ends. Needs a display and opencv-python."""
+    seconds: float | None = None
+    """Stop after this many seconds."""
+    threads: int = 0
+    """CPU threads for the model; 0 = all cores."""
+    stale: float = 0.5
+    """Age in seconds from which a frame is too old to be used."""
+    json: Path | None = None
+    """Write the summary to this file."""
+    live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
-    from typing import Annotated, Literal
-
-    import tyro
-    from rich.console import Console
-    from rich.live import Live as Screen
-
-    from mvitac.deploy.search import Index, neighbours
-    from mvitac.live.cameras import source
-    from mvitac.live.contact import LiveConfig
-    from mvitac.live.display import Window, draw
-    from mvitac.live.predictor import Live
+    from mvitac.live.display import Window
     from mvitac.live.recorder import Recorder, finish
-    from mvitac.live.streams import CaptureThread, Stream
-    from mvitac.system.files import check_place, write_json
 
     if argv[:1] == ["--finish"] and len(argv) == 2:
-        Console(markup=False).print(f"{argv[1]}: {finish(Path(argv[1]))} pairs", soft_wrap=True, highlight=False)
+        print(f"{argv[1]}: {finish(Path(argv[1]))} pairs")
         return
-
-    @dataclass(frozen=True, kw_only=True)
-    class Options:
-        """Predict from live frames: the newest always wins, old ones are never used, every fault is named. Ctrl-C ends it
-        with a summary.
-
-        A SOURCE is a camera (its number, /dev/videoN or serial:NAME; with @WIDTHxHEIGHT and @FPS it is asked for that mode,
-        e.g. serial:D20345@320x240@60), a video file, a folder of pictures[@FPS], or sim[:SEED].
-        A recording that a crash cut short: mvitac live --finish DIR
-        """
-
-        model: tyro.conf.Positional[str]
-        """An export's folder (fastest); or a run, an artifact, owner/name on the Hub, which is exported first."""
-        vision: str | None = None
-        """The camera."""
-        touch: tuple[str, ...] = ()
-        """The touch sensor, or both of a gripper: left right. Without any source, all of them are simulated."""
-        index: Path | None = None
-        """Show the nearest known touches from this index."""
-        record: Path | None = None
-        """Record what comes in, in this new folder."""
-        record_as: Literal["pack", "lerobot"] = "pack"
-        """What the recording becomes: a pack, or a LeRobotDataset v3 (an episode per touch)."""
-        record_fps: float = 10.0
-        """Pairs a second to record; a whole number for lerobot."""
-        window: bool = False
-        """Show the frames and answers in a window too; q or Esc in it ends. Needs a display and opencv-python."""
-        seconds: float | None = None
-        """Stop after so long."""
-        threads: int = 0
-        """CPU threads for the model; 0 = all cores."""
-        stale: float = 0.5
-        """Seconds after which a frame is too old to be used."""
-        json: Path | None = None
-        """Write the summary to this file."""
-        live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
-
-    options = parse(Options, argv, "live")
+    options = parse(_Options, argv, "live")
     for name, seconds in (("--seconds", options.seconds), ("--stale", options.stale)):
         if seconds is not None and not seconds > 0:
             raise ValueError(f"{name} {seconds:g}: give seconds, more than 0")
-    if options.json:
-        check_place(options.json)
-        if options.json.is_dir():
-            raise ValueError(f"--json {options.json} is a folder: give a file's name")
+    check_json(options.json)
     console = Console(markup=False)
     window = Window() if options.window else None
     engine = _engine(options.model, options.threads, console)
-    index = Index(options.index) if options.index else None
-    if index and index.meta["weights"] != engine.meta["weights"]:
+    nearest = _nearest(options, engine)
+    streams = _streams(options, engine)
+    if not (options.vision or options.touch):
+        print("no --vision, no --touch: all sensors are simulated")
+    recorder = None
+    if options.record:
+        channels = {m: s[2] for m, s in engine.inputs.items()}
+        recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
+    loop = _loop(engine, streams, options.live, console, nearest=nearest, record=recorder)
+    _run(loop, console, window, options.seconds)
+    summary = loop.summary()
+    _print_summary(summary)
+    if options.json:
+        write_json(options.json, summary)
+    if recorder:  # last, for it may fail (a full disk)
+        num = recorder.close()
+        print(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded")
+
+
+def _nearest(options: _Options, engine: "Engine") -> Any:
+    """The search for known touches, if there is an index; ValueError if it was made with another model."""
+    from mvitac.deploy.search import Index, neighbours
+
+    if not options.index:
+        return None
+    index = Index(options.index)
+    if index.meta["weights"] != engine.meta["weights"]:
         raise ValueError(f"{options.index} was made with another model: index the pack again with {options.model}")
+    return neighbours(index, options.live.neighbours, engine.inputs)
+
+
+def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
+    """The streams by modality, not yet open; several of one modality are numbered from 1."""
+    from mvitac.live.cameras import source
+    from mvitac.live.streams import Stream
+
     streams = {}
     for modality, texts in sources(engine.inputs, options.vision, options.touch).items():
         names = [modality] if len(texts) == 1 else [f"{modality} {i + 1}" for i in range(len(texts))]
         pairs = zip(names, texts, strict=True)
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
-    if not (options.vision or options.touch):
-        console.print("no --vision, no --touch: all sensors are simulated", highlight=False)
-    recorder = None
-    if options.record:
-        channels = {m: s[2] for m, s in engine.inputs.items()}
-        recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
-    nearest = neighbours(index, options.live.neighbours, engine.inputs) if index else None
-    # What happened is printed above the picture, so that it stays in the scrollback and in a log file.
-    loop = Live(
-        engine,
-        streams,
-        options.live,
-        nearest=nearest,
-        record=recorder,
-        tell=lambda event: console.print(event.text, style="yellow", soft_wrap=True, highlight=False, markup=False),
-    )
+    return streams
+
+
+def _loop(engine: "Engine", streams: dict[str, Any], config: LiveConfig, console: Console, **options: Any) -> "Live":
+    from mvitac.live.predictor import Live
+
+    # Printed above the picture, so that events stay in the scrollback and in a log file.
+    def tell(event: Any) -> None:
+        console.print(event.text, style="yellow", soft_wrap=True, highlight=False, markup=False)
+
+    return Live(engine, streams, config, tell=tell, **options)
+
+
+def _run(loop: "Live", console: Console, window: "Window | None", seconds: float | None) -> None:
+    """Predict until all streams ended, ``seconds`` are over, or the user stops it."""
+    from mvitac.live.display import draw
+
+    end = time.monotonic() + seconds if seconds else float("inf")
+    printed, drawn = 0, 0.0
+    with (
+        _capture(loop, window, console) as news,
+        Screen(view(loop), console=console, auto_refresh=False, transient=True) as screen,
+    ):
+        while time.monotonic() < end and not all(s.ended for s in loop.all):
+            news.wait(0.05)
+            news.clear()
+            loop.tick()
+            printed = _print_touch(loop, console, printed)
+            if time.monotonic() - drawn > _REDRAW:
+                screen.update(view(loop), refresh=True)
+                if window and not window.show(draw(loop)):
+                    break
+                drawn = time.monotonic()
+    loop.finish()
+    _print_touch(loop, console, printed)
+
+
+@contextmanager
+def _capture(loop: "Live", window: "Window | None", console: Console) -> Iterator[threading.Event]:
+    """Read every stream in a thread of its own; the event is set by each new frame. Ctrl-C ends the ``with``."""
+    from mvitac.live.streams import CaptureThread
+
     news = threading.Event()
     threads = [CaptureThread(stream, news.set) for stream in loop.all]
-    end = time.monotonic() + options.seconds if options.seconds else float("inf")
-    spoken = 0
     for thread in threads:
         thread.start()
     try:
-        with Screen(view(loop), console=console, auto_refresh=False, transient=True) as screen:
-            drawn = 0.0
-            while time.monotonic() < end and not all(s.ended for s in loop.all):
-                news.wait(0.05)
-                news.clear()
-                loop.tick()
-                spoken = _speak(loop, console, spoken)
-                if time.monotonic() - drawn > 0.1:
-                    screen.update(view(loop), refresh=True)
-                    if window and not window.show(draw(loop)):
-                        break
-                    drawn = time.monotonic()
+        yield news
     except KeyboardInterrupt:
         console.print("stopped")
     finally:
@@ -134,22 +179,21 @@ def live(argv: list[str]) -> None:
             thread.join(2.0)  # a device that hangs must not hang us
         if window:
             window.close()
-    loop.finish()
-    _speak(loop, console, spoken)
-    summary = loop.summary()
-    _conclude(summary, console)
-    if options.json:
-        write_json(options.json, summary)
-    if recorder:  # last, for it may fail (a full disk)
-        num = recorder.close()
-        console.print(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded", soft_wrap=True)
 
 
 def sources(
     inputs: Mapping[str, Sequence[int]], vision: str | None, touch: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """What to open by modality, for an engine's ``inputs`` (shapes [S, S, C] by modality): what was given, or simulated
-    sensors if nothing was. ValueError if one of them is left out: what is simulated must not pass for real."""
+    """The sources by modality: those that were given, or simulated sensors if there are none.
+
+    Args:
+        inputs: shapes [S, S, C] of the engine's inputs, by modality.
+        vision: source of the camera.
+        touch: sources of the touch sensors.
+
+    Raises:
+        ValueError: only some inputs have a source; a simulated sensor must not pass for a real one.
+    """
     given: dict[str, tuple[str, ...]] = {"vision": (vision,) if vision else (), "touch": tuple(touch)}
     given = {modality: texts for modality, texts in given.items() if texts}
     if not given:
@@ -164,7 +208,7 @@ def sources(
 
 
 def _engine(model: str, threads: int, console: Any) -> "Engine":
-    """An export as it is; anything else exported once, into the cache."""
+    """The engine of an export; a run or an artifact is exported first, once, into the cache."""
     from mvitac.deploy.artifact import load
     from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, lists_bf16
     from mvitac.deploy.export import export
@@ -182,25 +226,25 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
                 console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
         return engine
     loaded = load(model)
-    # Artifacts of one run differ in their probes alone. A bare run has none: those fitted below are what its data makes.
+    # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
     probes = [[to_json(r.question), safetensors_digest(dict(r.state_dict()))] for r in loaded.readouts.values()]
     key = digest([FORMAT_VERSION, loaded.weights_digest(), probes])
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
         pack = own_data(loaded, "`mvitac export` it where the data is, and give that folder")
-        export(with_readouts(loaded, pack), pack, folder, kind="onnx")
+        export(with_readouts(loaded, pack), pack, folder)
     return Engine(folder, threads=threads)
 
 
-def _speak(loop: "Live", console: Any, spoken: int) -> int:
-    """One line for a touch that has ended."""
+def _print_touch(loop: "Live", console: Any, printed: int) -> int:
+    """Print one line for a touch that has ended; the number of the last touch printed."""
     touch = loop.last
-    if touch is None or touch.number <= spoken or touch.end is None:
-        return spoken
-    said = ", ".join(_answer(loop, *item) for item in loop.answers(touch).items())
+    if touch is None or touch.number <= printed or touch.end is None:
+        return printed
+    answers = ", ".join(_answer(loop, *item) for item in loop.answers(touch).items())
     like = f"; like: {'; '.join(touch.known)}" if touch.known else ""
-    text = f"touch {touch.number} ({touch.end - touch.start:.1f} s): {said}{like}"
+    text = f"touch {touch.number} ({touch.end - touch.start:.1f} s): {answers}{like}"
     console.print(text, soft_wrap=True, highlight=False, markup=False)
     return touch.number
 
@@ -212,18 +256,8 @@ def _answer(loop: "Live", task: str, answer: tuple[str, float]) -> str:
 
 
 def view(loop: "Live") -> Any:
-    """The terminal's picture of ``loop``, 80 columns wide."""
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    streams = Table(box=None, pad_edge=False)
-    for column in ("stream", "fps", "age ms", "dropped", "state"):
-        streams.add_column(column, justify="left" if column in ("stream", "state") else "right")
-    for s in loop.all:
-        age = f"{1000 * s.age():.0f}" if s.num_frames else "-"
-        streams.add_row(s.name, f"{s.rate():.1f}", age, str(s.num_dropped), loop.state(s))
-    lines: list[Any] = [streams]
+    """The terminal's picture of ``loop``: streams, contact, answers, ages; 80 columns wide."""
+    lines: list[Any] = [_stream_table(loop)]
     for s in loop.streams.get("touch", ()):
         contact = loop.contacts[s.name]
         bar = "#" * min(30, round(10 * contact.level))
@@ -242,18 +276,24 @@ def view(loop: "Live") -> Any:
     return Group(*lines)
 
 
-def _conclude(summary: dict[str, Any], console: Any) -> None:
+def _stream_table(loop: "Live") -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in ("stream", "fps", "age ms", "dropped", "state"):
+        table.add_column(column, justify="left" if column in ("stream", "state") else "right")
+    for s in loop.all:
+        age = f"{1000 * s.age():.0f}" if s.num_frames else "-"
+        table.add_row(s.name, f"{s.rate():.1f}", age, str(s.num_dropped), loop.state(s))
+    return table
+
+
+def _print_summary(summary: dict[str, Any]) -> None:
     age = summary["age_ms"]
     if age["p50"] is not None:
-        console.print("end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**age), highlight=False)
-    console.print(
-        f"{summary['predictions']} predictions in {summary['touches']} touches; {summary['stale']} frames too old to use",
-        highlight=False,
+        print("end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**age))
+    print(
+        f"{summary['predictions']} predictions in {summary['touches']} touches; {summary['stale']} frames too old to use"
     )
     for name, s in summary["streams"].items():
-        console.print(
-            f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged",
-            highlight=False,
-        )
+        print(f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged")
     if summary["events"]:
-        console.print("events: " + ", ".join(f"{k} {v}" for k, v in summary["events"].items()), highlight=False)
+        print("events: " + ", ".join(f"{k} {v}" for k, v in summary["events"].items()))

@@ -1,6 +1,6 @@
-"""The command line: thin and lazy. `mvitac --help` imports nothing heavy; each command imports what it needs.
+"""The command line. `mvitac --help` imports nothing heavy; each command is imported when it is called.
 
-A user's mistake ends in one line on stderr and exit code 2; Ctrl-C in 130; anything else is our bug and shows a traceback.
+A mistake of the user ends in one line on stderr and exit code 2, Ctrl-C in 130. A traceback is a bug of ours.
 """
 
 import importlib
@@ -12,15 +12,15 @@ from collections.abc import Sequence
 HELP = """\
 usage: mvitac COMMAND [OPTIONS]     (mvitac COMMAND --help explains one)
 
-Learn from paired camera and optical-tactile images without labels, and prove
-what the features are worth.
+Learn from paired camera and optical-tactile images without labels, and measure
+how good the features are.
 
-  demo                 the whole road in minutes, on simulated data
+  demo                 simulate, pre-train, probe, report: all in minutes
   data simulate KIND   simulate materials or grasps into a pack
   data pack            read any dataset (--data NAME) into a pack
   data shard PACK URL  write a pack in shards, for --data stream
   data info PACK       what is in a pack
-  data check PACK      what is wrong with a pack, or with --data NAME (doctor)
+  data check PACK      what is wrong with a pack, or with --data NAME
   data sheet KIND      a picture of what the simulator makes
   data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
   data export-lerobot  write a PACK as a LeRobotDataset v3
@@ -30,7 +30,7 @@ what the features are worth.
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
-  live MODEL           cameras or files in, a prediction for every touch out
+  live MODEL           a prediction for every touch, from cameras or files
   explore RUN          a local page: the map of features, neighbours, mistakes
   embed PACK           embeddings of every row, as .npz or .parquet
   index PACK           make a pack searchable
@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except BrokenPipeError as error:
         if _reader_left():
-            return 141  # as a shell says of what SIGPIPE ended
+            return 141  # the exit code that a shell gives for SIGPIPE
         print(f"mvitac: error: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -97,9 +97,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    """The command that ``arguments`` name, done; its exit code."""
+    """Run the command that ``arguments`` name, and return its exit code."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP, end="")
+        return 0
+    if arguments[0] == "data" and (len(arguments) == 1 or arguments[1] in ("-h", "--help")):
+        lines = [line for line in HELP.splitlines() if line.startswith("  data ")]
+        print("usage: mvitac data COMMAND [OPTIONS]     (--help after a command explains it)", "", *lines, sep="\n")
         return 0
     if arguments[0] == "--version":
         from mvitac import __version__
@@ -108,10 +112,7 @@ def _run(arguments: list[str]) -> int:
         return 0
     name, rest = arguments[0], arguments[1:]
     _check_once(rest)
-    if name == "data" and rest:
-        if rest[0] in ("-h", "--help"):
-            print(HELP, end="")
-            return 0
+    if name == "data":
         name, rest = f"data {rest[0]}", rest[1:]
     if name not in COMMANDS:
         from mvitac.registry import unknown
@@ -122,7 +123,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _reader_left() -> bool:
-    """Whether nobody reads what is printed any more (``mvitac ... | head``); what is left of it then goes nowhere."""
+    """Whether the reader of stdout has closed it (``mvitac ... | head``); if so, the rest goes to the null device."""
     import select
 
     out = select.poll()
@@ -134,17 +135,17 @@ def _reader_left() -> bool:
 
 
 def _wait_briefly() -> None:
-    """Let OpenMP's threads spin for microseconds, not milliseconds, while they wait for each other.
+    """Let OpenMP threads spin for microseconds, not milliseconds, while they wait for each other.
 
-    Beside any other busy program the thread that is waited for may not be running: a step on two cores then took five
-    times as long (docs/speed.md). libgomp reads it when torch loads it; whoever sets OpenMP's own variables is obeyed.
+    Beside another busy program the awaited thread may not be running: a step on two cores then took five times as long
+    (docs/speed.md). libgomp reads the variable when torch loads it. OpenMP variables that the user set are kept.
     """
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
         os.environ["GOMP_SPINCOUNT"] = "10000"
 
 
 def _check_once(argv: Sequence[str]) -> None:
-    """An option given twice is a slip in a long command: say so instead of letting the last one win."""
+    """ValueError if an option is given twice, which is a mistake in a long command; tyro would take the last one."""
     names = [word.split("=")[0].replace("_", "-") for word in argv if word.startswith("--")]
     for name in names:
         if names.count(name) > 1:
@@ -152,7 +153,7 @@ def _check_once(argv: Sequence[str]) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """An error as one line; what the system says of a file gets the file's name and what to do."""
+    """An error as one line; an error of the operating system gets the file's name and advice."""
     if isinstance(error, OSError) and error.strerror:
         advice = {
             28: "free some space or choose another --out",

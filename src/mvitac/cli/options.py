@@ -1,41 +1,71 @@
-"""Options of a command line: tyro's, with every slip of a user told in one line."""
+"""Options of a command line: tyro's, with every mistake of a user reported in one line."""
 
 import argparse
 import contextlib
+import inspect
 import io
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
 
-def parse(kind: Callable[..., T] | type[T], argv: Sequence[str], prog: str, *, default: Any = None) -> T:
-    """tyro, with its boxed errors folded into the one line every command owes."""
+def parse(
+    kind: Callable[..., T] | type[T], argv: Sequence[str], prog: str, *, default: Any = None, description: str = ""
+) -> T:
+    """Parse ``argv`` with tyro, and turn its boxed errors into a ValueError of one line.
+
+    Args:
+        kind: dataclass of the options; the docstring under each field is its help text.
+        argv: words after the command's name.
+        prog: the command's name, e.g. "data pack".
+        default: instance of ``kind`` with other defaults than its own.
+        description: text of ``--help`` above the options, instead of the docstring of ``kind``.
+    """
     import tyro
 
     argv = [
-        re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", word) for word in argv
-    ]  # old name
-    if "-h" in argv or "--help" in argv:
-        wide: Any = contextlib.nullcontext()
-    else:
-        wide = _columns("10000")  # no help will be shown, and an error's lines must not be wrapped
+        re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", w) for w in argv
+    ]  # 0.1.0's name
+    options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
+    if default is not None:
+        options["default"] = default
+    if description:
+        options["description"] = inspect.cleandoc(description)
     boxed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(boxed), wide:
-            options: dict[str, Any] = {} if default is None else {"default": default}
-            return tyro.cli(kind, args=list(argv), prog=f"mvitac {prog}", **options)  # type: ignore[arg-type]
+        with contextlib.redirect_stderr(boxed):
+            if {"-h", "--help"} & set(argv):
+                # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
+                with _joined_lines():
+                    return tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff,))  # type: ignore[arg-type]
+            with _columns("10000"):  # the lines of an error must not be wrapped
+                return tyro.cli(kind, **options)  # type: ignore[arg-type]
     except SystemExit as exit_:
         if not exit_.code:
             raise
-        raise ValueError(_unboxed(boxed.getvalue(), prog)) from None
+        raise ValueError(_one_line(boxed.getvalue(), prog)) from None
 
 
-def short(argv: Sequence[str]) -> list[str]:
-    """``argv`` with a dataset's options as its own commands have them (--root), where spelt as in pretrain (--data.root)."""
-    return [f"--{word.removeprefix('--data.')}" if word.startswith("--data.") else word for word in argv]
+@contextlib.contextmanager
+def _joined_lines() -> Iterator[None]:
+    """Let tyro wrap field docstrings itself: it keeps the line breaks of the source, and has no option for that."""
+    from tyro import _docstrings
+
+    read = _docstrings.get_field_docstring
+
+    def joined(*arguments: Any) -> str | None:
+        text = read(*arguments)
+        return text and re.sub(r"(?<!\n)\n(?!\n)", " ", text)
+
+    _docstrings.get_field_docstring = joined
+    try:
+        yield
+    finally:
+        _docstrings.get_field_docstring = read
 
 
 @contextlib.contextmanager
@@ -50,25 +80,44 @@ def _columns(width: str) -> Iterator[None]:
             os.environ["COLUMNS"] = old
 
 
-def _unboxed(text: str, prog: str) -> str:
-    """What a boxed error of tyro says, in our words: `--batch-size: 'x' is not an int (see ... --help)`."""
+def short(argv: Sequence[str]) -> list[str]:
+    """``argv`` with the options of a dataset spelled as in ``data pack`` (--root), not as in pretrain (--data.root)."""
+    return [f"--{word.removeprefix('--data.')}" if word.startswith("--data.") else word for word in argv]
+
+
+def selectors(argv: list[str], names: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Take the options ``names`` (each with one value) out of ``argv``; return their values and the other words."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for name in names:
+        parser.add_argument(name, dest=name)
+    try:
+        found, rest = parser.parse_known_args(argv)
+    except argparse.ArgumentError as error:
+        raise ValueError(f"{error.argument_name}: expected a value after it") from None
+    return {name: value for name, value in vars(found).items() if value is not None}, rest
+
+
+def asks_help(argv: Sequence[str]) -> bool:
+    return bool({"-h", "--help"} & set(argv))
+
+
+def check_json(path: Path | None) -> None:
+    """ValueError if the file of a ``--json`` option cannot be written; called before the work begins."""
+    from mvitac.system.files import check_place
+
+    if path:
+        check_place(path)
+        if path.is_dir():
+            raise ValueError(f"--json {path} is a folder: give the name of a file")
+
+
+def _one_line(text: str, prog: str) -> str:
+    """A boxed error of tyro in our words, e.g. ``--batch-size: 'x' is not an int (see mvitac probe --help)``."""
     from mvitac.registry import unknown
 
-    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    # A frame of ╭─ title ─╮ and rules of ─ in a terminal; a title, an empty line and rules of - where it is ASCII only.
-    lines = [line.strip(" │|") for line in text.splitlines() if not re.match(r"\s*([╭╰├]|[│|]?\s*[-─]{3,})", line)]
-    lines = [line for line in lines if line and not line.startswith("For full helptext")]
-    if lines and lines[0] in (
-        "Value error",
-        "Missing argument",
-        "Invalid choice",
-        "Unrecognized options",
-        "Required options",
-    ):
-        lines = lines[1:]
+    whole = _unframed(text)
     see = f"(see mvitac {prog} --help)"
-    whole = " ".join(lines)
-    if found := re.match(r"Error parsing (?:run|data|session)?(?:\.[\w.]+)?: (.*)", whole):
+    if found := re.match(r"Error parsing (?!-)[\w.]*: (.*)", whole):
         return found[1]  # a config's own check, which names its field and what is allowed
     if found := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of (\(.*\))", whole):
         return f"{found[2]}: {unknown('choice', found[1], re.findall(chr(39) + '(.*?)' + chr(39), found[3]))}"
@@ -78,31 +127,30 @@ def _unboxed(text: str, prog: str) -> str:
         near = f"; did you mean {found[2]}?" if found[2] else ""
         return f"unknown option {found[1].replace(', ', ' ')}{near} {see}"
     if found := re.match(r"Error parsing (\S+): (.*?)(?: Argument helptext: (.*))?$", whole):
-        given = re.search(r"invalid literal for int\(\) with base 10: (.*)$", found[2])
-        if given:
-            what = f"{given[1]} is not an int"
-        elif given := re.match(r"could not convert string to float: (.*)$", found[2]):
-            what = f"{given[1]} is not a number"
-        elif "Exceeds the limit" in found[2]:
-            what = "a number of so many digits is too long"
-        elif given := re.search(r"(?:instantiated from|parse arguments) \[(.*?)\]", found[2]):
-            kind = re.search(r"(?:[A-Z]{3,}|\{\S+)(?: [A-Z]{3,})*", found[3] or "")  # FLOAT FLOAT, {None}|INT
-            what = f"{given[1]} is not {kind[0] if kind else 'possible'}"
-        else:
-            what = found[2]
-        return f"{found[1]}: {what} {see}"
+        return f"{found[1]}: {_wrong_value(found[2], found[3] or '')} {see}"
     if found := re.match(r"Missing from .*?: (.*)", whole):
         return f"missing {found[1].split(' (required)')[0]} {see}"
     return f"{whole} {see}"
 
 
-def selectors(argv: list[str], names: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Take the plain selectors out of ``argv``; what is left is for the chosen things' own fields."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name in names:
-        parser.add_argument(name, dest=name)
-    try:
-        found, rest = parser.parse_known_args(argv)
-    except argparse.ArgumentError as error:
-        raise ValueError(f"{error.argument_name}: expected a value after it") from None
-    return {name: value for name, value in vars(found).items() if value is not None}, rest
+def _unframed(text: str) -> str:
+    """The message inside tyro's frame: lines of ╭─ in a terminal, a title and rules of - where it is ASCII only."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    lines = [line.strip(" │|") for line in text.splitlines() if not re.match(r"\s*([╭╰├]|[│|]?\s*[-─]{3,})", line)]
+    lines = [line for line in lines if line and not line.startswith("For full helptext")]
+    titles = ("Value error", "Missing argument", "Invalid choice", "Unrecognized options", "Required options")
+    return " ".join(lines[1:] if lines and lines[0] in titles else lines)
+
+
+def _wrong_value(text: str, help_text: str) -> str:
+    """Why a value cannot be parsed; ``help_text`` of the option begins with its type."""
+    if found := re.search(r"invalid literal for int\(\) with base 10: (.*)$", text):
+        return f"{found[1]} is not an int"
+    if found := re.match(r"could not convert string to float: (.*)$", text):
+        return f"{found[1]} is not a number"
+    if "Exceeds the limit" in text:
+        return "a number of so many digits is too long"
+    if found := re.search(r"(?:instantiated from|parse arguments) \[(.*?)\]", text):
+        kind = re.search(r"(?:[A-Z]{3,}|\{\S+)(?: [A-Z]{3,})*", help_text)  # FLOAT FLOAT, {None}|INT
+        return f"{found[1]} is not {kind[0] if kind else 'possible'}"
+    return text

@@ -3,14 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated, Literal
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import tyro
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
 from tyro.conf import Positional
 
-from mvitac.cli.options import parse
+from mvitac.cli.options import check_json, parse
+from mvitac.data.pack import Pack
+from mvitac.deploy.artifact import load
+from mvitac.deploy.search import Index, build, check_pack, describe, embeddings
+from mvitac.system.files import brief, check_place, write_atomic, write_json
+from mvitac.system.progress import shown
 
-if TYPE_CHECKING:
-    import numpy as np
+_SIDE = 160
+"""Pixels: side of one picture in the sheet of what was found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,37 +30,26 @@ class _Embedding:
     pack: Positional[Path]
     """Folder of the pack."""
     model: str
-    """A run's or an artifact's folder, or owner/name on the Hub."""
+    """Folder of a run or an artifact, or owner/name on the Hub."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _EmbedOptions(_Embedding):
+    """Embeddings of every row of a pack, with ids, groups, splits and labels; NaN where a row lacks the image."""
+
+    out: Path
+    """The file: .npz (numpy) or .parquet."""
+    shared: bool = False
+    """Unit vectors of the space that both modalities share, instead of features."""
 
 
 def embed(argv: list[str]) -> None:
     """mvitac embed PACK --model M --out FILE.npz|FILE.parquet"""
-    import numpy as np
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-    from rich.console import Console
-
-    from mvitac.data.pack import Pack
-    from mvitac.deploy.artifact import load
-    from mvitac.deploy.search import check_pack, describe, embeddings
-    from mvitac.system.files import check_place, write_atomic
-    from mvitac.system.progress import shown
-
-    @dataclass(frozen=True, kw_only=True)
-    class Options(_Embedding):
-        """Embeddings of every row of a pack, with ids, groups, splits and labels; NaN where a row lacks the image."""
-
-        out: Path
-        """The file: .npz (numpy) or .parquet."""
-        shared: bool = False
-        """The unit vectors of the space that both modalities share, instead of features."""
-
-    options = parse(Options, argv, "embed")
+    options = parse(_EmbedOptions, argv, "embed")
     if options.out.suffix not in (".npz", ".parquet"):
         raise ValueError(f"--out {options.out}: give a name that ends in .npz or .parquet")
     check_place(options.out)
     model, pack = load(options.model), Pack(options.pack)
-    table = describe(pack, np.arange(pack.num))
     found = {}
     for m in check_pack(model, pack):
         rows = np.flatnonzero(pack.has(m))
@@ -56,122 +57,116 @@ def embed(argv: list[str]) -> None:
             x = np.concatenate(list(embeddings(model, pack, m, rows, shared=options.shared)))
         found[m] = np.full((pack.num, x.shape[1]), np.nan, np.float32)
         found[m][rows] = x
-    if options.out.suffix == ".npz":
+    _write(options.out, describe(pack, np.arange(pack.num)), found)
+    print(f"{options.out}: {', '.join(f'{m} {x.shape}' for m, x in found.items())}")
+
+
+def _write(out: Path, table: pa.Table, found: dict[str, np.ndarray]) -> None:
+    """Embeddings [N, D] by modality beside ``table``, as .npz or .parquet."""
+    if out.suffix == ".npz":
         columns = {name: np.array(table.column(name).to_pylist()) for name in table.column_names}
-        write_atomic(options.out, lambda file: np.savez(file, **columns, **found))  # type: ignore[arg-type]
-    else:
-        for m, x in found.items():
-            table = table.append_column(m, pa.FixedSizeListArray.from_arrays(x.reshape(-1), x.shape[1]))
-        write_atomic(options.out, lambda file: pq.write_table(table, file))
-    shapes = ", ".join(f"{m} {x.shape}" for m, x in found.items())
-    Console(markup=False).print(f"{options.out}: {shapes}", soft_wrap=True, highlight=False)
+        write_atomic(out, lambda file: np.savez(file, **columns, **found))  # type: ignore[arg-type]
+        return
+    for m, x in found.items():
+        table = table.append_column(m, pa.FixedSizeListArray.from_arrays(x.reshape(-1), x.shape[1]))
+    write_atomic(out, lambda file: pq.write_table(table, file))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _IndexOptions(_Embedding):
+    """Index the pairs of a pack, to find the nearest known touches and pictures with mvitac find."""
+
+    out: Path
+    """The new folder."""
+    splits: tuple[str, ...] = ()
+    """Only these splits (train, val, test, unlabelled); none given = all."""
 
 
 def index(argv: list[str]) -> None:
     """mvitac index PACK --model M --out DIR"""
-    from rich.console import Console
-
-    from mvitac.data.pack import Pack
-    from mvitac.deploy.artifact import load
-    from mvitac.deploy.search import build
-    from mvitac.system.progress import shown
-
-    @dataclass(frozen=True, kw_only=True)
-    class Options(_Embedding):
-        """Index the pairs of a pack, to find the nearest known touches and pictures with mvitac find."""
-
-        out: Path
-        """The new folder."""
-        splits: tuple[str, ...] = ()
-        """Only these splits (train, val, test, unlabelled); none given = all."""
-
-    options = parse(Options, argv, "index")
+    options = parse(_IndexOptions, argv, "index")
     with shown(Console(stderr=True)):
         made = build(load(options.model), Pack(options.pack), options.out, options.splits)
     shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
-    Console(markup=False).print(
-        f"{options.out}: {shapes}, space: {made.meta['space']}", soft_wrap=True, highlight=False
-    )
+    print(f"{options.out}: {shapes}, space: {made.meta['space']}")
 
 
-def _picture(files: Sequence[Path]) -> "np.ndarray":
-    """One RGB picture [H, W, 3 x files], the files' side by side in channels at the first one's size."""
-    import numpy as np
-    from PIL import Image
+@dataclass(frozen=True, kw_only=True)
+class _FindOptions:
+    """The nearest known pairs to a picture, by exact cosine in the space that vision and touch share."""
 
-    from mvitac.system.files import brief
+    image: Positional[tuple[Path, ...]]
+    """Picture files; a two-sensor touch is two files, left then right."""
+    index: Annotated[Path, tyro.conf.arg(name="in")]
+    """Folder of the index."""
+    source: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="from")] = "touch"
+    """Modality of the picture."""
+    target: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="to")] = "vision"
+    """Modality to compare it with."""
+    background: tuple[Path, ...] = ()
+    """For a model of difference images: the touch sensor without contact, as many files as the picture. Without it the
+    picture must be a difference image already."""
+    k: int = 5
+    """How many to find."""
+    json: Path | None = None
+    """Also write what was found to this file."""
+    picture: Path | None = None
+    """Also draw the query and what was found into this PNG (needs the indexed pack at its old path)."""
 
+
+def find(argv: list[str]) -> None:
+    """mvitac find IMAGE --in INDEX [--from touch] [--to vision] [--json FILE]"""
+    options = parse(_FindOptions, argv, "find")
+    if not options.image:
+        raise ValueError("name the picture to search for: mvitac find IMAGE --in INDEX")
+    check_json(options.json)
+    if options.picture:
+        check_place(options.picture)
+    index = Index(options.index)
+    query = _picture(options.image)
+    background = _picture(options.background) if options.background else None
+    rows, scores = index.find(index.model(), query, options.source, options.target, options.k, background=background)
+    found = [
+        {
+            "cosine": round(float(score), 6),
+            **{name: str(index.table.column(name)[row]) for name in ("id", "group")},
+            "row": index.table.column("row")[row].as_py(),
+            "labels": index.labels(row),
+        }
+        for row, score in zip(rows[0].tolist(), scores[0], strict=True)
+    ]
+    table = Table(title=f"{options.source} -> {options.target} in {options.index}", title_justify="left")
+    for column in ("cosine", "id", "group", *index.meta["classes"]):
+        table.add_column(column)
+    for one in found:
+        labels = (one["labels"].get(task, "") for task in index.meta["classes"])
+        table.add_row(f"{one['cosine']:.3f}", one["id"], one["group"], *labels)
+    Console(markup=False).print(table)
+    if options.json:
+        write_json(options.json, {"from": options.source, "to": options.target, "found": found})
+    if options.picture:
+        _draw(options.picture, query, index, options.target, [one["row"] for one in found])
+
+
+def _picture(files: Sequence[Path]) -> np.ndarray:
+    """One RGB picture [H, W, 3 x files]: the files stacked in channels, at the size of the first one."""
     parts: list[Image.Image] = []
     for file in files:
         try:
             with Image.open(file) as opened:
                 parts.append(opened.convert("RGB"))
-        except Exception as error:  # Pillow has a kind for each damage
+        except Exception as error:  # Pillow has an exception for each kind of damage
             raise ValueError(f"{file} cannot be read as a picture ({brief(error)}): give another") from None
     return np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
 
 
-def find(argv: list[str]) -> None:
-    """mvitac find IMAGE --in INDEX [--from touch] [--to vision]"""
-    from typing import Annotated, Literal
-
-    import numpy as np
-    import tyro
-    from PIL import Image
-    from rich.console import Console
-    from rich.table import Table
-
-    from mvitac.data.pack import Pack
-    from mvitac.deploy.search import Index
-    from mvitac.system.files import check_place, write_atomic
-
-    @dataclass(frozen=True, kw_only=True)
-    class Options:
-        """The nearest known pairs to a picture, by exact cosine in the space that vision and touch share."""
-
-        image: Positional[tuple[Path, ...]]
-        """Picture files; a two-sensor touch is two files, left then right."""
-        index: Annotated[Path, tyro.conf.arg(name="in")]
-        """Folder of the index."""
-        source: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="from")] = "touch"
-        """What the picture is."""
-        target: Annotated[Literal["touch", "vision"], tyro.conf.arg(name="to")] = "vision"
-        """What to compare it with."""
-        background: tuple[Path, ...] = ()
-        """For a model of difference images: the touch sensor without contact, as many files as the picture. Without it the
-        picture is a difference image already."""
-        k: int = 5
-        """How many to find."""
-        picture: Path | None = None
-        """Also draw the query and what was found into this PNG (needs the indexed pack where it was)."""
-
-    options = parse(Options, argv, "find")
-    if not options.image:
-        raise ValueError("say what to find: mvitac find IMAGE --in INDEX")
-    if options.picture:
-        check_place(options.picture)
-    index = Index(options.index)
-    model = index.model()
-    query = _picture(options.image)
-    free = _picture(options.background) if options.background else None
-    rows, scores = index.find(model, query, options.source, options.target, options.k, background=free)
-    table = Table(title=f"{options.source} -> {options.target} in {options.index}", title_justify="left")
-    for column in ("cosine", "id", "group", *index.meta["classes"]):
-        table.add_column(column)
-    for row, score in zip(rows[0].tolist(), scores[0], strict=True):
-        labels = index.labels(row)
-        own = [str(index.table.column(name)[row]) for name in ("id", "group")]
-        table.add_row(f"{score:.3f}", *own, *(labels.get(task, "") for task in index.meta["classes"]))
-    Console(markup=False).print(table)
-    if options.picture:
-        pack = Pack(index.meta["pack"], verify=False)
-        if pack.digest != index.meta["pack_digest"]:
-            raise ValueError(f"{pack.path} is another pack than the one that was indexed: index it again")
-        side = 160
-        sheet = Image.new("RGB", (side * (len(rows[0]) + 1), side), "white")
-        tiles = [query, *(pack.images[options.target][index.table.column("row")[r].as_py()] for r in rows[0].tolist())]
-        for i, tile in enumerate(tiles):
-            sheet.paste(
-                Image.fromarray(np.ascontiguousarray(tile[..., :3])).resize((side - 4, side - 4)), (i * side, 2)
-            )
-        write_atomic(options.picture, lambda file: sheet.save(file, "PNG"))
+def _draw(out: Path, query: np.ndarray, index: Index, target: str, rows: Sequence[int]) -> None:
+    """A PNG of the query and the ``target`` images in ``rows`` of the indexed pack, side by side."""
+    pack = Pack(index.meta["pack"], verify=False)
+    if pack.digest != index.meta["pack_digest"]:
+        raise ValueError(f"{pack.path} is another pack than the one that was indexed: index it again")
+    sheet = Image.new("RGB", (_SIDE * (len(rows) + 1), _SIDE), "white")
+    for i, tile in enumerate([query, *(pack.images[target][row] for row in rows)]):
+        picture = Image.fromarray(np.ascontiguousarray(tile[..., :3])).resize((_SIDE - 4, _SIDE - 4))
+        sheet.paste(picture, (i * _SIDE, 2))
+    write_atomic(out, lambda file: sheet.save(file, "PNG"))

@@ -23,6 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mvitac.data import notebook
 from mvitac.data.jpeg import Jpegs, Lazy
 from mvitac.data.spec import DataSpec
 from mvitac.registry import from_json, unknown
@@ -113,6 +114,12 @@ class Pack:
         except ValueError as error:
             raise ValueError(f"{self.path / name}: {error} (make the pack again)") from None
         return table
+
+    def __repr__(self) -> str:
+        return f"Pack({str(self.path)!r}: {self.num} rows of {self.spec.name} at {self.size} px)"
+
+    def _repr_html_(self) -> str:
+        return notebook.pack_html(self)
 
     @property
     def digest(self) -> str:

@@ -23,6 +23,8 @@ class DatasetConfig(Registered, ABC):
 
     local: ClassVar[tuple[str, ...]] = ("workers",)
     """Options that do not affect the result."""
+    phased: ClassVar[bool] = False
+    """Whether rows of a touch group show phases of a grasp (before, during, after) instead of repeated touches."""
 
     size: int = 256
     """Side of the stored images in pixels; crops are taken from them (paper: 256)."""
@@ -35,6 +37,11 @@ class DatasetConfig(Registered, ABC):
 
     def __post_init__(self) -> None:
         check_request(self.size, self.workers, store=self.store, quality=self.quality)
+
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        """Fields that do not change the outcome of a run: local options, and how raw pixels would be compressed."""
+        return (*self.local, "store", "quality") if self.store == "raw" else self.local
 
     @abstractmethod
     def source(self) -> Source:

@@ -126,6 +126,7 @@ class GraspsConfig(SimulatedConfig):
     """Simulated two-finger grasps of 106 objects, before, during and after the lift, labelled by success."""
 
     name: ClassVar[str] = "grasps"
+    phased: ClassVar[bool] = True
 
     num: int = 5300
     """Number of grasps; each gives three rows (before, during, after)."""

@@ -1,4 +1,4 @@
-"""The artifact: one folder that holds a trained model and everything needed to use it right.
+"""The artifact: one folder with a trained model and everything needed to use it correctly.
 
     <artifact>/artifact.json       format, preprocessing, probes with class names and scores, data, digests
                model.safetensors   encoders and heads into the shared space
@@ -6,8 +6,8 @@
                run.json            provenance: method, data, optimiser, seed, versions, commit
                README.md           the model card
 
-``load`` takes a run's folder, an artifact or an id on the Hugging Face Hub. Nothing is ever unpickled; every file is
-checked against its digest before it is parsed; a file that artifact.json may not name is never opened.
+``load`` takes a run's folder, an artifact or an id on the Hugging Face Hub. Nothing is unpickled, every file is checked
+against its digest before it is parsed, and no file with another name is opened.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ MANIFEST = "artifact.json"
 FILES = ("model.safetensors", "probes.safetensors", "run.json", "README.md")
 """The only names an artifact may use."""
 PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".npy", ".npz", ".joblib")
-"""Files that some program may unpickle; an artifact has none, so one that does was tampered with."""
+"""Suffixes of files that some program may unpickle. An artifact has none: one that does was changed."""
 MAX_HEADER, MAX_MANIFEST = 4 << 20, 1 << 20
-"""Bytes: a ResNet's safetensors header takes some 20 kB; a header of gigabytes is an attack on memory."""
+"""Maximum bytes: the safetensors header of a ResNet takes some 20 kB; one of gigabytes would fill the memory."""
 AS_GIVEN = "none is subtracted: tactile images are used as the sensor gives them"
 SUBTRACTED = (
     "subtracted: touch is (touch - background) / 2 + 128, the background being what the sensor shows without contact;"
@@ -48,21 +48,26 @@ HUB_ID = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(@(?P<revis
 class PublishedModel(Model, ModelHubMixin):
     """A model from an artifact, with the Hub's usual ``from_pretrained``, ``save_pretrained`` and ``push_to_hub``.
 
-    What goes up is the artifact as it was published, file by file; what comes down is checked as a local one is.
+    An upload copies the artifact file by file; a download is checked like a local artifact.
     """
 
     def __init__(self, model: Model, folder: Path) -> None:
         nn.Module.__init__(self)
         self.__dict__.update(vars(model))
         self.folder = folder
-        self._hub_mixin_config = None  # run.json and artifact.json say it all: no config.json beside them
+        self._hub_mixin_config = None  # run.json and artifact.json hold all of it: no config.json
 
     @classmethod
     def from_pretrained(
         cls, pretrained_model_name_or_path: str | Path, *, revision: str | None = None, **options: Any
     ) -> PublishedModel:
-        """The artifact in a folder, or of "owner/name" on the Hub; ``options`` as ``snapshot_download`` has them (token,
-        cache_dir, local_files_only, force_download)."""
+        """The artifact in a folder, or of "owner/name" on the Hub.
+
+        Args:
+            pretrained_model_name_or_path: folder or Hub id.
+            revision: branch, tag or commit on the Hub.
+            options: those of ``huggingface_hub.snapshot_download`` (token, cache_dir, local_files_only, force_download).
+        """
         local = Path(pretrained_model_name_or_path)
         return read(local if local.is_dir() else pull(str(pretrained_model_name_or_path), revision, **options))
 
@@ -72,34 +77,42 @@ class PublishedModel(Model, ModelHubMixin):
 
 
 def load(path: str | Path) -> Model:
-    """A trained model, in eval mode, from a run's folder, an artifact's folder, or "owner/name[@revision]" on the Hub.
+    """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
-    From an artifact it comes with its probes (``Model.predict``). Only a ``str`` whose folder is not here is looked up
-    on the Hub. ValueError says what is wrong with what was found.
+    Args:
+        path: folder of a run or an artifact, or "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is
+            no folder here is looked up on the Hub.
+
+    Raises:
+        ValueError: nothing is there, or it is damaged.
+
+    Example:
+        model = mvitac.load("artifacts/first")
+        probabilities = model.predict(vision=photo, touch=press)
     """
     local = Path(path)
     found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
-    # "runs/frist" beside a folder runs/ is a slip of the keyboard, not somebody's repository.
+    # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
     if found and not local.exists() and not local.parent.is_dir():
         return read(pull(found["repo"], found["revision"]))
     return read(local) if (local / MANIFEST).is_file() else models.load(local)
 
 
 def pull(repo: str, revision: str | None = None, **options: Any) -> Path:
-    """The artifact ``repo`` from the Hugging Face Hub, in its local cache; only an artifact's own files are fetched."""
+    """Download the artifact ``repo`` into the local cache of the Hub; only files that an artifact may have are fetched."""
     from huggingface_hub import snapshot_download
 
     try:
         return Path(snapshot_download(repo, revision=revision, allow_patterns=[MANIFEST, *FILES], **options))
-    except Exception as error:  # offline, not found, no access: the client has a kind for each
+    except Exception as error:  # offline, not found, no access: the client has an exception for each
         raise ValueError(
-            f"there is no folder {repo} here, and it could not be had from the Hugging Face Hub ({brief(error)}):"
+            f"there is no folder {repo} here, and it could not be downloaded from the Hugging Face Hub ({brief(error)}):"
             " give the folder of a run or an artifact, or check the id, the network and the login (`hf auth login`)"
         ) from None
 
 
 def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]:
-    """What stands between a camera's frame and the encoders, in words and numbers."""
+    """Description of the preprocessing from a camera's frame to the encoders' input, JSON-ready."""
     return {
         "input": "uint8 RGB [H, W, C]; OpenCV's frames are BGR: reverse their channels",
         "colour_order": "RGB",
@@ -116,7 +129,7 @@ def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]
 
 
 def read(folder: Path) -> PublishedModel:
-    """The model in the artifact ``folder``, with its probes; ValueError if anything is not as it was published."""
+    """The model in the artifact ``folder``, with its probes; ValueError if anything was changed since it was published."""
     manifest = read_manifest(folder)
     model = models.load(folder / "model.safetensors")
     asked, given = preprocessing(model), manifest["preprocessing"]
@@ -131,7 +144,7 @@ def read(folder: Path) -> PublishedModel:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """artifact.json of ``folder`` after every file it names was checked; ValueError otherwise."""
+    """artifact.json of ``folder``, after checking every file that it names; ValueError otherwise."""
     path = folder / MANIFEST
     if path.is_file() and path.stat().st_size > MAX_MANIFEST:
         raise ValueError(f"{path} has {path.stat().st_size} bytes: no artifact needs more than {MAX_MANIFEST}, refused")
@@ -166,7 +179,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def seal(manifest: dict[str, Any]) -> str:
-    """The digest that a manifest carries of the rest of itself."""
+    """The digest of a manifest without its own ``digest`` field."""
     return digest({key: value for key, value in manifest.items() if key != "digest"})
 
 

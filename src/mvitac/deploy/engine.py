@@ -1,11 +1,11 @@
-"""Run an export where the robot is: numpy in, numpy out, one engine; no torch unless the engine is torch.
+"""Run an export on the robot: numpy in, numpy out; no torch unless the engine is torch.
 
     <export>/export.json          inputs, outputs, classes, preprocessing, digests, the report of how it was checked
              model.onnx           or model.xml and model.bin (OpenVINO), or model.pt2 (torch.export)
-             check.safetensors    a few real inputs and what the trained model made of them
+             check.safetensors    a few real inputs and the outputs of the trained model for them
 
 ``Engine(folder)`` verifies the digests and repeats those few inputs on this machine before the first prediction.
-Pickles in a torch export are refused; torch calls its format unsafe all the same, so open only those you trust.
+Pickles in a torch export are refused. torch still calls its format unsafe, so open only exports that you trust.
 """
 
 from __future__ import annotations
@@ -29,22 +29,27 @@ TORCH_MEMBERS = re.compile(
     r"data/weights/(weight_\d+|model_weights_config\.json)|data/constants/(tensor_\d+|model_constants_config\.json)"
     r"|data/sample_inputs/model\.pt|models/model\.json|archive_format|archive_version|byteorder|\.data/\w+"
 )
-"""What torch.export writes of a model; compiled libraries and pickled objects, which it would run, are not among it."""
+"""Files that torch.export writes of a model; not among them: compiled libraries and pickled objects, which it would run."""
 Images = Mapping[str, np.ndarray]
 Call = Callable[[list[np.ndarray]], list[np.ndarray]]
 
 
 class Engine:
-    """An export, opened: call it with uint8 [B, S, S, C] by modality, get float32 [B, ...] by output name."""
+    """An opened export: call it with uint8 [B, S, S, C] by modality to get float32 [B, ...] by output name.
+
+    Example:
+        engine = Engine("exports/first")
+        probabilities = engine(vision=photos, touch=presses)["probability_category"]   # [B, K]
+    """
 
     def __init__(self, folder: str | Path, *, threads: int = 0) -> None:
-        """``threads``: CPU threads (0 = all cores). ValueError if anything differs from what was exported."""
+        """``threads``: CPU threads, 0 = all cores. ValueError if a file or an output differs from the export's."""
         folder = Path(folder)
         self.meta = read_manifest(folder)
         self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
         self.classes: dict[str, list[str]] = self.meta["classes"]
         self.difference: bool = self.meta["preprocessing"].get("difference", False)
-        """Whether touch is to be given as (touch - background) / 2 + 128."""
+        """Whether the touch input is (touch - background) / 2 + 128."""
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})
@@ -55,12 +60,12 @@ class Engine:
                 if self.meta["int8"] and self.meta["report"].get("target") != "avx2":
                     again = ", with --target avx2 if this CPU has no VNNI"
                 raise ValueError(
-                    f"{folder}: on this machine {name} has cosine {least:.4f} to what the trained model gave,"
+                    f"{folder}: on this machine {name} has cosine {least:.4f} to the output of the trained model,"
                     f" at least {self.meta['tolerance']['min_cosine']} is allowed: export it again{again}"
                 )
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
-        """Outputs of one batch; ValueError names an input that is missing, unknown or of a foreign shape."""
+        """Outputs of one batch; ValueError names an input that is missing, unknown or of another shape."""
         if images.keys() != self.inputs.keys():
             raise ValueError(f"this export takes {', '.join(self.inputs)}; got {', '.join(images) or 'nothing'}")
         for name, shape in self.inputs.items():
@@ -72,7 +77,7 @@ class Engine:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """export.json of ``folder`` after every file was checked against its digest."""
+    """export.json of ``folder``, after checking every file against its digest."""
     meta = read_json(folder / MANIFEST, "an export's description")
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         raise ValueError(f"{folder / MANIFEST} does not describe an export: give a folder `mvitac export` wrote")
@@ -96,7 +101,7 @@ def open_engine(folder: Path, kind: str, precision: str = "fp32", threads: int =
         return {"torch": _torch, "onnx": _onnx, "openvino": _openvino}[kind](path, precision, threads)
     except ImportError as error:
         raise ValueError(f"{path} needs {error.name}: pip install 'mvitac[export]'") from None
-    except Exception as error:  # each engine has its own kinds
+    except Exception as error:  # each engine has its own exceptions
         raise ValueError(f"{path} cannot be opened ({brief(error)}): export it again") from None
 
 
@@ -112,7 +117,7 @@ def _onnx(path: Path, precision: str, threads: int) -> Call:
 
 
 def lists_bf16(core: Any) -> bool:
-    """Whether OpenVINO (an ``openvino.Core``) says that this CPU computes bf16; where it does not, fp32 is used."""
+    """Whether OpenVINO (an ``openvino.Core``) lists bf16 for this CPU; where it does not, fp32 is used."""
     return "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
@@ -129,7 +134,7 @@ def _openvino(path: Path, precision: str, threads: int) -> Call:
 
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
         found = request.infer(arrays, share_inputs=True)
-        return [np.array(found[i]) for i in range(len(found))]  # the engine reuses its own buffers
+        return [np.array(found[i]) for i in range(len(found))]  # the engine reuses its buffers
 
     return call
 
@@ -141,7 +146,7 @@ def _torch(path: Path, precision: str, threads: int) -> Call:
         for name in archive.namelist():
             if not TORCH_MEMBERS.fullmatch(name.partition("/")[2]):
                 raise ValueError(f"it holds {name!r}, which mvitac does not write and which may be a program: refused")
-    # Else torch falls back to unpickling whatever it finds.
+    # Without this torch falls back to unpickling.
     forced = os.environ.get("TORCH_FORCE_WEIGHTS_ONLY_LOAD")
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     try:

@@ -1,4 +1,4 @@
-"""The whole road from pixels to probabilities as one module: uint8 in, resizing and normalisation inside.
+"""From pixels to probabilities in one module: uint8 in, resizing and normalisation inside.
 
 Shapes: B images, S stored side, C channels (3, or 6 for two sensors), D features, E shared space, K classes.
 Inputs: one uint8 [B, S, S, C] RGB per modality, as a pack stores them. Outputs, by ``ExportModule.outputs``:
@@ -17,7 +17,7 @@ from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 
 class ExportModule(nn.Module):
-    """What is exported. Its arithmetic is written anew, so that comparing it with ``Model.features`` is a real check."""
+    """The exported module. It shares no preprocessing code with ``Model.features``, so comparing them is a check."""
 
     filter: Tensor
     head_filter: Tensor
@@ -25,7 +25,7 @@ class ExportModule(nn.Module):
     shift: Tensor
 
     def __init__(self, model: Model, modalities: tuple[str, ...] | None = None) -> None:
-        """``modalities``: the inputs it is to have; None = all the model has. ValueError where the model lacks one."""
+        """``modalities``: its inputs; None = all the model has. ValueError if the model lacks one."""
         super().__init__()
         self.modalities = modalities or tuple(model.encoders)
         for modality in self.modalities:
@@ -43,9 +43,8 @@ class ExportModule(nn.Module):
             + [f"probability_{task}" for task in self.classes]
         )
         sides = model.run.augment
-        self.twice = (
-            bool(self.projectors) and sides.size != sides.eval_size
-        )  # heads want views of the side they learned from
+        # Heads need views of the size they were trained on.
+        self.twice = bool(self.projectors) and sides.size != sides.eval_size
         self.register_buffer("filter", _filter(sides.eval_size, model.stored))
         self.register_buffer("head_filter", _filter(sides.size, model.stored) if self.twice else torch.empty(0))
         mean, std = (torch.tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
@@ -74,9 +73,9 @@ class ExportModule(nn.Module):
 
 
 def _filter(size: int, stored: int) -> Tensor:
-    """[size, stored]: antialiased bilinear resizing is linear along each axis, so one matrix, read off the identity.
+    """[size, stored]: antialiased bilinear resizing is linear along each axis, so it is one matrix, the resized identity.
 
-    In the 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel comes out the same.
+    Rounded to the 16-bit fixed-point weights of torch's uint8 kernel, so that every pixel is the same.
     """
     rows = F.interpolate(torch.eye(stored)[None, None], (size, stored), mode="bilinear", antialias=True)[0, 0]
     step = 2.0 ** max(p for p in range(24) if (rows.max() * 2**p).round() < 2**15)

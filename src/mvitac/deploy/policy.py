@@ -1,4 +1,4 @@
-"""Trained encoders as the observation encoder of a robot policy: a dict of images in, one feature vector out.
+"""Trained encoders as the observation encoder of a robot policy: from a dict of images to one feature vector.
 
     encoder = ObservationEncoder(mvitac.load("runs/demo/seed0"), {"observation.images.wrist": "vision",
                                                                   "observation.images.gel": "touch"})
@@ -24,17 +24,22 @@ STATE = "observation.state"
 class ObservationEncoder(nn.Module):
     """Features [B, D] (or [B, T, D]) of an observation, in the order of ``keys``, with the robot's state at the end.
 
-    Touch is what the model learned from: where ``model.spec.difference``, (touch - background) / 2 + one half.
+    A model of difference images (``model.spec.difference``) takes touch as (touch - background) / 2 + one half.
     """
 
     mean: Tensor
     std: Tensor
 
     def __init__(self, model: Model, keys: Mapping[str, str], *, state: int = 0, tune: bool = False) -> None:
-        """``keys``: observation key -> modality. Two gels of one gripper are two keys of "touch", left first.
+        """
+        Args:
+            model: a trained model.
+            keys: modality of each observation key. Two gels of one gripper are two keys of "touch", left first.
+            state: length of "observation.state" to append; 0 = none.
+            tune: let the policy's loss train the encoders (BatchNorm keeps its statistics); otherwise they are frozen.
 
-        ``state``: length of "observation.state" to append; 0 = none. ``tune``: let the policy's loss train the encoders too
-        (BatchNorm keeps its statistics all the same); otherwise they are frozen. ValueError names what does not fit.
+        Raises:
+            ValueError: a modality or the number of its keys does not fit the model.
         """
         super().__init__()
         self.keys: dict[str, list[str]] = {}
@@ -52,20 +57,20 @@ class ObservationEncoder(nn.Module):
         self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.eval_size, state, tune
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
-        self._looked: set[str] = set()
+        self._checked: set[str] = set()
         self.encoders.requires_grad_(tune)
         self.encoders.eval()
         features = (int(e.num_features) for e in self.encoders.values())  # type: ignore[arg-type]
         self.out_features = sum(features) + state
 
     def train(self, mode: bool = True) -> ObservationEncoder:
-        """As for any module, but the encoders stay in eval mode: a policy's small batches would spoil their BatchNorm."""
+        """As for any module, but the encoders stay in eval mode: small batches of a policy would spoil their BatchNorm."""
         super().train(mode)
         self.encoders.eval()
         return self
 
     def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
-        """ValueError names a key that is missing or has a foreign shape."""
+        """Features of a batch of observations; ValueError names a key that is missing or has another shape."""
         found, lead = [], ()
         for modality, names in self.keys.items():
             views = []
@@ -94,8 +99,8 @@ class ObservationEncoder(nn.Module):
         return observation[name]
 
     def _check_range(self, name: str, image: Tensor) -> None:
-        """The first images of a key only: looking at all would make a GPU wait for each."""
-        if name in self._looked:
+        """Check the first images of a key only: each check makes a GPU wait."""
+        if name in self._checked:
             return
         low, high = (float(x) for x in image.aminmax())
         if image.dtype != torch.uint8 and not (low >= -1e-3 and high <= 1 + 1e-3):
@@ -103,10 +108,10 @@ class ObservationEncoder(nn.Module):
                 f"{name}: expected floats in [0, 1] or uint8, got {image.dtype} from {low:.3g} to {high:.3g}: the encoder"
                 " normalises images itself, give them as they come from the camera"
             )
-        self._looked.add(name)
+        self._checked.add(name)
 
     def _view(self, image: Tensor) -> Tensor:
-        """Normalised [N, 3, size, size], resized in the two steps that training took."""
+        """Normalised [N, 3, size, size], resized in two steps as in training."""
         x = image.float() / 255 if image.dtype == torch.uint8 else image.float()
         for side in (self.stored, self.size):
             if x.shape[-2:] != (side, side):

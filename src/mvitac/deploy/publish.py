@@ -1,4 +1,4 @@
-"""Runs -> artifacts: fit the probes on a finished run's data, describe everything, write one folder, push it to the Hub."""
+"""Publish runs: fit the probes on a finished run's data, write one artifact folder, and push it to the Hub."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from mvitac.system.progress import work
 
 
 def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
-    """The linear probe of every task and modality of ``pack``, fitted and scored exactly as ``mvitac probe`` does.
+    """The linear probe of every task and modality of ``pack`` by name, fitted and scored exactly as by ``mvitac probe``.
 
-    Tasks without labelled rows in train and test have none: what cannot be scored is not published.
+    A task without labelled rows in train and test has none: a probe that cannot be scored is not published.
     """
     readouts = {}
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
@@ -70,7 +70,7 @@ def _fit_readout(model: Model, pack: Pack, task: Task, source: str, modalities: 
 
 
 def own_data(model: Model, instead: str) -> Pack:
-    """The data ``model`` was trained on; ValueError says what to do ``instead`` where it is not at hand."""
+    """The data ``model`` was trained on; the ValueError where it is missing ends with ``instead``, what to do."""
     try:
         return model.run.data.open()
     except ValueError as error:
@@ -78,16 +78,25 @@ def own_data(model: Model, instead: str) -> Pack:
 
 
 def with_readouts(model: Model, pack: Pack | None = None) -> Model:
-    """``model`` with probes: an artifact's own, else fitted on ``pack`` or, without one, on the run's own data."""
+    """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack`` (default: the run's data)."""
     if not model.readouts:
         model.readouts = fit_readouts(model, pack or model.run.data.open())
     return model
 
 
 def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
-    """Write the artifact of the finished ``run`` into the new folder ``out`` and return it.
+    """Write the artifact of a finished run.
 
-    ``pack`` fits the probes on other data than the run was trained on. The result was loaded once before it is shown.
+    Args:
+        run: the run's folder.
+        out: the new folder.
+        pack: data to fit the probes on (default: the data the run was trained on).
+
+    Returns:
+        ``out``. The artifact was loaded once, as a check, before it got this name.
+
+    Raises:
+        ValueError: ``out`` exists or cannot be written, or the run or its data is missing.
     """
     if out.exists():
         raise ValueError(f"{out} already exists: choose another place, or delete it first")
@@ -99,26 +108,9 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        model.save(partial / "model.safetensors")
+        _write_weights(model, partial)
         write_json(partial / "run.json", record)
-        if model.readouts:
-            tensors = {f"{r.question.name}.{k}": v for r in model.readouts.values() for k, v in r.state_dict().items()}
-            data = safetensors.torch.save(tensors)
-            write_atomic(partial / "probes.safetensors", lambda file: file.write(data))
-        sensors = sorted(set(pack.column("sensor").astype(str))) if "sensor" in pack.table.column_names else []
-        manifest: dict[str, Any] = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "preprocessing": preprocessing(model, tuple(sensors)),
-            "probes": [to_json(r.question) for r in model.readouts.values()],
-            "data": {
-                "name": pack.spec.name,
-                "licence": pack.spec.licence,
-                "source": pack.spec.source,
-                "digest": pack.digest,
-            },
-            "trained_on": {key: getattr(model.spec, key) for key in ("name", "licence", "source")},
-        }
+        manifest = _describe(model, pack)
         write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
         write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})
@@ -129,15 +121,36 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
     return out
 
 
+def _write_weights(model: Model, folder: Path) -> None:
+    model.save(folder / "model.safetensors")
+    if model.readouts:
+        tensors = {f"{r.question.name}.{k}": v for r in model.readouts.values() for k, v in r.state_dict().items()}
+        data = safetensors.torch.save(tensors)
+        write_atomic(folder / "probes.safetensors", lambda file: file.write(data))
+
+
+def _describe(model: Model, pack: Pack) -> dict[str, Any]:
+    """artifact.json without its files and digest."""
+    sensors = sorted(set(pack.column("sensor").astype(str))) if "sensor" in pack.table.column_names else []
+    keys = ("name", "licence", "source")
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "preprocessing": preprocessing(model, tuple(sensors)),
+        "probes": [to_json(r.question) for r in model.readouts.values()],
+        "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},
+        "trained_on": {key: getattr(model.spec, key) for key in keys},
+    }
+
+
 def card(model: Model, manifest: dict[str, Any]) -> str:
-    """The model card (Markdown with the Hub's front matter)."""
-    data, given, learned = manifest["data"], manifest["preprocessing"], manifest["trained_on"]
-    run = model.run
+    """The model card: Markdown with the Hub's front matter."""
+    data, learned = manifest["data"], manifest["trained_on"]
     sets = {"Encoders and probes": learned}
     if learned != {key: data[key] for key in learned}:
         sets = {"Encoders": learned, "Probes": data}
     licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
-    lines = [
+    header = [
         "---",
         "library_name: mvitac",
         "tags: [tactile, robotics, self-supervised, visual-tactile]",
@@ -145,11 +158,26 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
         f"license_name: {json.dumps('weights: as their owner says; trained on data under: ' + licences)}",
         "---",
         "",
-        f"# {run.method.name} on {learned['name']}",
+    ]
+    end = [
+        "## Data",
+        "",
+        *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
+        "The configuration, library versions and commit are in run.json.",
+        "",
+    ]
+    return "\n".join([*header, *_about(model, learned["name"], data["name"]), *_usage(manifest["preprocessing"]), *end])
+
+
+def _about(model: Model, learned: str, data: str) -> list[str]:
+    """The part of the model card on the model: what it is, an example, scores, classes."""
+    run = model.run
+    lines = [
+        f"# {run.method.name} on {learned}",
         "",
         f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}),"
         f" {'trained with labels' if model.tasks else 'pre-trained without labels'} by"
-        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes on {data['name']}.",
+        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes on {data}.",
         "",
         "```python",
         "import mvitac",
@@ -159,7 +187,7 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
         "",
         "## Scores",
         "",
-        "Accuracy on rows of groups that neither encoders nor probes saw, beside always saying the commonest class.",
+        "Accuracy on rows of groups that neither encoders nor probes saw; majority is always the most frequent class.",
         "",
         "| task | from | accuracy % | majority % | test rows |",
         "|---|---|---:|---:|---:|",
@@ -167,36 +195,32 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
     for readout in model.readouts.values():
         q = readout.question
         lines.append(f"| {q.task} | {q.modality} | {100 * q.accuracy:.1f} | {100 * q.majority:.1f} | {q.num_test} |")
-    lines += ["", "## Classes", ""]
-    lines += [f"- {task}: {', '.join(names)}" for task, names in model.classes.items()]
-    lines += [
-        "",
+    return [*lines, "", "## Classes", "", *(f"- {task}: {', '.join(c)}" for task, c in model.classes.items()), ""]
+
+
+def _usage(given: dict[str, Any]) -> list[str]:
+    """The part of the model card on preprocessing."""
+    return [
         "## Preprocessing",
         "",
         f"{given['input']}. {given['resize']}: stored {given['stored']} px, size {given['size']} px."
         f" Then (x / 255 - {given['mean']}) / {given['std']}. Background: {given['background']}.",
         f"Sensors seen: {', '.join(given['sensors']) or 'not recorded'}."
-        " Another sensor, lamp or gel needs its own check before these predictions mean anything.",
-        "",
-        "## Data",
-        "",
-        *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
-        "The whole configuration, library versions and commit are in run.json.",
+        " For another sensor, lamp or gel, check the accuracy before you rely on these predictions.",
         "",
     ]
-    return "\n".join(lines)
 
 
 def push(artifact: Path, repo: str, *, private: bool = False) -> str:
-    """Upload a checked ``artifact`` to the Hugging Face Hub as ``repo`` ("owner/name") and return its address."""
+    """Check ``artifact``, upload it to the Hugging Face Hub as ``repo`` ("owner/name"), and return its address."""
     if not HUB_ID.fullmatch(repo) or "@" in repo:
         raise ValueError(f"{repo!r} is no name on the Hub: give owner/name")
     model = read(artifact)
     try:
         address = model.push_to_hub(repo, private=private, commit_message=f"{model.run.method.name} by mvitac publish")
-    except Exception as error:  # offline, no login, no right to write: the client has a kind for each
+    except Exception as error:  # offline, no login, no right to write: the client has an exception for each
         raise ValueError(
             f"{repo} could not be written on the Hugging Face Hub ({brief(error)}): check the network and the login"
-            f" (`hf auth login`); the artifact itself is whole, in {artifact}"
+            f" (`hf auth login`); the artifact itself is complete, in {artifact}"
         ) from None
     return str(address)

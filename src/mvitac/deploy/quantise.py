@@ -1,6 +1,6 @@
-"""ONNX files, their int8 versions, and which CPU an int8 version is for.
+"""ONNX files, their int8 versions, and the CPU that an int8 version is for.
 
-A CPU without VNNI adds pairs of 8-bit products in 16 bits, and what does not fit is cut off (it saturates). With weights
+A CPU without VNNI adds pairs of 8-bit products in 16 bits, and larger sums are cut off (they saturate). With weights
 of 7 bits the sums fit; this is onnxruntime's ``reduce_range`` and OpenVINO's overflow fix.
 """
 
@@ -28,7 +28,7 @@ def write_onnx(
     outputs: list[str],
     shapes: Any,
 ) -> Path:
-    """``module`` as model.onnx in ``folder``."""
+    """Write ``module`` as model.onnx into ``folder``; ``shapes`` are the dynamic shapes of torch.export."""
     path = folder / "model.onnx"
     torch.onnx.export(
         module,
@@ -46,7 +46,7 @@ def write_onnx(
 
 
 def to_openvino(path: Path) -> None:
-    """Write the ONNX file for OpenVINO too, into the same folder."""
+    """Convert the ONNX file for OpenVINO, into the same folder."""
     import openvino
 
     openvino.save_model(openvino.convert_model(path), path.with_name(FILES["openvino"][0]), compress_to_fp16=False)
@@ -76,19 +76,15 @@ def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]], *,
         weight_type=QuantType.QInt8,
         per_channel=True,
         reduce_range=seven_bits,
-        op_types_to_quantize=[
-            "Conv",
-            "Add",
-            "MaxPool",
-            "GlobalAveragePool",
-        ],  # heads and probes stay fp32: they are tiny
+        # Heads and probes stay in fp32: they are small.
+        op_types_to_quantize=["Conv", "Add", "MaxPool", "GlobalAveragePool"],
     )
 
 
 def this_machine(kind: str) -> Literal["avx2", "vnni"]:
-    """The target of this machine: ``kind``'s engine takes the mean of 576 ones in int8, which saturates at about half.
+    """The target of this machine: the engine of ``kind`` computes the mean of 576 ones in int8; saturated, it is about half.
 
-    Asked of the engine, not of the CPU's flags: it has its own choice of instructions, and variables that restrict it.
+    Measured on the engine, not read from the CPU's flags: it chooses its instructions itself, and variables restrict it.
     """
     conv = torch.nn.Conv2d(64, 64, 3, bias=False).requires_grad_(False)
     conv.weight.fill_(1 / 576)

@@ -1,7 +1,7 @@
-"""Find the nearest known touches and pictures: exact cosine over any number of rows, in memory that does not grow with it.
+"""Find the nearest known touches and pictures by exact cosine, in memory that does not grow with the number of rows.
 
     <index>/index.json          format, space, digests
-            model.safetensors   what embeds a query
+            model.safetensors   the model that embeds a query
             rows.parquet        id, group, split, labels and pack row of each indexed pair
             vision.npy          float32 [N, E], unit length, memory-mapped
             touch.npy
@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +24,22 @@ import pyarrow.parquet as pq
 import torch
 
 from mvitac.data.pack import Pack, has_difference
-from mvitac.model import Images, Model, load
+from mvitac.model import ImageInput, Model, load
 from mvitac.registry import unknown
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.progress import work
 
+FORMAT, FORMAT_VERSION = "mvitac-index", 1
+BLOCK = 1 << 16
+"""Rows compared at once: 128 MB of float32 at E = 512, the largest part of a search's memory."""
+
 
 def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str, np.ndarray]], list[str]]:
-    """``Live``'s ``nearest`` from a ``search.Index``: "id (label, ...)" of the k nearest known touches.
+    """The function ``nearest`` of ``Live``: an engine's outputs to "id (label, ...)" of the k nearest known touches.
 
-    By touch, or by vision where the engine's ``inputs`` have no touch. ValueError if the index does not hold it.
+    Compared by touch, or by vision where the engine's ``inputs`` have no touch. ValueError if the index lacks it.
     """
-
     modality = "touch" if "touch" in inputs else "vision"
     if modality not in index.banks:
         raise ValueError(f"{index.folder} holds no {modality} to compare with: index a pack that has it")
@@ -49,15 +53,17 @@ def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str,
     return find
 
 
-FORMAT, FORMAT_VERSION = "mvitac-index", 1
-BLOCK = 1 << 16
-"""Rows compared at once: 128 MB of float32 at E = 512, and the largest part of a search's own memory."""
-
-
 def nearest(bank: np.ndarray, queries: np.ndarray, k: int, *, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
-    """Row numbers and cosines [Q, k] (best first) of the rows of ``bank`` [N, E] nearest to ``queries`` [Q, E].
+    """The ``k`` nearest rows by cosine: an exact search.
 
-    Exact. Both must have unit length. Equal cosines come in row order. ``bank`` may be memory-mapped.
+    Args:
+        bank: float32 [N, E], unit length; may be memory-mapped.
+        queries: float32 [Q, E], unit length.
+        k: number of rows to find; all rows if there are fewer.
+        block: rows compared at once.
+
+    Returns:
+        Row numbers and cosines, both [Q, k], best first; equal cosines in row order.
     """
     if queries.ndim != 2 or queries.shape[1] != bank.shape[1]:
         raise ValueError(f"queries are {queries.shape}, the index holds {bank.shape[1]} dimensions: embed them alike")
@@ -70,10 +76,10 @@ def nearest(bank: np.ndarray, queries: np.ndarray, k: int, *, block: int = BLOCK
     for start in range(0, len(bank), block):
         found = queries @ bank[start : start + block].T
         if rows.shape[1] == k and not (found.max(1) > scores[:, -1]).any():
-            continue  # nothing here is better than what every query has
+            continue  # no row of this block is better than those found so far
         if found.shape[1] > k:
             best = np.argpartition(-found, k - 1, axis=1)[:, :k]
-            # A tie across the edge of the k best is cut anywhere by argpartition: take the earliest rows instead.
+            # argpartition cuts a tie at the k-th place anywhere: take the earliest rows instead.
             edge = np.take_along_axis(found, best, 1).min(1, keepdims=True)
             for q in np.flatnonzero((found >= edge).sum(1) > k):
                 best[q] = np.argsort(-found[q], kind="stable")[:k]
@@ -87,7 +93,7 @@ def nearest(bank: np.ndarray, queries: np.ndarray, k: int, *, block: int = BLOCK
 
 
 def embeddings(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, shared: bool) -> Iterator[np.ndarray]:
-    """Embeddings of pack rows in chunks of at most 256: features, or the unit vectors of the shared space."""
+    """Embeddings of pack rows in chunks of at most 256 rows: features, or unit vectors of the shared space."""
     device = next(model.parameters()).device
     with work(f"embedding {modality}", len(rows), "images") as advance:
         for chunk in np.array_split(rows, max(1, -(-len(rows) // 256))):
@@ -98,7 +104,7 @@ def embeddings(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, sha
 
 
 def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
-    """The modalities that model and pack share; ValueError if there are none, or the pack's images do not fit."""
+    """The modalities that model and pack have in common; ValueError if there are none, or the images do not fit."""
     names = tuple(m for m in pack.spec.modalities if m in model.encoders)
     for modality in names:
         if pack.spec.channels(modality) != model.spec.channels(modality):
@@ -123,13 +129,23 @@ def describe(pack: Pack, rows: np.ndarray) -> pa.Table:
 
 
 def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> Index:
-    """Index the whole pairs of ``pack`` (of ``splits``; none = all) into the new folder ``out``.
+    """Index the complete pairs of a pack.
 
-    In the space both modalities share if the model has one (touch finds vision and vision finds touch), else by features
-    (each finds only its own kind). Busy if another process builds there.
+    A model with a space that both modalities share is indexed there, so that touch finds vision and vision finds touch;
+    any other by features, where each modality finds only itself.
+
+    Args:
+        model: embeds the rows; a copy is kept for queries.
+        pack: rows to index.
+        out: the new folder.
+        splits: index only these; none = all.
+
+    Raises:
+        Busy: another process writes ``out``.
+        ValueError: ``out`` exists, or the pack does not fit the model.
     """
     check_place(out)
-    busy = f"{out} is being written by another process: let it end, or choose another --out"
+    busy = f"{out} is being written by another process: wait until it ends, or choose another --out"
     with hold_lock(out, busy, wait=False):
         return _build(model, pack, out, splits)
 
@@ -147,18 +163,7 @@ def _build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...]) -> Inde
     partial.mkdir(parents=True)
     try:
         for modality in modalities:
-            at = 0
-            bank: np.ndarray | None = None
-            for x in embeddings(model, pack, modality, rows, shared=shared):
-                x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
-                if bank is None:
-                    path = partial / f"{modality}.npy"
-                    bank = np.lib.format.open_memmap(path, "w+", np.float32, (len(rows), x.shape[1]))
-                bank[at : at + len(x)] = x
-                at += len(x)
-            assert bank is not None and at == len(rows)
-            bank.flush()  # type: ignore[attr-defined]
-            del bank
+            _write_bank(partial / f"{modality}.npy", embeddings(model, pack, modality, rows, shared=shared), len(rows))
         model.save(partial / "model.safetensors")
         pq.write_table(describe(pack, rows), partial / "rows.parquet")
         names = sorted(p.name for p in partial.iterdir())
@@ -180,17 +185,29 @@ def _build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...]) -> Inde
     return Index(out, verify=False)
 
 
+def _write_bank(path: Path, chunks: Iterator[np.ndarray], num: int) -> None:
+    """``num`` unit vectors as .npy, chunk by chunk, so that memory does not grow with the number of rows."""
+    first = next(chunks)
+    bank = np.lib.format.open_memmap(path, "w+", np.float32, (num, first.shape[1]))
+    start = 0
+    for x in chain([first], chunks):
+        bank[start : start + len(x)] = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+        start += len(x)
+    assert start == num
+    bank.flush()
+
+
 class Index:
     """An opened index: ``table`` describes the rows, ``banks[modality]`` are their unit vectors, memory-mapped."""
 
     def __init__(self, folder: str | Path, *, verify: bool = True) -> None:
-        """ValueError says what is wrong; ``verify`` recomputes the digests (about 1 s per GB)."""
+        """``verify`` recomputes the digests (about 1 s per GB). ValueError if the index is damaged or was changed."""
         self.folder = folder = Path(folder)
         meta = read_json(folder / "index.json", "an index's description")
         if not isinstance(meta, dict) or meta.get("format") != FORMAT or meta.get("format_version") != FORMAT_VERSION:
             raise ValueError(f"{folder / 'index.json'} does not describe an index: make one with `mvitac index`")
         if meta.get("digest") != digest({key: value for key, value in meta.items() if key != "digest"}):
-            raise ValueError(f"{folder / 'index.json'} does not match its digest: it was changed, make it again")
+            raise ValueError(f"{folder / 'index.json'} does not match its digest: it was changed: make it again")
         allowed = {"model.safetensors", "rows.parquet", "vision.npy", "touch.npy"}
         if not {"model.safetensors", "rows.parquet"} <= set(meta["files"]) <= allowed:
             raise ValueError(f"{folder / 'index.json'} names other files than {', '.join(sorted(allowed))}: refused")
@@ -208,22 +225,31 @@ class Index:
                 self.banks[modality] = bank
 
     def model(self) -> Model:
-        """The model that embedded the rows, to embed queries."""
+        """The model that embedded the rows, for queries."""
         return load(self.folder / "model.safetensors")
 
     def find(
         self,
         model: Model,
-        images: Images,
+        images: ImageInput,
         source: str,
         target: str,
         k: int = 5,
         *,
-        background: Images | None = None,
+        background: ImageInput | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and cosines [Q, k] of the ``target`` images nearest to ``images`` of modality ``source``.
+        """The nearest indexed images of modality ``target`` to ``images`` of modality ``source``.
 
-        ``background`` as for ``Model.embed``: what the touch sensor shows without contact.
+        Args:
+            model: that of ``model()``.
+            images: Q queries, as for ``Model.embed``.
+            source: modality of the queries.
+            target: modality to search.
+            k: number of rows to find.
+            background: the touch sensor without contact, as for ``Model.embed``.
+
+        Returns:
+            Row numbers and cosines, both [Q, k], best first.
         """
         for name in (source, target):
             if name not in self.banks:

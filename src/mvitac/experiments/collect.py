@@ -33,8 +33,8 @@ from mvitac.run import Run, load_run
 from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.provenance import provenance
-from mvitac.training.loop import check_same
 from mvitac.training.sampler import training_rows
+from mvitac.training.setup import check_same
 from mvitac.training.views import gel_mirror
 
 

@@ -1,6 +1,7 @@
-"""Where live frames come from: cameras, video files, folders of pictures, and a simulated sensor.
+"""Sources of live frames: cameras, video files, folders of pictures, and a simulated sensor.
 
-A ``Source`` opens, reads and closes; clocks, threads and faults are ``live/streams.py``'s. Frames are uint8 RGB [H, W, 3].
+A ``Source`` opens, reads and closes; clocks, threads and faults are in ``live/streams.py``. Frames are uint8 RGB
+[H, W, 3].
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 
 
 class Ended(Exception):
-    """A source has no more frames, and never will."""
+    """A source has no more frames."""
 
 
 class Source(ABC):
-    """Where frames come from. ``read`` raises OSError where the device is gone, ValueError for one damaged frame."""
+    """A source of frames. ``read`` raises OSError if the device is gone, ValueError for one damaged frame."""
 
     fps: float = 30.0
     """Nominal rate."""
     paced: bool = True
-    """Whether the device itself makes ``read`` wait for the next frame."""
+    """Whether ``read`` itself waits for the next frame."""
 
     @abstractmethod
     def open(self) -> None: ...
@@ -45,7 +46,7 @@ class Camera(Source):
     """A UVC camera by index, device path or USB serial number; DIGIT and GelSight Mini are such cameras."""
 
     def __init__(self, which: str, size: tuple[int, int] | None = None, fps: float | None = None) -> None:
-        """``size`` (width, height) and ``fps`` to ask the camera for; None leaves it as it is."""
+        """``size`` (width, height) and ``fps`` to request from the camera; None keeps its own."""
         self.which, self.size, self.asked = which, size, fps
 
     def open(self) -> None:
@@ -58,7 +59,7 @@ class Camera(Source):
                 raise OSError(f"no camera with serial {target} is plugged in")
             target = str(links[0].resolve())
         self.capture = cv2.VideoCapture(target)
-        self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame in a queue is worse than none
+        self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame in a queue delays the newest
         if not self.capture.isOpened():
             raise OSError(f"camera {self.which} cannot be opened")
         asked = (
@@ -70,7 +71,7 @@ class Camera(Source):
             if value:
                 self.capture.set(name, value)
         given = [self.capture.get(name) for name, _ in asked]
-        # A driver takes what it likes and says nothing; some report no rate at all.
+        # A driver may choose another mode without an error; some report no rate.
         if any(value and has and abs(has - value) > 0.05 * value for has, (_, value) in zip(given, asked, strict=True)):
             raise OSError(
                 f"camera {self.which} has no such mode: it gives {given[0]:g}x{given[1]:g} at {given[2]:g} fps"
@@ -89,7 +90,7 @@ class Camera(Source):
 
 
 class Video(Source):
-    """A video file, at its own rate."""
+    """A video file, at its own frame rate."""
 
     paced = False
 
@@ -137,14 +138,15 @@ class Folder(Source):
         try:
             with Image.open(path) as image:
                 return np.array(image.convert("RGB"))
-        except Exception as error:  # Pillow has a kind for each damage
+        except Exception as error:  # Pillow has an exception for each kind of damage
             raise ValueError(f"{path.name}: {brief(error)}") from None
 
 
 class Simulated(Source):
-    """A simulated sensor: one second of nothing, two of a touch of a new material, and so on; camera and gel agree.
+    """A simulated sensor: one second without contact, two seconds of touching a new material, repeated.
 
-    Nothing for longer at first: live input learns the free gel from its first second, on a slow machine from later ones.
+    Camera and gel of one seed show the same touch. The first rest is longer: live input learns the free gel then, on a
+    slow machine for more than a second.
     """
 
     paced = False
@@ -166,7 +168,7 @@ class Simulated(Source):
             self.touch = int(touch)
             rng = np.random.default_rng([self.seed, self.touch])
             sensors = {name: s for name, s in materials.SENSORS.items() if not s.held_out}
-            while True:  # all touches by one sensor, as a robot has one
+            while True:  # all touches by one sensor, as on a robot
                 address = int(rng.integers(len(materials.CLASSES))), int(rng.integers(60)), int(rng.integers(5))
                 pair = materials.touch(self.seed, *address, size=self.size)
                 if pair["sensor"] == min(sensors):
@@ -184,8 +186,15 @@ MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d
 
 
 def source(text: str, modality: str) -> Source:
-    """A source from its name: a camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` asks it for that mode), a
-    video, a folder[@fps], or ``sim``[:seed]. ValueError if there is no such thing, or a file that cannot be read.
+    """The source that ``text`` names.
+
+    Args:
+        text: a camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` after it requests that mode), a video
+            file, a folder[@fps], or ``sim``[:seed].
+        modality: vision or touch, for a simulated sensor.
+
+    Raises:
+        ValueError: there is no such source, or its file cannot be read.
     """
     if text == "sim" or text.startswith("sim:"):
         seed = text.partition(":")[2] or "0"
@@ -216,7 +225,7 @@ def source(text: str, modality: str) -> Source:
 
 
 def _readable(files: Source, text: str) -> Source:
-    """``files`` again, if they can be opened: unlike a camera, they will not come back by waiting."""
+    """``files``, or ValueError if they cannot be opened: unlike a camera, a missing file does not come back."""
     try:
         files.open()
     except OSError as error:

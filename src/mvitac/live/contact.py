@@ -1,4 +1,4 @@
-"""Contact: one touch sensor's background, and whether something touches it now."""
+"""Contact detection: the background of one touch sensor, and whether something touches it."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from PIL import Image
 from mvitac.data.images import fit
 
 SIDE = 32
-"""Side of the small gray pictures in which contact is looked for."""
+"""Side in pixels of the small gray pictures in which contact is detected."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiveConfig:
-    """How live input is judged."""
+    """Contact detection and display of live input."""
 
     calibration: int = 30
-    """Frames without contact from which a sensor's background and noise are learned."""
+    """Number of first frames, without contact, from which a sensor's background and noise are learned."""
     contact: float = 6.0
-    """Contact is this many times the no-contact noise; it ends at half of that."""
+    """Contact begins at a change of this many times the noise without contact, and ends at half of that."""
     least_change: float = 1.0
-    """Grey levels of mean change below which nothing counts as contact, however quiet the sensor."""
+    """Mean change in grey levels below which nothing counts as contact, however low the noise."""
     follow: float = 0.01
-    """How fast the background follows the sensor while nothing is touched (share per frame)."""
+    """Share of the change by which the background is updated per frame while nothing is touched."""
     min_confidence: float = 0.5
-    """Probability below which an answer is shown as unsure."""
+    """Probability below which an answer is marked as unsure."""
     neighbours: int = 3
-    """Nearest known touches to show, if there is an index."""
+    """Number of nearest known touches to show, if there is an index."""
 
     def __post_init__(self) -> None:
         if self.calibration < 2:
@@ -40,24 +40,24 @@ class LiveConfig:
 
 
 class Contact:
-    """Whether one touch sensor is touched: learns its background, then compares."""
+    """Contact of one touch sensor: learns its background, then compares frames with it."""
 
     def __init__(self, config: LiveConfig, side: int = 0) -> None:
-        """``side``: of the picture of no contact to keep, for a model that wants it subtracted; 0 = none."""
+        """``side``: side in pixels of the background to keep for a model of difference images; 0 = none."""
         self.config, self.side = config, side
         self.forget()
 
     def forget(self) -> None:
-        """Calibrate anew, as after a change of resolution or a replugged sensor."""
+        """Calibrate again, e.g. after a change of resolution or a reconnected sensor."""
         self.first: list[tuple[np.ndarray, np.ndarray | None]] = []
         self.background: np.ndarray | None = None
         self.picture: np.ndarray | None = None
-        """The background [side, side, 3] as the model would see it, float32."""
+        """The background float32 [side, side, 3] at the size of the model's input."""
         self.noise = self.level = 0.0
         self.touched = self.uneasy = False
 
     def __call__(self, image: np.ndarray) -> bool | None:
-        """True in contact, False without, None while calibrating. ``level`` is the change in units of the threshold."""
+        """True in contact, False without, None while calibrating; sets ``level``, the change over the threshold."""
         small = np.asarray(Image.fromarray(image).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
         whole = fit(image, self.side) if self.side else None
         if self.background is None:
@@ -72,7 +72,7 @@ class Contact:
             self.noise = float(np.median(changes))
             self.uneasy = bool(changes.max() > max(self.config.least_change, self.config.contact * self.noise))
             if self.uneasy:
-                return None  # something moved: learn it again
+                return None  # something moved: calibrate again
             self.background = middle
             self.picture = np.stack(pictures).mean(0, dtype=np.float32) if pictures else None
         change = float(np.abs(small - self.background).mean())

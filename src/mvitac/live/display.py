@@ -1,6 +1,6 @@
-"""A window on live input: the newest frames, contact, and what the model says of the touch, as one picture.
+"""A window for live input: the newest frames, contact, and the model's answers, as one picture.
 
-``draw`` needs neither a display nor OpenCV, so what is shown can be tested; ``Window`` needs both and says which is lacking.
+``draw`` needs neither a display nor OpenCV, so it can be tested; ``Window`` needs both, and its error names the missing one.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from mvitac.live.predictor import Live
 from mvitac.system.files import brief
 
 SIDE, LINE, EDGE = 256, 24, 4
-"""Pixels: side of a stream's picture, height of a line of text, frame around a picture."""
+"""Pixels: side of a stream's picture, height of a line of text, width of the frame around a picture."""
 BACK, TEXT, FAINT = (24, 24, 28), (235, 235, 235), (130, 130, 130)
 TOUCHED, FAULT = (60, 170, 90), (200, 60, 50)
 
 
 def draw(loop: Live) -> np.ndarray:
-    """uint8 RGB [H, W, 3] of fixed size: streams side by side (framed green in contact, red at fault), answers below."""
+    """uint8 RGB [H, W, 3] of fixed size: streams side by side (green frame: contact, red: fault), answers below."""
     width = SIDE * max(2, len(loop.all))
     touch = loop.touch or loop.last
     answers = loop.answers(touch)
@@ -52,7 +52,7 @@ class Window:
     """A window of the desktop that shows pictures until it is closed, or q or Esc is pressed in it."""
 
     def __init__(self, title: str = "mvitac live") -> None:
-        """ValueError says what a window needs and is not there."""
+        """ValueError names what a window needs and is missing."""
         self.title, self.cv2 = title, _opencv()
         try:
             self.cv2.namedWindow(title)
@@ -60,8 +60,8 @@ class Window:
             raise ValueError(f"--window: OpenCV cannot open one ({brief(error)}): leave it out") from None
 
     def show(self, picture: np.ndarray) -> bool:
-        """Show uint8 RGB [H, W, 3]; False once the user has closed the window."""
-        self.cv2.imshow(self.title, np.ascontiguousarray(picture[..., ::-1]))  # OpenCV's order is BGR
+        """Show uint8 RGB [H, W, 3]; False if the user has closed the window."""
+        self.cv2.imshow(self.title, np.ascontiguousarray(picture[..., ::-1]))  # OpenCV wants BGR
         pressed = self.cv2.waitKey(1) & 0xFF
         return pressed not in (ord("q"), 27) and self.cv2.getWindowProperty(self.title, self.cv2.WND_PROP_VISIBLE) >= 1
 
@@ -70,8 +70,8 @@ class Window:
 
 
 def _opencv() -> ModuleType:
-    """OpenCV, if it can open windows here."""
-    # Asked first: some builds of OpenCV end the process where there is no display.
+    """OpenCV, or ValueError if it cannot open windows here."""
+    # Checked first: some builds of OpenCV end the process without a display.
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ValueError("--window: there is no display (DISPLAY and WAYLAND_DISPLAY are not set): leave it out")
     try:

@@ -1,9 +1,9 @@
-"""Live: the newest frames in, contact, a smoothed answer per touch and its age out. No training code.
+"""Predict from the newest frames: contact, a mean answer per touch, and the age of each prediction.
 
-Each touch sensor's background (no contact) is learned from its first frames and followed slowly while nothing is
-touched; it decides *whether* there is contact. The model sees frames as they are, or minus that background if it learned
-from difference images. Probabilities are averaged over one touch and forgotten with it. Time comes from a clock that is
-given. Shapes: frames uint8 RGB [H, W, 3].
+The background of each touch sensor (no contact) is learned from its first frames and updated slowly while nothing is
+touched; it decides *whether* there is contact. The model gets frames as they are, or minus that background if it was
+trained on difference images. Probabilities are averaged over one touch. Time comes from a clock passed as an argument.
+Shapes: frames uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.streams import Event, Frame, Stream
 
 NUM_AGES = 10_000
-"""Predictions that the percentiles of the age are of: the latest ones, minutes of them, in memory that stays the same."""
+"""Number of latest predictions, some minutes of them, over which the percentiles of the age are computed."""
 
 
 @dataclass
 class Touch:
-    """One touch, from contact to release: the mean of what was predicted."""
+    """One touch, from contact to release, with the sum of its predictions."""
 
     number: int
     start: float
@@ -35,7 +35,7 @@ class Touch:
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
     known: list[str] = field(default_factory=list)
-    """The known touches it is most like, if there is an index."""
+    """The most similar known touches, if there is an index."""
 
     def add(self, probabilities: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
@@ -49,7 +49,7 @@ class Touch:
 
 
 class Live:
-    """Streams -> contact, predictions, ages. ``tick`` once whenever a frame may have come."""
+    """Predictions from streams of frames. Call ``tick`` whenever a frame may have come."""
 
     def __init__(
         self,
@@ -62,32 +62,31 @@ class Live:
         record: Callable[[dict[str, np.ndarray], dict[str, Any]], None] | None = None,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> None:
-        """``streams``: one stream per camera and sensor, by modality; two touch sensors are stacked on channels.
-
-        ``nearest`` turns the engine's outputs into names of known touches; ``record`` gets every pair that was used;
-        ``tell`` hears of every fault as it happens, in whichever thread noticed.
-        ValueError if the engine takes other inputs.
         """
-        for modality, (_, _, channels) in engine.inputs.items():
-            have = 3 * len(streams.get(modality, ()))
-            if have != channels:
-                raise ValueError(
-                    f"the model takes {channels // 3} {modality} stream(s), {have // 3} given:"
-                    f" give {channels // 3} --{modality} (or export a model with other inputs)"
-                )
-        if extra := set(streams) - set(engine.inputs):
-            raise ValueError(f"the model has no input for {', '.join(sorted(extra))}: leave it out")
+        Args:
+            engine: the exported model.
+            streams: one stream per camera and sensor, by modality; two touch sensors are stacked in channels.
+            config: contact detection and display.
+            clock: time in seconds, that of the streams.
+            nearest: turns the engine's outputs into descriptions of known touches.
+            record: called with every pair that was used (images, columns).
+            tell: called with every fault as it happens, in the thread that noticed it.
+
+        Raises:
+            ValueError: the engine takes other inputs.
+        """
+        _check_inputs(engine, streams)
         self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
         self.nearest, self.record, self.tell = nearest, record, tell
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]
-        """A new frame of this stream starts a prediction."""
+        """The stream whose new frames start predictions."""
         side = engine.inputs["touch"][0] if engine.difference and "touch" in streams else 0
         self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
         self.age = self.max_age = 0.0
-        """Seconds from capture to answer of the latest prediction, and the most of any; of the leading modality's frames."""
+        """Seconds from the capture of the leading frame to the answer: of the latest prediction, and the maximum."""
         self.num_predictions = self.num_stale = self.num_touches = 0
         self.touch: Touch | None = None
         self.last: Touch | None = None
@@ -99,7 +98,7 @@ class Live:
             stream.tell = self._heard
 
     def tick(self) -> bool:
-        """Use the newest frames, if the leading stream has a new one; True if that made a prediction."""
+        """Use the newest frames if the leading stream has a new one; True if that made a prediction."""
         for stream in self.all:
             stream.check()
         leading = self.leading.newest(take=False)
@@ -108,43 +107,50 @@ class Live:
                 self._lose(self.clock())
             return False
         frames = {m: [s.newest() for s in several] for m, several in self.streams.items()}
-        # A frame may have come since ``leading`` was looked at: the one that is used counts.
+        # A newer frame may have come since ``leading`` was read: the one that is used counts.
         self._seen = (frames[self._leading_modality][0] or leading).number
         now = self.clock()
-        for several, found in zip(self.streams.values(), frames.values(), strict=True):
-            for stream, frame in zip(several, found, strict=True):
-                # An old frame is not the present: rather no answer than one about the past.
-                if frame is None or stream.fault == "frozen" or now - frame.time > stream.stale_after:
-                    self.num_stale += 1
-                    self._lose(now)
-                    return False
+        if not self._all_fresh(frames, now):
+            self.num_stale += 1
+            self._lose(now)
+            return False
         self.contact = self._contact(frames.get("touch", []))
         images = {
             m: np.concatenate([fit(f.image, self.engine.inputs[m][0]) for f in found if f], axis=2)
             for m, found in frames.items()
         }
-        made = False
         if self.contact:
-            if self.touch is None:
-                self.num_touches += 1
-                self.touch = Touch(self.num_touches, now)
-            outputs = self.engine(**{m: x[None] for m, x in self._wanted(images).items()})
-            self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
-            if self.nearest:
-                self.touch.known = self.nearest(outputs)
-            self.age = self.clock() - min(f.time for f in frames[self._leading_modality] if f)
-            self._ages[self.num_predictions % NUM_AGES] = self.age
-            self.max_age = max(self.max_age, self.age)
-            self.num_predictions += 1
-            made = True
+            self._predict(images, now, captured=min(f.time for f in frames[self._leading_modality] if f))
         else:
             self._release(now)
         if self.record:
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
-        return made
+        return bool(self.contact)
+
+    def _all_fresh(self, frames: dict[str, list[Frame | None]], now: float) -> bool:
+        """Whether every stream has a frame that shows the present; an old one would give an answer about the past."""
+        return all(
+            frame is not None and stream.fault != "frozen" and now - frame.time <= stream.stale_after
+            for several, found in zip(self.streams.values(), frames.values(), strict=True)
+            for stream, frame in zip(several, found, strict=True)
+        )
+
+    def _predict(self, images: dict[str, np.ndarray], now: float, captured: float) -> None:
+        """Add a prediction to the current touch, or start one; ``captured``: time of the leading frame."""
+        if self.touch is None:
+            self.num_touches += 1
+            self.touch = Touch(self.num_touches, now)
+        outputs = self.engine(**{m: x[None] for m, x in self._as_trained(images).items()})
+        self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
+        if self.nearest:
+            self.touch.known = self.nearest(outputs)
+        self.age = self.clock() - captured
+        self._ages[self.num_predictions % NUM_AGES] = self.age
+        self.max_age = max(self.max_age, self.age)
+        self.num_predictions += 1
 
     def finish(self) -> None:
-        """End a touch that was still going on: no more frames will come."""
+        """End the current touch: no more frames will come."""
         self._release(self.clock())
 
     @property
@@ -152,7 +158,7 @@ class Live:
         return "touch" if self.streams.get("touch") else "vision"
 
     def _contact(self, frames: Sequence[Frame | None]) -> bool | None:
-        """Whether any touch sensor is in contact, None while one is calibrated; without a sensor always True."""
+        """Whether any touch sensor is in contact; None during calibration; always True without a sensor."""
         if not self.contacts:
             return True
         while self._changed:
@@ -172,15 +178,15 @@ class Live:
         states = self.contacts.values()
         return None if any(c.background is None for c in states) else any(c.touched for c in states)
 
-    def _wanted(self, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """``images`` as the model learned from them; what is recorded stays as it came."""
+    def _as_trained(self, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """``images`` as the model was trained on them; recorded images stay as they came."""
         if not (self.engine.difference and self.contacts):
             return images
         free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
         return {**images, "touch": difference(images["touch"], np.rint(free).astype(np.uint8))}
 
     def _lose(self, now: float) -> None:
-        """What cannot be seen is neither touched nor free."""
+        """End the touch when frames are missing: contact is then unknown."""
         self._release(now)
         self.contact = None
 
@@ -192,13 +198,13 @@ class Live:
     def _heard(self, event: Event) -> None:
         self.counts[event.what] += 1
         self.tell(event)
-        # Another lens, crop or gel: what was learned of the background no longer holds. The capture thread says so here
-        # before it shows the frame, and ``tick``, in its own thread, may be at work on the one before: it forgets.
+        # Another lens, crop or gel: the learned background no longer holds. The capture thread reports it before it
+        # shows the frame, while ``tick`` may use the frame before in its own thread: so ``tick`` forgets it.
         if event.what in ("resolution changed", "back") and event.stream in self.contacts:
             self._changed.add(event.stream)
 
     def state(self, stream: Stream) -> str:
-        """What a stream is doing, in a word: its fault, "calibrating" or "good"."""
+        """State of a stream in a word: its fault, "calibrating" or "good"."""
         contact = self.contacts.get(stream.name)
         return stream.fault or ("calibrating" if contact and contact.background is None else "good")
 
@@ -209,7 +215,7 @@ class Live:
         return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
 
     def summary(self) -> dict[str, Any]:
-        """What a run of live input came to, JSON-ready; ages in ms from capture to prediction."""
+        """Counts, ages in ms from capture to prediction, and events, JSON-ready."""
         ages = 1000 * self._ages[: self.num_predictions]
         p50, p99 = (float(np.percentile(ages, q)) if len(ages) else None for q in (50, 99))
         return {
@@ -222,3 +228,16 @@ class Live:
             },
             "events": dict(self.counts),
         }
+
+
+def _check_inputs(engine: Engine, streams: dict[str, Sequence[Stream]]) -> None:
+    """ValueError if the number of streams is not that of the engine's inputs."""
+    for modality, (_, _, channels) in engine.inputs.items():
+        given, wanted = len(streams.get(modality, ())), channels // 3
+        if given != wanted:
+            raise ValueError(
+                f"the model takes {wanted} {modality} stream(s), {given} given:"
+                f" give {wanted} --{modality} (or export a model with other inputs)"
+            )
+    if extra := set(streams) - set(engine.inputs):
+        raise ValueError(f"the model has no input for {', '.join(sorted(extra))}: leave it out")

@@ -1,5 +1,5 @@
-"""Record live input: pairs go to a spool on disk as they come, and become a pack or a LeRobotDataset at the end (or later,
-after a crash)."""
+"""Record live input: pairs are written to a temporary folder, the spool, and become a pack or a LeRobotDataset at the end
+(after a crash: later, by ``mvitac live --finish``)."""
 
 from __future__ import annotations
 
@@ -19,18 +19,24 @@ from mvitac.registry import from_json, to_json
 from mvitac.system.files import check_place, digest_file, read_json, write_atomic, write_json
 
 SPOOL = 64
-"""Pairs per file of the spool: what a crash can lose."""
+"""Pairs per file of the spool: the number that a crash can lose."""
 
 
 class Recorder:
-    """Call it with every pair; ``close`` makes the pack or dataset. At most ``fps`` pairs a second are kept."""
+    """Call it with every pair; ``close`` makes the pack or dataset. At most ``fps`` pairs per second are kept."""
 
     def __init__(
         self, out: Path, channels: dict[str, int], *, fps: float = 10.0, form: Literal["pack", "lerobot"] = "pack"
     ) -> None:
-        """``channels`` by modality, of the images that will come, uint8 [S, S, C].
+        """
+        Args:
+            out: the new folder.
+            channels: number of channels C by modality, of images uint8 [S, S, C].
+            fps: maximum number of pairs per second; a whole number for lerobot.
+            form: format of ``out``.
 
-        ``form``: what ``out`` becomes; a LeRobotDataset has a whole ``fps``. ValueError says what is not possible.
+        Raises:
+            ValueError: ``out`` exists or cannot be written, or ``fps`` is not possible.
         """
         if not fps > 0:
             raise ValueError(f"fps {fps:g}: give pairs a second, more than 0")
@@ -61,12 +67,12 @@ class Recorder:
         self._next = float("-inf")
 
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
-        """Keep one pair, if it is time for one; ``columns`` has at least time, contact and touch_number."""
+        """Keep one pair if the last one is long enough ago; ``columns`` has at least time, contact and touch_number."""
         time = columns["time"]
         if time < self._next:
             return
-        # Counted from the last due time, not from this pair's: else every delay would lower the rate. But what was missed
-        # (at the start, in a gap) is not made up for.
+        # Counted from the last due time, not from this pair, as every delay would lower the rate. Pairs that were missed
+        # (at the start, in a gap) are not replaced by more later.
         self._next += self.every
         if time >= self._next:
             self._next = time + self.every
@@ -86,15 +92,15 @@ class Recorder:
         self.waiting = []
 
     def close(self) -> int:
-        """Write what is left and make the pack or dataset; how many pairs it has (0: nothing is made)."""
+        """Write the last pairs and make the pack or dataset; returns its number of pairs (0: nothing is made)."""
         self._flush()
         return finish(self.out)
 
 
 def finish(out: Path) -> int:
-    """Make ``out`` of its spool, which is then deleted; returns how many pairs it has (0: nothing is made)."""
+    """Make ``out`` from its spool, which is then deleted; returns its number of pairs (0: nothing is made)."""
     spool = Recorded(out.with_name(out.name + ".spool"))
-    if not spool.files:  # a crash came before the first of them
+    if not spool.files:  # a crash before the first file
         shutil.rmtree(spool.path)
         return 0
     if spool.form == "lerobot":
@@ -108,7 +114,7 @@ def finish(out: Path) -> int:
 
 
 class Recorded(Source):
-    """A spool as a source of a pack; an item is one of its files."""
+    """A spool as the source of a pack; each of its files is an item."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -142,7 +148,7 @@ class Recorded(Source):
         pick: Callable[[str, int], np.ndarray | None] = lambda m, i: arrays[m][i] if m in arrays else None  # noqa: E731
         for i in range(len(columns["time"])):
             own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
-            # Frames between touches belong to nothing; each touch is a group of near-copies.
+            # Frames of one touch are near-copies, so each touch is a group; so is each rest between touches.
             group = f"touch-{own['touch_number']:06d}" if own["contact"] else f"rest-{own['touch_number']:06d}"
             own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled"}
             samples.append(Sample(vision=pick("vision", i), touch=pick("touch", i), columns=own))

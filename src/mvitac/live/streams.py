@@ -1,7 +1,7 @@
-"""Streams of frames: the newest one wins, and every fault is named.
+"""Streams of frames: only the newest frame counts, and every fault is reported.
 
-A ``Stream`` keeps its source's newest frame (``live/cameras.py``), counts what was dropped and says what is wrong with it. Time
-comes from a clock that is given, so all of it runs on a fake one. Frames are uint8 RGB [H, W, 3].
+A ``Stream`` keeps the newest frame of its source (``live/cameras.py``), counts dropped frames and reports faults. Time
+comes from a clock passed as an argument, so tests use a fake one. Frames are uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mvitac.system.files import brief
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture and when it was taken (seconds of the stream's clock)."""
+    """One picture and its time of capture (seconds of the stream's clock)."""
 
     image: np.ndarray
     time: float
@@ -29,7 +29,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Event:
-    """Something a user must know: ``what`` is the kind of fault (or its end), ``text`` the whole sentence."""
+    """A fault or its end: ``what`` is the kind, ``text`` the sentence for the user."""
 
     time: float
     stream: str
@@ -38,7 +38,7 @@ class Event:
 
 
 class Stream:
-    """One source's newest frame and its health. ``pump`` belongs to one thread, everything else to any."""
+    """The newest frame of one source, and its faults. Call ``pump`` from one thread only, the rest from any."""
 
     def __init__(
         self,
@@ -51,8 +51,16 @@ class Stream:
         frozen_after: float = 1.0,
         retry_every: float = 1.0,
     ) -> None:
-        """``stale_after``: age in seconds from which a frame is no longer used; ``frozen_after``: how long pictures may be
-        identical to the last byte; ``retry_every``: pause between tries to open a lost device."""
+        """
+        Args:
+            name: the stream's name in events.
+            origin: where frames come from.
+            clock: time in seconds.
+            tell: called with every event, in the thread that noticed it.
+            stale_after: age in seconds from which a frame is no longer used.
+            frozen_after: seconds for which pictures may be identical to the last byte.
+            retry_every: seconds between attempts to open a lost device.
+        """
         self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
         self.stale_after, self.frozen_after, self.retry_every = stale_after, frozen_after, retry_every
         self.fault: str | None = None
@@ -69,7 +77,7 @@ class Stream:
         self._arrivals: deque[float] = deque(maxlen=30)
 
     def pump(self) -> None:
-        """Read one frame, or try once to open the source; blocks as long as the device does."""
+        """Read one frame, or try once to open the source. Blocks as long as the device does."""
         if self.ended:
             return
         try:
@@ -87,19 +95,19 @@ class Stream:
             self.num_damaged += 1
             self._say("damaged frame", f"skipped a damaged frame ({brief(error)})")
             return
-        except Exception as error:  # OSError; OpenCV and the drivers under it have kinds of their own
+        except Exception as error:  # OSError, or one of the exceptions of OpenCV and its drivers
             self._lost(error)
             return
         self._take(image)
 
     def newest(self, *, take: bool = True) -> Frame | None:
-        """The newest frame, whatever its age; with ``take`` it then counts as used, not as dropped."""
+        """The newest frame of any age; with ``take`` it counts as used, not as dropped."""
         with self._lock:
             self._taken = self._taken or take
             return self._newest
 
     def check(self) -> None:
-        """Say so if the device has stopped giving frames; ``pump`` cannot, it is what waits."""
+        """Report a device that has stopped giving frames; ``pump`` cannot, as it waits for the device."""
         now = self.clock()
         last = self._newest.time if self._newest else self._opened_at
         if self._open and not self.ended and not self._stalled and now - last > self.stale_after:
@@ -166,7 +174,7 @@ def _shape(image: np.ndarray) -> str:
 
 
 class CaptureThread(threading.Thread):
-    """Pumps one stream until ``stop``; files are slowed down to their own rate."""
+    """Reads one stream until ``stopping`` is set; files are read at their own frame rate."""
 
     def __init__(self, stream: Stream, wake: Callable[[], None]) -> None:
         super().__init__(name=f"capture {stream.name}", daemon=True)

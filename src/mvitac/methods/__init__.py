@@ -1,4 +1,4 @@
-"""Pre-training methods, one file each. Importing this package imports every file in it, and so registers them all."""
+"""Pre-training methods, one file each. Importing this package imports and registers all of them."""
 
 from mvitac.methods.base import Method, MethodConfig
 from mvitac.registry import import_all

@@ -1,96 +1,123 @@
-"""One training batch as a method sees it.
+"""The interface of a pre-training method, and the batch it receives.
 
-Shapes: N rows of a dataset, B images in a batch, V views of each image, C channels, H x W pixels.
+Shapes: B images in a batch, V views of each image, C channels, H x W pixels, D features.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
+import torch
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.registry import Registered
 
+Embeddings = dict[Hashable, Tensor]
+"""Tensors [B, ...], row i of pair i. Keys are plain tuples of the method's choice, e.g. ``("q", "touch", 0)``."""
+
 
 @dataclass(frozen=True)
 class Views:
-    """A batch as a method sees it: V augmented, normalised views [B, C, H, W] of every image, per modality."""
+    """A batch as a method sees it."""
 
     images: dict[str, list[Tensor]]
-    """modality -> V tensors; a modality the dataset lacks is absent."""
+    """modality -> V tensors [B, C, H, W], augmented and normalised. A modality the dataset lacks is absent."""
     labels: dict[str, Tensor]
-    """task -> [B] int64, -1 = unlabelled; only supervised references look at it."""
+    """task -> [B] int64, -1 = unlabelled. Only supervised methods use it."""
     rows: Tensor
-    """[B] int64, the row of each pair in its pack (memory banks are indexed by it)."""
+    """[B] int64, the row of each pair in its pack. Memory banks are indexed by it."""
 
 
 class Method(nn.Module, ABC):
-    """A pre-training method. Devices, precision, optimisers, logging and checkpoints are never its business."""
+    """A pre-training method.
+
+    It computes losses. Devices, precision, optimisers, logging and checkpoints belong to the training loop.
+    """
 
     views: ClassVar[int] = 1
-    """Views per image that ``forward`` unpacks."""
+    """Views per image that ``forward`` needs."""
 
     @abstractmethod
     def forward(self, batch: Views) -> dict[str, Tensor]:
-        """Scalars of one batch: "loss" is minimised, the rest is logged. Pure: no update, no print, no sync."""
+        """Return the scalars of one batch: "loss" is minimised, the others are logged.
+
+        It must be pure: no parameter update, no printing, no ``.item()``. ``torch.compile`` relies on it.
+        """
 
     @abstractmethod
     def encoders(self) -> dict[str, nn.Module]:
-        """What outlives pre-training: modality -> trunk from [B, C, H, W] to features [B, D]."""
+        """The networks that are kept: modality -> trunk from images [B, C, H, W] to features [B, D]."""
 
     def classifiers(self) -> dict[str, nn.Module]:
-        """task -> classifier from all ``encoders``' features, concatenated in their order, to logits; {} if none."""
+        """task -> classifier on the features of all ``encoders``, concatenated in their order. {} if there are none."""
         return {}
 
     def projectors(self) -> dict[str, nn.Module]:
-        """modality -> head from features into the space both modalities share, for retrieval; {} if there is none."""
+        """modality -> head from features into the space shared by both modalities. {} if there is none."""
         return {}
 
     def prepare(self, rows: Tensor) -> None:
-        """Called once, after the weights are drawn and before any are restored, with the pack rows [N] (ascending int64)
-        that training draws from: the place to make memory that is sized or indexed by them."""
+        """Allocate memory that depends on the training rows, e.g. a memory bank.
+
+        Called once, after the weights are initialised and before a checkpoint is loaded.
+
+        Args:
+            rows: [N] int64, the pack rows that training draws from, in ascending order.
+        """
         return
 
     def after_step(self, progress: float) -> None:
-        """What happens after the optimiser's step, e.g. the momentum update; ``progress`` runs from 0 to 1.
+        """Run the updates that follow the optimiser's step, e.g. of a momentum encoder.
 
-        What it needs of the batch, ``forward`` leaves in an attribute (``pending``) that ``forward`` never reads.
+        Values it needs from the batch are left by ``forward`` in the attribute ``pending``, which ``forward`` itself
+        never reads.
+
+        Args:
+            progress: Share of the run that is done, from 0 to 1.
         """
         return
 
 
 class Contrastive(Method):
-    """A method whose losses need nothing of a batch but what is computed from each pair apart: tensors [B, ...], row i of
-    pair i, such as embeddings.
+    """A method whose losses use only tensors that are computed separately for each pair.
 
-    Saying so in three parts lets the loop embed a batch in chunks (gradient caching) or on many processes (all-gathered
-    negatives) and contrast all of it at once (``training/step.py``).
+    It implements three functions instead of ``forward``. The training step can then embed a batch in chunks (gradient
+    caching) or on several processes (all-gathered negatives), and compute the loss over all of it (``training/step.py``).
     """
 
     @abstractmethod
-    def queries(self, batch: Views) -> dict[str, Tensor]:
-        """Embeddings that gradients flow into."""
+    def queries(self, batch: Views) -> Embeddings:
+        """Embeddings that receive gradients."""
 
-    def keys(self, batch: Views) -> dict[str, Tensor]:
-        """What none flows into, such as embeddings of momentum towers, or the pairs' row numbers."""
+    def keys(self, batch: Views) -> Embeddings:
+        """Tensors without gradients, e.g. embeddings of momentum encoders, or row numbers."""
         return {}
 
     @abstractmethod
-    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The losses of ``forward`` from all ``queries`` and ``keys``, by name; may leave ``pending``."""
+    def contrast(self, z: Embeddings) -> dict[str, Tensor]:
+        """Compute the losses of ``forward`` from all ``queries`` and ``keys``. May set ``pending``."""
 
     def forward(self, batch: Views) -> dict[str, Tensor]:
         return self.contrast(self.queries(batch) | self.keys(batch))
 
 
+def with_sum(losses: dict[str, Tensor]) -> dict[str, Tensor]:
+    """``losses`` and, as "loss", their sum."""
+    return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+
+
 @dataclass(frozen=True, kw_only=True)
 class MethodConfig(Registered, ABC):
-    """Base of every method's config, which lies beside its method."""
+    """Base of every method's config. A config is defined in the same file as its method."""
+
+    needs_pairs: ClassVar[bool] = False
+    """Whether the method needs both modalities. If not, it also trains on vision or touch alone."""
 
     def check_fields(
         self,
@@ -100,7 +127,17 @@ class MethodConfig(Registered, ABC):
         share: tuple[str, ...] = (),
         width: tuple[str, ...] = (),
     ) -> None:
-        """ValueError unless the named fields are > 0, >= 0, in [0, 1] (or None) and 1 to 65536 (or None) respectively."""
+        """Check the ranges of the named fields.
+
+        Args:
+            positive: Fields that must be > 0.
+            weight: Fields that must be >= 0.
+            share: Fields that must be in [0, 1], or None.
+            width: Fields that must be from 1 to 65536.
+
+        Raises:
+            ValueError: For the first field out of range.
+        """
         for name in positive:
             if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
                 raise ValueError(f"{name} {getattr(self, name)}: give a positive number")
@@ -114,23 +151,26 @@ class MethodConfig(Registered, ABC):
             if not 1 <= getattr(self, name) <= 65536:
                 raise ValueError(f"{name} {getattr(self, name)}: give 1 to 65536")
 
-    def check_pairs(self, spec: DataSpec) -> None:
-        """ValueError unless the dataset has both modalities."""
-        if len(spec.modalities) < 2:
-            have = ", ".join(spec.modalities)
+    def check_modalities(self, spec: DataSpec) -> None:
+        """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
+        if self.needs_pairs and len(spec.modalities) < 2:
+            others = sorted(name for name, config in self.choices.items() if not config.needs_pairs)  # type: ignore
             raise ValueError(
-                f"method {self.name!r} learns from pairs, dataset {spec.name!r} has {have} only:"
-                " choose --method mvitac or a method per modality (simclr, moco, byol, dino, vicreg)"
+                f"method {self.name!r} learns from pairs, but dataset {spec.name!r} has {', '.join(spec.modalities)} only:"
+                f" choose a --method that needs no pairs ({', '.join(others)})"
             )
 
     def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
-        """Tasks whose labels it learns from; none for a self-supervised method."""
+        """Tasks whose labels the method learns from. Empty for a self-supervised method."""
         return ()
 
     def without_idle(self, spec: DataSpec) -> Self:
-        """The same method on a dataset, settings that do nothing there at one value: equal ones train alike."""
+        """This config with every setting that has no effect on the dataset at a fixed value.
+
+        Two configs that train alike on the dataset become equal.
+        """
         return self
 
     @abstractmethod
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> Method:
-        """The method with fresh weights for a dataset; ValueError if it cannot work on that dataset."""
+        """Create the method with fresh weights. Raises ValueError if it cannot work on the dataset."""

@@ -1,7 +1,7 @@
-"""Supervised fusion of Calandra et al. (2017): a trunk per stream (vision, left gel, right gel), one MLP on all of them.
+"""Supervised fusion of Calandra et al. (2017): a trunk per stream (vision, left gel, right gel) and an MLP on all of them.
 
-The layout is that of TACTO's grasp-stability experiment, which MViTac ran for its Table II: a ResNet-18 per stream, pooled
-features concatenated, linear layers 512 - 256 - classes with ReLU between (arXiv:1710.05512 and
+The architecture is that of TACTO's grasp-stability experiment, which MViTac ran for its Table II: a ResNet-18 per stream,
+concatenated pooled features, and linear layers 512 - 256 - classes with ReLU between (arXiv:1710.05512 and
 https://github.com/facebookresearch/tacto, experiments/grasp_stability). Streams share no weights.
 """
 
@@ -20,7 +20,7 @@ from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
 
 @dataclass(frozen=True, kw_only=True)
 class CalandraConfig(LabelledConfig):
-    """Supervised grasp prediction with a trunk per camera and per gel, end to end."""
+    """Supervised grasp prediction with a trunk per camera and per gel, trained end to end."""
 
     name: ClassVar[str] = "calandra"
 

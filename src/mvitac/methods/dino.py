@@ -1,13 +1,15 @@
-"""DINO (Caron et al., ICCV 2021, arXiv:2104.14294) for each modality by itself: no negatives, K made-up classes.
+"""DINO (Caron et al., ICCV 2021, arXiv:2104.14294), for each modality separately: no negatives, K learned prototypes.
 
-A head turns features into scores of K prototypes. The student's distribution over them for one view must match the momentum
-(teacher) tower's for the other view, both ways round:
+A head turns features into scores of K prototypes. The student's distribution over them for one view must match that of the
+momentum (teacher) tower for the other view, in both directions:
 
     L = -sum_k P_t(k) log P_s(k),    P_s = softmax(s / tau_s),    P_t = softmax((t - c) / tau_t)
 
-The centre c, a moving mean of the teacher's scores, keeps one prototype from taking all; the sharp tau_t keeps the answer
-from being even. Sources: the paper (eq. 1-4, appendix C); https://github.com/facebookresearch/dino (main_dino.py).
-Left out: small local crops (every method here sees two views), tau_t's warm-up, the last layer's first frozen epoch.
+The centre c is a moving average of the teacher's scores and keeps one prototype from winning everywhere. The low
+temperature tau_t keeps the distribution from becoming uniform.
+Sources: the paper (eq. 1-4, appendix C); https://github.com/facebookresearch/dino (main_dino.py).
+Not implemented: small local crops (every method here uses two views), the warm-up of tau_t, and freezing the last layer in
+the first epoch.
 """
 
 from __future__ import annotations
@@ -21,9 +23,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, build_towers
-from mvitac.nn.momentum import Momentum, rising
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
+from mvitac.nn.momentum import Momentum, momentum_at
 
 BOTTLENECK = 256
 
@@ -35,17 +37,17 @@ class DINOConfig(MethodConfig):
     name: ClassVar[str] = "dino"
 
     student_temperature: float = 0.1
-    """tau_s (DINO: .1)."""
+    """Student temperature tau_s (DINO: .1)."""
     teacher_temperature: float = 0.04
-    """tau_t (DINO: .04, in long runs rising to .07)."""
+    """Teacher temperature tau_t (DINO: .04, rising to .07 in long runs)."""
     centre_momentum: float = 0.9
-    """Share of its old value that the centre keeps at a step (DINO: .9)."""
+    """Share of the old value that the centre keeps in a step (DINO: .9)."""
     momentum: float = 0.996
-    """m of the teacher at the start (DINO: .996)."""
+    """Momentum m of the teacher at the start (DINO: .996)."""
     momentum_end: float | None = 1.0
-    """m rises to this along a half cosine (DINO: 1)."""
+    """Value to which m rises along a half cosine (DINO: 1)."""
     out: int = 4096
-    """K, prototypes; DINO's 65,536 are 5 % of ImageNet, 4,096 are 5 % of Touch and Go."""
+    """Number of prototypes K. DINO's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
     hidden: int = 2048
     """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
 
@@ -61,7 +63,7 @@ class DINOConfig(MethodConfig):
 
 
 class Prototypes(nn.Module):
-    """Features [B, D] to cosines [B, K] with K directions, through an MLP with a bottleneck."""
+    """An MLP with a bottleneck: features [B, D] to cosines [B, K] with K learned directions."""
 
     def __init__(self, features: int, hidden: int, num: int) -> None:
         super().__init__()
@@ -75,7 +77,7 @@ class Prototypes(nn.Module):
 
 
 def agreement(student: Float[Tensor, "B K"], teacher: Float[Tensor, "B K"]) -> Float[Tensor, ""]:
-    """Cross-entropy of the student's scores with the teacher's distribution, both divided by their temperatures; mean."""
+    """Cross-entropy between the teacher's and the student's distribution; scores are already divided by temperature."""
     return -(teacher.softmax(dim=1) * student.log_softmax(dim=1)).sum(1).mean()
 
 
@@ -94,30 +96,30 @@ class DINO(Contrastive):
         self.register_buffer("centre", torch.zeros(len(self.student), config.out))
         self.pending: Tensor | None = None
 
-    def queries(self, batch: Views) -> dict[str, Tensor]:
-        return {f"{m}_s{i}": tower(batch.images[m][i]) for m, tower in self.student.items() for i in (0, 1)}
+    def queries(self, batch: Views) -> Embeddings:
+        return {("student", m, i): tower(batch.images[m][i]) for m, tower in self.student.items() for i in (0, 1)}
 
-    def keys(self, batch: Views) -> dict[str, Tensor]:
-        return {f"{m}_t{i}": tower(batch.images[m][i]) for m, tower in self.teacher.items() for i in (0, 1)}
+    def keys(self, batch: Views) -> Embeddings:
+        return {("teacher", m, i): tower(batch.images[m][i]) for m, tower in self.teacher.items() for i in (0, 1)}
 
-    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+    def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         config, losses, means = self.config, {}, []
         with torch.autocast(self.centre.device.type, enabled=False):
             for m, centre in zip(self.student, self.centre, strict=True):
-                s = [z[f"{m}_s{i}"].float() / config.student_temperature for i in (0, 1)]
-                raw = [z[f"{m}_t{i}"].float() for i in (0, 1)]
+                s = [z["student", m, i].float() / config.student_temperature for i in (0, 1)]
+                raw = [z["teacher", m, i].float() for i in (0, 1)]
                 t = [(scores - centre) / config.teacher_temperature for scores in raw]
                 losses[m] = (agreement(s[0], t[1]) + agreement(s[1], t[0])) / 2
                 means.append(torch.cat(raw).mean(0))
         self.pending = torch.stack(means)
-        return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+        return with_sum(losses)
 
     def encoders(self) -> dict[str, nn.Module]:
-        return {m: tower.trunk for m, tower in self.student.items()}  # type: ignore[misc]
+        return trunks(self.student)
 
     def after_step(self, progress: float) -> None:
-        assert self.pending is not None, "forward comes first"
+        assert self.pending is not None, "call forward first"
         self.centre.lerp_(self.pending, 1 - self.config.centre_momentum)
-        m = rising(self.config.momentum, self.config.momentum_end, progress)
+        m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for modality, tower in self.student.items():
             self.teacher[modality].follow(tower, m)  # type: ignore[operator]

@@ -1,7 +1,7 @@
-"""MoCo v2 (He et al., CVPR 2020, arXiv:1911.05722; Chen et al., arXiv:2003.04297) for each modality by itself.
+"""MoCo v2 (He et al., CVPR 2020, arXiv:1911.05722; Chen et al., arXiv:2003.04297), for each modality separately.
 
-A query's positive is the momentum tower's embedding of another view of its image; its negatives are the queue of the last
-K keys, never the other keys of its batch. MViTac keeps the momentum tower and drops the queue.
+The positive of a query is the momentum tower's embedding of another view of the same image. The negatives are a queue of
+the last K keys; the other keys of the batch are not used. MViTac keeps the momentum tower and drops the queue.
 """
 
 from __future__ import annotations
@@ -10,34 +10,33 @@ from abc import ABC
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, Head, build_towers
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.nn.encoders import EncoderConfig, Head, build_towers, trunks
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
-from mvitac.nn.momentum import Momentum, rising
+from mvitac.nn.momentum import Momentum, momentum_at
 
 
 @dataclass(frozen=True, kw_only=True)
 class QueueConfig(MethodConfig, ABC):
-    """Base of their configs; no method by itself."""
+    """Fields shared by the methods with a queue (moco, mct)."""
 
     queue: int = 4096
-    """K, keys remembered for each head; MoCo's 65,536 are 5 % of ImageNet, 4,096 are 5 % of Touch and Go. Never more than
-    half the training rows, so that a row seldom meets its own older key."""
+    """Number of keys K in each queue. MoCo's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go. At most half the
+    training rows, so that a row seldom meets its own older key."""
     momentum: float = 0.999
-    """m of the key towers (MoCo: .999)."""
+    """Momentum m of the key towers (MoCo: .999)."""
     momentum_end: float | None = None
-    """If given, m rises to this along a half cosine."""
+    """If given, m rises to this value along a half cosine."""
     out: int = 128
     """Width of the embeddings (MoCo: 128)."""
     hidden: int = 512
-    """Hidden width of the 2-layer heads (MoCo v2: the trunk's own width)."""
+    """Hidden width of the 2-layer heads (MoCo v2: the trunk's width)."""
     head_norm: bool = False
-    """BatchNorm after the heads' first layer (MoCo v2: none)."""
+    """BatchNorm after the first layer of the heads (MoCo v2: none)."""
 
     def __post_init__(self) -> None:
         self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
@@ -45,7 +44,7 @@ class QueueConfig(MethodConfig, ABC):
             raise ValueError(f"queue {self.queue}: give 1 to {1 << 24} keys")
 
     def queue_size(self, num_rows: int) -> int:
-        """Keys to remember when training on ``num_rows`` rows."""
+        """Number of keys to keep when training on ``num_rows`` rows."""
         return min(self.queue, max(1, num_rows // 2))
 
 
@@ -56,7 +55,7 @@ class MoCoConfig(QueueConfig):
     name: ClassVar[str] = "moco"
 
     temperature: float = 0.2
-    """tau (MoCo v2: .2)."""
+    """Temperature tau (MoCo v2: .2)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,24 +84,24 @@ class MoCo(Contrastive):
         size = self.config.queue_size(len(rows))
         self.queues = nn.ModuleDict({m: Queue(size, self.config.out) for m in self.query})
 
-    def queries(self, batch: Views) -> dict[str, Tensor]:
-        return {f"{m}_q": tower(batch.images[m][0]) for m, tower in self.query.items()}
+    def queries(self, batch: Views) -> Embeddings:
+        return {("q", m): tower(batch.images[m][0]) for m, tower in self.query.items()}
 
-    def keys(self, batch: Views) -> dict[str, Tensor]:
-        return {f"{m}_k": tower(batch.images[m][1]) for m, tower in self.key.items()}
+    def keys(self, batch: Views) -> Embeddings:
+        return {("k", m): tower(batch.images[m][1]) for m, tower in self.key.items()}
 
-    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
-        assert self.queues, "prepare(rows) comes first"
-        self.pending = {m: z[f"{m}_k"] for m in self.query}
+    def contrast(self, z: Embeddings) -> dict[str, Tensor]:
+        assert self.queues, "call prepare(rows) first"
+        self.pending = {m: z["k", m] for m in self.query}
+        tau = self.config.temperature
         queue: dict[str, Tensor] = {m: queue.keys for m, queue in self.queues.items()}  # type: ignore[misc]
-        losses = {m: queue_nce(z[f"{m}_q"], z[f"{m}_k"], queue[m], self.config.temperature) for m in self.query}
-        return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+        return with_sum({m: queue_nce(z["q", m], z["k", m], queue[m], tau) for m in self.query})
 
     def encoders(self) -> dict[str, nn.Module]:
-        return {m: tower.trunk for m, tower in self.query.items()}  # type: ignore[misc]
+        return trunks(self.query)
 
     def after_step(self, progress: float) -> None:
-        m = rising(self.config.momentum, self.config.momentum_end, progress)
+        m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for modality, tower in self.query.items():
             self.queues[modality].push(self.pending[modality])  # type: ignore[operator]
             self.key[modality].follow(tower, m)  # type: ignore[operator]

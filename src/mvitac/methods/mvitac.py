@@ -1,15 +1,24 @@
-"""MViTac (Dave, Lygerakis, Rueckert, ICRA 2024): intra- and inter-modal contrast of vision and touch, eq. 1-14.
+"""MViTac: contrastive learning within and across vision and touch (Dave, Lygerakis, Rueckert, ICRA 2024, eq. 1-14).
 
-Notation of the paper: encoders f(.; theta) for vision and f(.; psi) for touch; heads phi_v (vision, intra), phi_t
-(vision, inter), Phi_t (touch, intra), Phi_v (touch, inter); q = query, k = key. z_xy: x is the query's modality, y the
-key's. Two views of each image: the first feeds the query tower, the second the key tower. Shapes: images [B, C, H, W],
-features [B, D], embeddings z [B, 128].
+The paper's case, for a batch of vision images v and touch images t. A tower is a trunk with two heads, (intra, inter):
+
+    v_q, v_k = augment(v), augment(v);  t_q, t_k = augment(t), augment(t)
+    q_vv, q_vt = query_vision(v_q)                       # eq. 4, 9    theta; phi_v, phi_t
+    q_tt, q_tv = query_touch(t_q)                        # eq. 6, 12   psi; Phi_t, Phi_v
+    k_vv, k_tv = key_vision(v_k)                         # eq. 5, 13   no gradient
+    k_tt, k_vt = key_touch(t_k)                          # eq. 7, 10   no gradient
+    loss = nce(q_vv, k_vv) + nce(q_tt, k_tt) + lambda_inter * (nce(q_vt, k_vt) + nce(q_tv, k_tv))    # eq. 8, 11, 14
+    update(query_vision, query_touch, gradient(loss))
+    key = m * key + (1 - m) * query                      # eq. 1-3, for every parameter of both key towers
+
+Notation of the paper: f(.; theta) encodes vision, f(.; psi) touch. Heads: phi_v (vision, intra), phi_t (vision, inter),
+Phi_t (touch, intra), Phi_v (touch, inter). In z_xy, x is the modality of the query and y the modality of the key.
+Shapes: images [B, C, H, W], features [B, D], embeddings z [B, 128].
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
 
@@ -17,108 +26,107 @@ import torch
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
+from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers, num_features, trunks
 from mvitac.nn.losses import info_nce
-from mvitac.nn.momentum import Momentum, rising
+from mvitac.nn.momentum import Momentum, momentum_at
+from mvitac.registry import LATER_IN_DIGEST
 from mvitac.system.processes import in_branches
 
 PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
-"""loss -> modality of its queries, of its keys."""
+"""loss -> (modality of its queries, modality of its keys)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MViTacConfig(MethodConfig):
-    """Momentum contrast within and across vision and touch; on touch-only (or vision-only) data its intra loss alone."""
+    """Momentum contrast within and across vision and touch. On one modality, only its intra-modal loss."""
 
     name: ClassVar[str] = "mvitac"
 
     temperature: float = 0.07
-    """tau of InfoNCE; the best of .07, .2, .5, 1 in the paper."""
+    """Temperature tau of InfoNCE. The paper compares .07, .2, .5 and 1; .07 is best."""
     lambda_inter: float = 1.0
-    """Weight of the two inter-modal losses (eq. 14); not given in the paper, 1 in the authors' code."""
+    """Weight of the two inter-modal losses (eq. 14). Not given in the paper; 1 in the authors' code."""
     momentum: float = 0.99
-    """m of eq. 1-3; not given in the paper, .99 in the authors' code."""
+    """Momentum m of eq. 1-3. Not given in the paper; .99 in the authors' code."""
     momentum_end: float | None = None
-    """If given, m rises to this along a half cosine (as in BYOL and MoCo v3); the paper has no schedule."""
+    """If given, m rises to this value along a half cosine (as in BYOL and MoCo v3). The paper has no schedule."""
     keys: Literal["momentum", "end-to-end"] = "momentum"
-    """Where keys come from: a momentum tower (the paper), or the query tower itself, learning from them too (SimCLR; named
-    as in MoCo, figure 2). The latter is symmetric as it is, and takes no momentum."""
+    """Network that computes the keys. momentum: a momentum copy of the query tower (paper). end-to-end: the query tower
+    itself, with gradients (as in SimCLR; the name is from MoCo, figure 2). end-to-end is always symmetric and ignores the
+    momentum."""
     key_norm: Literal["batch", "running"] = "batch"
-    """Statistics of BatchNorm in momentum towers: of their own batch (the authors' code), or those that follow the query
-    tower's (EMAN, arXiv:2101.08482)."""
+    """BatchNorm statistics of momentum towers. batch: of their own batch (authors' code). running: moving averages that
+    follow the query tower (EMAN, arXiv:2101.08482)."""
     symmetric: bool = False
-    """Each view is query and key in turn, the loss the mean of both ways (BYOL, MoCo v3); the paper has one way."""
-    pairs: Literal["crossed", "all"] = "crossed"
-    """Which views the inter-modal losses pair: a view of one modality with the other's other view (the paper's query and
-    key), or with both, at the same forward passes. "all" needs each view as query and key: end-to-end or symmetric."""
+    """Use each view as query and as key, and average both losses (BYOL, MoCo v3). The paper does not."""
+    pairs: Literal["crossed", "all"] = field(default="crossed", metadata=LATER_IN_DIGEST)
+    """Views paired by the inter-modal losses. crossed: a view of one modality with the other view of the other modality
+    (paper). all: with both views of the other modality, at no extra forward pass; needs end-to-end or symmetric."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
-    """Which of the four losses of eq. 14 to minimise; the paper minimises all."""
+    """Losses of eq. 14 to minimise. The paper minimises all four."""
     shared_heads: bool = False
-    """One head per encoder for intra and inter losses alike, instead of the paper's two."""
+    """Use one head per encoder for intra- and inter-modal losses. The paper uses two."""
     out: int = 128
     """Width of the embeddings z (paper: 128)."""
     hidden: int = 512
-    """Hidden width of the 2-layer heads; not given in the paper (2048 in the authors' code), 512 is the trunk's width."""
+    """Hidden width of the 2-layer heads. Not given in the paper; 2048 in the authors' code; 512 is the trunk's width."""
     dropout: float = 0.0
-    """Dropout in the heads; none in the paper, .5 in the authors' code."""
+    """Dropout in the heads. None in the paper; .5 in the authors' code."""
     head_norm: bool = False
-    """BatchNorm after the heads' first layer, as in MoCo v3 and SimCLR v2; none in the paper."""
+    """BatchNorm after the first layer of the heads, as in MoCo v3 and SimCLR v2. None in the paper."""
 
     def __post_init__(self) -> None:
-        if not (self.temperature > 0 and math.isfinite(self.temperature)):
-            raise ValueError(f"temperature {self.temperature}: give a positive number, e.g. 0.07")
-        if not (self.lambda_inter >= 0 and math.isfinite(self.lambda_inter)):
-            raise ValueError(f"lambda_inter {self.lambda_inter}: give a finite weight >= 0")
-        for name, m in (("momentum", self.momentum), ("momentum_end", self.momentum_end)):
-            if m is not None and not 0 <= m <= 1:
-                raise ValueError(f"{name} {m}: give 0 (keys copy the queries) to 1 (keys never move)")
-        for name, width in (("out", self.out), ("hidden", self.hidden)):
-            if not 1 <= width <= 65536:
-                raise ValueError(f"head width {name} {width}: give 1 to 65536")
+        self.check_fields(
+            positive=("temperature",),
+            weight=("lambda_inter",),
+            share=("momentum", "momentum_end"),
+            width=("out", "hidden"),
+        )
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if self.pairs == "all" and not self.both_ways:
             raise ValueError(
-                "pairs 'all' need each view as query and as key: give keys 'end-to-end', symmetric, or pairs 'crossed'"
+                "pairs 'all' needs each view as query and as key: give keys 'end-to-end', symmetric, or pairs 'crossed'"
             )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
 
     @property
     def both_ways(self) -> bool:
-        """Whether each view is query and key."""
+        """Whether each view is used as query and as key."""
         return self.symmetric or self.keys == "end-to-end"
 
     def without_idle(self, spec: DataSpec) -> Self:
-        mine = replace(self, losses=tuple(part for part in _possible(spec) if part in self.losses))
+        mine = replace(self, losses=tuple(part for part in possible_losses(spec) if part in self.losses))
         return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
-        if not set(self.losses) & set(_possible(spec)):
+        possible = possible_losses(spec)
+        if not set(self.losses) & set(possible):
             raise ValueError(
                 f"losses {', '.join(self.losses)} need another modality than dataset {spec.name!r} has:"
-                f" give some of {', '.join(_possible(spec))}"
+                f" give some of {', '.join(possible)}"
             )
         return MViTac(self, spec, encoder)
 
 
-def _possible(spec: DataSpec) -> tuple[str, ...]:
-    """The losses of eq. 14 that a dataset's modalities allow."""
-    own = tuple({"vision": "vv", "touch": "tt"}[m] for m in spec.modalities)
-    return (*own, "vt", "tv") if len(own) == 2 else own
+def possible_losses(spec: DataSpec) -> tuple[str, ...]:
+    """The losses of eq. 14 that can be computed with a dataset's modalities."""
+    return tuple(part for part, used in PARTS.items() if set(used) <= set(spec.modalities))
 
 
 class Tower(nn.Module):
-    """One encoder with its two heads: an image passes the trunk once and leaves as (z intra, z inter)."""
+    """An encoder with two heads: images [B, C, H, W] to embeddings (z intra, z inter), in one pass of the trunk."""
 
     def __init__(self, config: MViTacConfig, encoder: EncoderConfig, channels: int) -> None:
         super().__init__()
         self.trunk = build_trunk(encoder, channels)
 
         def head() -> Head:
-            features = int(self.trunk.num_features)  # type: ignore[arg-type]
-            return Head(features, config.hidden, config.out, dropout=config.dropout, norm=config.head_norm)
+            return Head(
+                num_features(self.trunk), config.hidden, config.out, dropout=config.dropout, norm=config.head_norm
+            )
 
         self.intra = head()
         self.inter = self.intra if config.shared_heads else head()
@@ -128,24 +136,11 @@ class Tower(nn.Module):
         return self.intra(features), self.inter(features)
 
 
-def _embed(towers: nn.ModuleDict, batch: Views, name: str, views: list[int]) -> dict[str, Tensor]:
-    """Embeddings of ``views`` of each modality by both heads, named e.g. q0_vision_intra."""
-
-    def of(modality: str) -> dict[str, Tensor]:
-        z = {}
-        for view in views:
-            intra, inter = towers[modality](batch.images[modality][view])
-            z |= {f"{name}{view}_{modality}_intra": intra, f"{name}{view}_{modality}_inter": inter}
-        return z
-
-    branches = [partial(of, modality) for modality in towers]
-    if batch.rows.device.type != "cpu" or draws_random_numbers(towers):
-        return {key: tensor for branch in branches for key, tensor in branch().items()}
-    return in_branches(branches)
-
-
 class MViTac(Contrastive):
-    """Query towers, their momentum copies, four losses."""
+    """Query towers, their momentum copies, and the four losses. The module's docstring has it in pseudo-code.
+
+    Embeddings are keyed ``(q or k, modality, view, head)``, e.g. ``z["q", "vision", 0, "intra"]`` for q_vv.
+    """
 
     views = 2
 
@@ -158,42 +153,61 @@ class MViTac(Contrastive):
         running = config.key_norm == "running"
         self.key = nn.ModuleDict({m: Momentum(tower, running_norm=running) for m, tower in momentum.items()})
 
-    @property
-    def directions(self) -> tuple[tuple[int, int], ...]:
-        """(view of the query, view of the key) of every term of a loss."""
-        return ((0, 1), (1, 0)) if self.config.both_ways else ((0, 1),)
+    def queries(self, batch: Views) -> Embeddings:
+        """Eq. 4, 6, 9, 12."""
+        views = (0, 1) if self.config.both_ways else (0,)
+        return embed("q", self.query, batch, views)
 
-    def queries(self, batch: Views) -> dict[str, Tensor]:
-        return _embed(self.query, batch, "q", [q for q, _ in self.directions])  # eq. 4, 6, 9, 12
+    def keys(self, batch: Views) -> Embeddings:
+        """Eq. 5, 7, 10, 13. End-to-end keys are the queries themselves, so there is nothing to add."""
+        views = (1, 0) if self.config.both_ways else (1,)
+        return embed("k", self.key, batch, views)
 
-    def keys(self, batch: Views) -> dict[str, Tensor]:
-        return _embed(self.key, batch, "k", [k for _, k in self.directions])  # eq. 5, 7, 10, 13
-
-    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
-        tower = "q" if self.config.keys == "end-to-end" else "k"
+    def contrast(self, z: Embeddings) -> dict[str, Tensor]:
+        k = "q" if self.config.keys == "end-to-end" else "k"
         losses = {}
-        for part, (mine, other) in PARTS.items():
-            if mine not in self.query or other not in self.query:
-                continue
-            head = "intra" if mine == other else "inter"
-            same = ((0, 0), (1, 1)) if head == "inter" and self.config.pairs == "all" else ()
-            ways = [
-                info_nce(z[f"q{query}_{mine}_{head}"], z[f"{tower}{key}_{other}_{head}"], self.config.temperature)
-                for query, key in self.directions + same
-            ]
-            losses[part] = torch.stack(ways).mean()  # eq. 8, 11
+        for part, (x, y) in PARTS.items():
+            if x in self.query and y in self.query:
+                head = "intra" if x == y else "inter"
+                pairs = self.view_pairs(head)
+                terms = [info_nce(z["q", x, i, head], z[k, y, j, head], self.config.temperature) for i, j in pairs]
+                losses[part] = torch.stack(terms).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
-        # A loss that is left out of the sum is still told, as a witness of what the others do to it.
-        weighted = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
-        return {"loss": torch.stack(weighted).sum(), **losses}  # eq. 14, or what is left of it with one modality
+        minimised = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
+        return {"loss": torch.stack(minimised).sum(), **losses}  # eq. 14; losses that are not minimised are logged too
+
+    def view_pairs(self, head: str) -> tuple[tuple[int, int], ...]:
+        """(view of the query, view of the key) of each term of a loss. The paper: ((0, 1),)."""
+        crossed = ((0, 1), (1, 0)) if self.config.both_ways else ((0, 1),)
+        # An image's view with itself would be no task, so only inter-modal losses pair equal views.
+        return (*crossed, (0, 0), (1, 1)) if head == "inter" and self.config.pairs == "all" else crossed
 
     def encoders(self) -> dict[str, nn.Module]:
-        return {m: tower.trunk for m, tower in self.query.items()}  # type: ignore[misc]
+        return trunks(self.query)
 
     def projectors(self) -> dict[str, nn.Module]:
         return {m: tower.inter for m, tower in self.query.items()}  # type: ignore[misc]
 
     def after_step(self, progress: float) -> None:
-        m = rising(self.config.momentum, self.config.momentum_end, progress)
+        m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for modality, key in self.key.items():
             key.follow(self.query[modality], m)  # type: ignore[operator]  # eq. 1-3
+
+
+def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...]) -> Embeddings:
+    """Embeddings of ``views`` of each modality by both heads, keyed ``(name, modality, view, head)``.
+
+    On a CPU the two towers run side by side, except with dropout, which needs one order of random numbers.
+    """
+
+    def of(modality: str) -> Embeddings:
+        z: Embeddings = {}
+        for view in views:
+            images = batch.images[modality][view]
+            z[name, modality, view, "intra"], z[name, modality, view, "inter"] = towers[modality](images)
+        return z
+
+    branches = [partial(of, modality) for modality in towers]
+    if batch.rows.device.type != "cpu" or draws_random_numbers(towers):
+        return {key: tensor for branch in branches for key, tensor in branch().items()}
+    return in_branches(branches)

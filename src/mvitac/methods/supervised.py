@@ -1,7 +1,7 @@
-"""The supervised reference: one trunk per modality, features concatenated, one linear layer per task, end to end.
+"""The supervised reference: one trunk per modality, concatenated features, one linear layer per task, trained end to end.
 
-As the paper describes its ResNet-18 rows (appendix C). It is also the yardstick that says how much of a task the labels
-could teach the same network: its own classifiers are scored, and its frozen trunks probed like any other method's.
+This is how the paper describes its ResNet-18 rows (appendix C). It also shows how much of a task the same network can learn
+from labels: its own classifiers are scored, and its frozen trunks are probed like those of any other method.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Method, MethodConfig, Views
+from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
 from mvitac.registry import unknown
 
 
 @dataclass(frozen=True, kw_only=True)
 class LabelledConfig(MethodConfig):
-    """What the supervised references share: which labels they learn from, which images they see."""
+    """Fields shared by the supervised methods: tasks and modalities to learn from."""
 
     tasks: tuple[str, ...] = ()
-    """Tasks to learn; none given = all of the dataset's."""
+    """Tasks to learn. Default: all tasks of the dataset."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
-    """Modalities to learn from; none given = all the dataset has."""
+    """Modalities to learn from. Default: all modalities of the dataset."""
 
     def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
         known = [task.name for task in spec.tasks]
@@ -38,7 +38,7 @@ class LabelledConfig(MethodConfig):
         return self.tasks or tuple(known)
 
     def modalities_of(self, spec: DataSpec) -> tuple[str, ...]:
-        """The modalities to learn from, in the dataset's order; ValueError if it lacks one."""
+        """The modalities to learn from, in the dataset's order. Raises ValueError if the dataset lacks one."""
         for modality in self.modalities:
             if modality not in spec.modalities:
                 raise unknown("modality", modality, spec.modalities)
@@ -48,14 +48,14 @@ class LabelledConfig(MethodConfig):
         return replace(self, modalities=self.modalities_of(spec))
 
     def num_classes(self, spec: DataSpec) -> dict[str, int]:
-        """task -> number of classes, for the tasks to learn."""
+        """task -> number of classes, for each task to learn."""
         known = {task.name: len(task.classes) for task in spec.tasks}
         return {name: known[name] for name in self.labels_needed(spec)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class SupervisedConfig(LabelledConfig):
-    """Cross-entropy on the dataset's own labels, all tasks at once unless one is named."""
+    """Cross-entropy on the labels of the dataset, on all tasks at once unless tasks are named."""
 
     name: ClassVar[str] = "supervised"
 
@@ -66,12 +66,12 @@ class SupervisedConfig(LabelledConfig):
 
 
 class Supervised(Method):
-    """Concatenated features to one classifier per task."""
+    """One classifier per task on the concatenated features."""
 
     def __init__(self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module]) -> None:
         super().__init__()
         self.trunks = nn.ModuleDict(trunks)
-        # Task names may hold characters a module name may not, hence the list.
+        # A list, because task names may contain characters that module names may not.
         self.tasks = tuple(classifiers)
         self.heads = nn.ModuleList(classifiers.values())
 
@@ -81,8 +81,8 @@ class Supervised(Method):
         for task, head in zip(self.tasks, self.heads, strict=True):
             labels = batch.labels[task]
             total = F.cross_entropy(head(features).float(), labels, ignore_index=-1, reduction="sum")
-            losses[task] = total / (labels >= 0).sum().clamp(min=1)  # a batch without labels is 0, not NaN
-        return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+            losses[task] = total / (labels >= 0).sum().clamp(min=1)  # 0, not NaN, for a batch without labels
+        return with_sum(losses)
 
     def encoders(self) -> dict[str, nn.Module]:
         return dict(self.trunks.items())

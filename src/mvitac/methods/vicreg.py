@@ -1,13 +1,13 @@
-"""VICReg (Bardes, Ponce, LeCun, ICLR 2022, arXiv:2105.04906) for each modality by itself: no negatives, no second tower.
+"""VICReg (Bardes, Ponce, LeCun, ICLR 2022, arXiv:2105.04906), for each modality separately: no negatives, one tower.
 
 Embeddings Z, Z' [B, D] of two views, eq. 1-6:
 
-    v(Z) = mean over dimensions of max(0, 1 - sqrt(Var(z_j) + 1e-4))      variance: every dimension stays spread
-    c(Z) = 1/D * sum of squared off-diagonal entries of Cov(Z)            covariance: dimensions say different things
-    s    = mean squared difference of Z and Z'                            invariance: two views of one image agree
+    v(Z) = mean over dimensions of max(0, 1 - sqrt(Var(z_j) + 1e-4))      variance: no dimension collapses
+    c(Z) = 1/D * sum of squared off-diagonal entries of Cov(Z)            covariance: dimensions are decorrelated
+    s    = mean squared difference of Z and Z'                            invariance: two views of an image agree
     L    = 25 s + 25 (v(Z) + v(Z')) / 2 + 1 (c(Z) + c(Z'))
 
-The half at the variance term is the authors' code's (https://github.com/facebookresearch/vicreg), not the paper's.
+The factor 1/2 of the variance term is from the authors' code (https://github.com/facebookresearch/vicreg), not the paper.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, build_towers
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
 
 
 @dataclass(frozen=True, kw_only=True)
 class VICRegConfig(MethodConfig):
-    """Variance, invariance, covariance of two views, per modality."""
+    """Variance, invariance and covariance terms on two views, per modality."""
 
     name: ClassVar[str] = "vicreg"
 
@@ -38,7 +38,7 @@ class VICRegConfig(MethodConfig):
     covariance: float = 1.0
     """Weight of c (VICReg: 1)."""
     hidden: int = 2048
-    """Width of the three layers of the expander: four times the trunk's, as VICReg's 8192 is four times ResNet-50's."""
+    """Width of the three expander layers. Four times the trunk's width, as VICReg's 8192 is four times that of ResNet-50."""
 
     def __post_init__(self) -> None:
         self.check_fields(weight=("invariance", "variance", "covariance"), width=("hidden",))
@@ -77,20 +77,20 @@ class VICReg(Contrastive):
 
         self.towers = build_towers(encoder, spec, expander)
 
-    def queries(self, batch: Views) -> dict[str, Tensor]:
-        return {f"{m}_{i}": tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}
+    def queries(self, batch: Views) -> Embeddings:
+        return {(m, i): tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}
 
-    def contrast(self, z: dict[str, Tensor]) -> dict[str, Tensor]:
+    def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         losses: dict[str, Tensor] = {}
         for modality in self.towers:
-            first, second = (z[f"{modality}_{i}"].float() for i in (0, 1))
+            first, second = (z[modality, i].float() for i in (0, 1))
             with torch.autocast(first.device.type, enabled=False):
                 s = F.mse_loss(first, second)
                 v = (variance(first) + variance(second)) / 2
                 c = covariance(first) + covariance(second)
             weights = self.config
             losses[modality] = weights.invariance * s + weights.variance * v + weights.covariance * c
-        return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+        return with_sum(losses)
 
     def encoders(self) -> dict[str, nn.Module]:
-        return {m: tower.trunk for m, tower in self.towers.items()}  # type: ignore[misc]
+        return trunks(self.towers)

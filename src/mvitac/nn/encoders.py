@@ -1,4 +1,4 @@
-"""Trunks (any timm model by name), their weights, and the projection heads."""
+"""Trunks (any timm model), their initial weights, and projection heads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IMAGENET, SCRATCH = "imagenet", "scratch"
 
 @register_model
 def mvitac_tiny(pretrained: bool = False, **kwargs: Any) -> ResNet:
-    """A ResNet of one thin block per stage (64-d features, 78 k parameters): for tests and the smoke recipe."""
+    """A ResNet with one narrow block per stage (64 features, 78 k parameters), for tests and the smoke recipe."""
     if pretrained:
         raise ValueError("mvitac_tiny has no ImageNet weights: use --encoder.weights scratch")
     for key in ("pretrained_cfg", "pretrained_cfg_overlay", "cache_dir"):
@@ -33,12 +33,13 @@ def mvitac_tiny(pretrained: bool = False, **kwargs: Any) -> ResNet:
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
-    """The network under both modalities."""
+    """The network that encodes each modality."""
 
     trunk: str = "resnet18.tv_in1k"
-    """Any timm model name; the paper uses ResNet-18 (resnet18.tv_in1k is torchvision's)."""
+    """Name of a timm model. The paper uses ResNet-18; resnet18.tv_in1k is torchvision's."""
     weights: str = IMAGENET
-    """`imagenet` (downloaded by timm), `scratch` (random), or a file with the trunk's state dict (.safetensors, .pth)."""
+    """Initial weights: `imagenet` (downloaded by timm), `scratch` (random), or a file with the trunk's state dict
+    (.safetensors, .pth)."""
 
     def __post_init__(self) -> None:
         if not timm.is_model(self.trunk.split(".")[0]):
@@ -48,10 +49,12 @@ class EncoderConfig:
 
 
 def build_trunk(config: EncoderConfig, channels: int) -> nn.Module:
-    """A trunk from ``channels`` x H x W to pooled features [B, D]; attribute ``num_features`` is D.
+    """Create a trunk that maps images [B, ``channels``, H, W] to pooled features [B, D]; ``trunk.num_features`` is D.
 
-    More than three input channels keep the pretrained stem: timm repeats and rescales its filters. Never falls back to
-    random weights in silence: ValueError if the asked-for weights cannot be had.
+    With more than three channels the pretrained stem is kept: timm repeats and rescales its filters.
+
+    Raises:
+        ValueError: If the requested weights are not available. There is no silent fallback to random weights.
     """
     return use_products(_from_timm(config, channels))
 
@@ -61,19 +64,20 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
     if config.weights == SCRATCH:
         try:
             return timm.create_model(config.trunk, **arguments)
-        except Exception as error:  # an unknown tag, or a trunk that cannot have these channels
+        except Exception as error:  # an unknown tag, or a trunk that does not support this number of channels
             raise ValueError(
-                f"trunk {config.trunk} cannot be made for {channels} channels ({brief(error)}): give another --encoder.trunk"
+                f"trunk {config.trunk} cannot be created for {channels} channels ({brief(error)}): give another"
+                " --encoder.trunk"
             ) from None
     if config.weights != IMAGENET:
-        # Checked here, not when the config is made: a finished run must load where its start weights are gone.
+        # Checked here, not in the config: a finished run must load after the file of its initial weights is gone.
         if not Path(config.weights).is_file():
             raise ValueError(f"weights {config.weights!r}: give imagenet, scratch, or a file that exists")
         try:
             return timm.create_model(
                 config.trunk, pretrained=True, pretrained_cfg_overlay={"file": config.weights}, **arguments
             )
-        except Exception as error:  # torch, safetensors and timm each raise their own kinds on a foreign file
+        except Exception as error:  # torch, safetensors and timm raise different types for an unsuitable file
             raise ValueError(f"{config.weights} does not hold weights for {config.trunk}: {brief(error)}") from None
     try:
         return timm.create_model(config.trunk, pretrained=True, **arguments)
@@ -85,7 +89,7 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
 
 
 class Head(nn.Sequential):
-    """Projection head g(.; phi): a 2-layer MLP, ReLU after the first layer, nothing after the last (paper, appendix A)."""
+    """Projection head g(.; phi): a 2-layer MLP with ReLU after the first layer only (paper, appendix A)."""
 
     def __init__(self, features: int, hidden: int, out: int, *, dropout: float = 0.0, norm: bool = False) -> None:
         layers: list[nn.Module] = [nn.Linear(features, hidden, bias=not norm)]
@@ -98,7 +102,7 @@ class Head(nn.Sequential):
 
 
 class Projected(nn.Module):
-    """A trunk with one head: images [B, C, H, W] to embeddings [B, D]."""
+    """A trunk with one head: images [B, C, H, W] to embeddings [B, E]."""
 
     def __init__(self, trunk: nn.Module, head: nn.Module) -> None:
         super().__init__()
@@ -109,20 +113,30 @@ class Projected(nn.Module):
 
 
 def num_features(trunk: nn.Module) -> int:
-    """Width D of a trunk's pooled features."""
+    """Width D of the pooled features of a trunk."""
     return int(trunk.num_features)  # type: ignore[arg-type]
 
 
 def draws_random_numbers(network: nn.Module) -> bool:
-    """Whether ``network`` has dropout of any kind: torch's and timm's layers name their rate in one of three ways."""
+    """Whether ``network`` has any kind of dropout. Layers of torch and timm call its rate p, drop_prob or drop_rate."""
     rates = ("p", "drop_prob", "drop_rate")
     return any(isinstance(rate := getattr(m, name, 0), float) and rate > 0 for m in network.modules() for name in rates)
 
 
 def build_towers(config: EncoderConfig, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
-    """A ``Projected`` per modality of ``spec``, with fresh weights drawn in its order; ``head`` makes one for D features."""
+    """A ``Projected`` trunk and head per modality of ``spec``. ``head`` creates a head for D features."""
     towers = nn.ModuleDict()
     for modality in spec.modalities:
         trunk = build_trunk(config, spec.channels(modality))
         towers[modality] = Projected(trunk, head(num_features(trunk)))
     return towers
+
+
+def trunks(towers: nn.ModuleDict) -> dict[str, nn.Module]:
+    """modality -> trunk of its tower."""
+    return {m: tower.trunk for m, tower in towers.items()}  # type: ignore[misc]
+
+
+def heads(towers: nn.ModuleDict) -> dict[str, nn.Module]:
+    """modality -> head of its ``Projected`` tower."""
+    return {m: tower.head for m, tower in towers.items()}  # type: ignore[misc]

@@ -1,6 +1,6 @@
-"""A trained linear probe that goes with a model: features in, class probabilities out.
+"""A trained linear probe that is published with a model: features in, class probabilities out.
 
-Shapes: B images, D features (of both modalities joined, vision first, where it reads both), K classes.
+Shapes: B images, D features (a probe on both modalities reads vision, then touch, concatenated), K classes.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import torch
 from torch import Tensor, nn
 
 UNSEEN = -1e4
-"""Logit of a class that training never showed: probability 0 in fp32, and still a number in fp16."""
+"""Logit of a class without training examples: probability 0 in fp32, and still finite in fp16."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeInfo:
-    """What a readout answers, from which modality, and how well it did on rows it never saw."""
+    """Task, modality and test score of a probe."""
 
     task: str
     modality: str
     """touch, vision or both."""
     classes: tuple[str, ...]
     accuracy: float
-    """On the test rows of the data it was trained on."""
+    """Accuracy on the test split of the dataset it was trained on."""
     majority: float
-    """Accuracy there of always saying the commonest class: the score to beat."""
+    """Accuracy on the same rows of always predicting the most frequent class."""
     num_test: int
 
     @property
@@ -40,24 +40,29 @@ class ProbeInfo:
 
 
 class LinearProbe(nn.Module):
-    """softmax(features W^T + b)."""
+    """softmax(features W^T + b).
+
+    Args:
+        question: What the probe predicts.
+        weight: [K, D], fp32.
+        bias: [K], fp32.
+    """
 
     weight: Tensor
     bias: Tensor
 
     def __init__(self, question: ProbeInfo, weight: Tensor, bias: Tensor) -> None:
-        """``weight`` [K, D], ``bias`` [K], both fp32."""
         super().__init__()
         num = len(question.classes)
         if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
             raise ValueError(
-                f"probe {question.name}: weights {tuple(weight.shape)} and {tuple(bias.shape)}"
-                f" do not belong to {num} classes"
+                f"probe {question.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
+                f" do not fit {num} classes: expected [{num}, D] and [{num}]"
             )
         if weight.dtype != torch.float32 or bias.dtype != torch.float32:
             raise ValueError(f"probe {question.name}: weights are {weight.dtype}, expected torch.float32")
         if not (weight.isfinite().all() and bias.isfinite().all()):
-            raise ValueError(f"probe {question.name}: its weights are not all numbers")
+            raise ValueError(f"probe {question.name}: its weights are not all finite")
         self.question = question
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)
@@ -68,9 +73,9 @@ class LinearProbe(nn.Module):
 
 
 def from_logistic(question: ProbeInfo, model: Any, mean: np.ndarray, std: np.ndarray) -> LinearProbe:
-    """A fitted scikit-learn ``LogisticRegression`` on (x - mean) / std, with the scaling folded into its weights."""
+    """Convert a scikit-learn ``LogisticRegression`` fitted on (x - mean) / std; the scaling is folded into the weights."""
     coef, intercept = np.asarray(model.coef_, float), np.asarray(model.intercept_, float)
-    if len(coef) == 1:  # two classes: one logit, of the second
+    if len(coef) == 1:  # with two classes scikit-learn has one logit, that of the second class
         coef, intercept = np.concatenate([0 * coef, coef]), np.concatenate([0 * intercept, intercept])
     num = len(question.classes)
     weight, bias = np.zeros((num, coef.shape[1])), np.full(num, UNSEEN)
@@ -80,7 +85,7 @@ def from_logistic(question: ProbeInfo, model: Any, mean: np.ndarray, std: np.nda
 
 
 def constant(question: ProbeInfo, label: int, dim: int) -> LinearProbe:
-    """Always class ``label``: all that can be learned where training shows one class only."""
+    """A probe that always predicts class ``label``, for training data with a single class."""
     bias = torch.full((len(question.classes),), UNSEEN)
     bias[label] = 0
     return LinearProbe(question, torch.zeros(len(question.classes), dim), bias)

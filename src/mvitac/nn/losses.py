@@ -1,4 +1,4 @@
-"""Contrastive losses as closed forms. B queries, B keys, D dimensions; row i of the keys is the positive of query i."""
+"""Contrastive losses. Shapes: B queries, B keys, D dimensions. Row i of the keys is the positive of query i."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 def info_nce(query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], temperature: float) -> Float[Tensor, ""]:
     """InfoNCE with in-batch negatives, mean over the queries (paper eq. 8 and 11).
 
-    L = -log( exp(q.k+ / tau) / sum_i exp(q.k_i / tau) ), the sum running over all B keys of the batch, the positive
-    included. Both inputs are L2-normalised here, and everything is computed in fp32 whatever the autocast: at
-    tau = .07 the logits span +-14, where bf16 keeps only two digits.
+    L = -log( exp(q.k+ / tau) / sum_i exp(q.k_i / tau) ), where the sum is over all B keys of the batch, including the
+    positive. This function L2-normalises both inputs. It computes in fp32, also under autocast: at tau = .07 the logits
+    span +-14, where bf16 keeps only two digits.
     """
     with torch.autocast(query.device.type, enabled=False):
         query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)
@@ -24,10 +24,10 @@ def info_nce(query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], temperature
 def queue_nce(
     query: Float[Tensor, "B D"], key: Float[Tensor, "B D"], queue: Float[Tensor, "K D"], temperature: float
 ) -> Float[Tensor, ""]:
-    """InfoNCE against a queue (MoCo, eq. 1): the negatives are its K keys, the other keys of the batch are not.
+    """InfoNCE with the K keys of a queue as negatives (MoCo, eq. 1). The other keys of the batch are not negatives.
 
-    L = -log( exp(q.k+ / tau) / (exp(q.k+ / tau) + sum_i exp(q.k_i / tau)) ), mean over the queries. Query and key are
-    L2-normalised here, the queue holds normalised keys; fp32 as in ``info_nce``.
+    L = -log( exp(q.k+ / tau) / (exp(q.k+ / tau) + sum_i exp(q.k_i / tau)) ), mean over the queries. This function
+    L2-normalises queries and keys; the queue must hold normalised keys. It computes in fp32, as ``info_nce``.
     """
     with torch.autocast(query.device.type, enabled=False):
         query, key = F.normalize(query.float(), dim=1), F.normalize(key.float(), dim=1)

@@ -1,6 +1,6 @@
-"""Keys remembered across batches: a queue of the last ones (MoCo), a bank with one per row of the data (CMC).
+"""Keys kept across batches: a queue of the latest keys (MoCo), and a bank with one key per training row (CMC).
 
-Both are read in ``forward`` and written in ``after_step`` only. Shapes: D dimensions, N rows, K places.
+Both are read in ``forward`` and written only in ``after_step``. Shapes: D dimensions, N rows, K places.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mvitac.system.distributed import World
 
 
 class Queue(nn.Module):
-    """The last K keys, L2-normalised; random directions until enough have come (as in MoCo)."""
+    """The latest K keys, L2-normalised. It starts with random directions, as in MoCo."""
 
     keys: Tensor
     """[K, D]."""
@@ -31,7 +31,7 @@ class Queue(nn.Module):
 
     @torch.no_grad()
     def push(self, keys: Float[Tensor, "B D"]) -> None:
-        """Put ``keys`` over the oldest ones; of more than K only the last K stay."""
+        """Replace the oldest keys by ``keys``. Of more than K keys only the last K are kept."""
         size = len(self.keys)
         keys = F.normalize(keys.float(), dim=1)[-size:]
         at = (self.place + torch.arange(len(keys), device=keys.device)) % size
@@ -40,37 +40,42 @@ class Queue(nn.Module):
 
 
 class Bank(nn.Module):
-    """One L2-normalised embedding per training row, which moves towards each new one of that row.
+    """One L2-normalised embedding per training row: a moving average of the row's embeddings.
 
-    It lies whole until ``shard_banks`` deals its rows out to many processes. ``state_dict`` is then to be asked for by all
-    at once: rank 0 gets the whole bank, the others none of it. ``load_state_dict`` wants the whole one everywhere.
+    ``shard_banks`` distributes the rows over the processes: row i belongs to process i mod size. After that, all processes
+    must call ``state_dict`` together. It returns the whole bank on rank 0 and nothing on the others. ``load_state_dict``
+    takes the whole bank on every process.
     """
 
     values: Tensor
-    """[N, D]. Sharded: this process's rows and a spare one, at which all others are looked up and written: so shapes depend
-    on no draw, and nothing waits for a GPU."""
+    """[N, D]. If sharded: the rows of this process and one spare row, which stands for the rows of all other processes.
+    With it, shapes do not depend on the drawn rows, so that nothing has to wait for a GPU."""
 
     def __init__(self, num_rows: int, width: int) -> None:
         super().__init__()
         self.num, self.world = num_rows, World()
-        bound = (3 / width) ** 0.5  # uniform in +-sqrt(3 / D): unit length in expectation, as CMC's code starts it
+        bound = (3 / width) ** 0.5  # uniform in +-sqrt(3 / D), as CMC's code: unit length in expectation
         self.register_buffer("values", torch.empty(num_rows, width).uniform_(-bound, bound))
 
     @property
     def num_own(self) -> int:
-        """Rows of the bank that this process holds."""
+        """Number of the bank's rows that this process holds."""
         return len(range(self.world.rank, self.num, self.world.size))
 
     def find(self, at: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
-        """Where in ``values`` the bank's rows ``at`` are."""
+        """Positions in ``values`` of the bank's rows ``at``; the spare row for rows of other processes."""
         rank, size = self.world.rank, self.world.size
         return at if size == 1 else torch.where(at % size == rank, at // size, self.num_own)
 
     def find_drawn(self, at: Int[Tensor, "B K"]) -> Int[Tensor, "B k"]:
-        """``find`` of those of the rows ``at``, drawn evenly, that this process holds, and of the spare row in between.
+        """Positions in ``values`` of those of the rows ``at`` that this process holds, padded with the spare row.
 
-        On one process k = K. On more it is a little above K times the share of rows held: that a query has more of them, and
-        loses those beyond, has a probability below 1e-32 (Chernoff's bound).
+        Args:
+            at: K rows for each query, drawn uniformly.
+
+        Returns:
+            [B, k]. On one process k = K. On several, k is a little above K times the share of rows this process holds. A
+            query with more such rows loses the excess; the probability of that is below 1e-32 (Chernoff bound).
         """
         place, mean = self.find(at), at.shape[1] * self.num_own / self.num
         width = math.ceil(mean + 12 * mean**0.5 + 50)
@@ -83,9 +88,17 @@ class Bank(nn.Module):
     def dots(
         self, query: Float[Tensor, "B D"], place: Int[Tensor, "B K"]
     ) -> tuple[Float[Tensor, "B K"], Bool[Tensor, "B K"]]:
-        """Inner products of each query, the same on all processes, with the rows found at ``place``; False where that is the
-        spare one, whose products mean nothing. What is made of the others goes through ``world.sum``."""
-        # All rows held at once, then the drawn ones: the same numbers as fetching B x K rows, in far less memory.
+        """Inner products of queries with bank rows.
+
+        Args:
+            query: The queries, the same on all processes.
+            place: Positions in ``values``, from ``find`` or ``find_drawn``.
+
+        Returns:
+            The inner products, and a mask that is False for the spare row, whose products have no meaning. Values computed
+            from the others must be summed over the processes with ``world.sum``.
+        """
+        # Multiply with all rows, then select the drawn ones: the same numbers as gathering B x K rows, in far less memory.
         return (self.world.spread(query) @ self.values.T).gather(1, place), place < self.num_own
 
     @torch.no_grad()
@@ -95,7 +108,7 @@ class Bank(nn.Module):
         self.values[at] = F.normalize(m * self.values[at] + (1 - m) * z.float(), dim=1)
 
     def _cut(self, whole: Float[Tensor, "N D"]) -> Tensor:
-        """What this process holds of ``whole``, as ``values``."""
+        """The part of ``whole`` that this process keeps in ``values``."""
         return whole if self.world.size == 1 else torch.cat([self.world.shard(whole), whole[:1]])
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
@@ -107,13 +120,13 @@ class Bank(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         whole = state_dict.get(f"{prefix}values")
-        if isinstance(whole, Tensor) and len(whole) == self.num:  # else torch says what is wrong with it
+        if isinstance(whole, Tensor) and len(whole) == self.num:  # otherwise torch reports what does not fit
             state_dict[f"{prefix}values"] = self._cut(whole)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
 def shard_banks(module: nn.Module, world: World) -> None:
-    """Keep this process's rows only of every bank in ``module``; the banks must be the same on all processes."""
+    """Reduce every bank in ``module`` to the rows of this process. The banks must be equal on all processes before."""
     for bank in module.modules():
         if isinstance(bank, Bank):
             bank.world = world
@@ -121,6 +134,6 @@ def shard_banks(module: nn.Module, world: World) -> None:
 
 
 def replicated(module: nn.Module) -> list[Tensor]:
-    """The parameters and buffers of ``module`` that every process holds alike: all but the shards of banks."""
+    """The parameters and buffers of ``module`` that are equal on all processes: all except the shards of banks."""
     parts = [part for part in module.modules() if not isinstance(part, Bank)]
     return [tensor for part in parts for tensor in (*part.parameters(False), *part.buffers(False))]

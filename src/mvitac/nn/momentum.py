@@ -1,4 +1,4 @@
-"""The momentum copy of a module (paper eq. 1-3, after MoCo): whole module, so that no part can be forgotten."""
+"""The momentum copy of a module (paper eq. 1-3, after MoCo). It copies the whole module, so that no part is forgotten."""
 
 from __future__ import annotations
 
@@ -10,17 +10,21 @@ import torch
 from torch import Tensor, nn
 
 
-def rising(m: float, end: float | None, progress: float) -> float:
-    """m at ``progress`` (0 to 1) of a run: constant, or rising to ``end`` along a half cosine (BYOL, MoCo v3)."""
-    return m if end is None else end - (end - m) * (math.cos(math.pi * progress) + 1) / 2
+def momentum_at(progress: float, start: float, end: float | None) -> float:
+    """Momentum m at ``progress`` (0 to 1) of a run: constant, or rising to ``end`` along a half cosine (BYOL, MoCo v3)."""
+    return start if end is None else end - (end - start) * (math.cos(math.pi * progress) + 1) / 2
 
 
 class Momentum(nn.Module):
-    """A frozen copy of ``query`` that follows it: theta_k <- m theta_k + (1 - m) theta."""
+    """A frozen copy of a module that follows it: theta_k <- m theta_k + (1 - m) theta.
+
+    Args:
+        query: The module to copy.
+        running_norm: BatchNorm of the copy uses moving averages that follow the query's, instead of the statistics of the
+            batch. A key then depends on no other image of its batch (EMAN, Cai et al., CVPR 2021).
+    """
 
     def __init__(self, query: nn.Module, *, running_norm: bool = False) -> None:
-        """``running_norm``: its BatchNorm uses the statistics that follow the query's, never those of its own batch, so
-        that a key tells nothing of its neighbours (EMAN, Cai et al., CVPR 2021)."""
         super().__init__()
         self.module = copy.deepcopy(query).requires_grad_(False)
         self.running_norm = running_norm
@@ -34,7 +38,7 @@ class Momentum(nn.Module):
 
     @torch.no_grad()
     def follow(self, query: nn.Module, m: float) -> None:
-        """Move every parameter and every floating buffer towards ``query``'s; integer buffers (counters) are copied."""
+        """Move all parameters and floating-point buffers towards ``query``'s. Copy integer buffers (counters)."""
         mine: list[Tensor] = [*self.module.parameters(), *self.module.buffers()]
         theirs: list[Tensor] = [*query.parameters(), *query.buffers()]
         floating = [(k, q) for k, q in zip(mine, theirs, strict=True) if k.is_floating_point()]

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
@@ -98,7 +98,7 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
         torch.set_num_threads(threads)
 
 
-def in_branches(branches: Sequence[Callable[[], dict[str, Tensor]]]) -> dict[str, Tensor]:
+def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dict[Hashable, Tensor]:
     """The tensors of all ``branches``, which share no parameters and draw no random numbers: networks that are trained
     together, each in a thread with its share of torch's threads. ``backward()`` takes them side by side as well.
 
@@ -110,13 +110,13 @@ def in_branches(branches: Sequence[Callable[[], dict[str, Tensor]]]) -> dict[str
         return {name: tensor for branch in branches for name, tensor in branch().items()}
     cpu = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu"), torch.is_grad_enabled()
 
-    def in_this_mode(branch: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    def in_this_mode(branch: Callable[[], dict[Hashable, Tensor]]) -> dict[Hashable, Tensor]:
         # A thread begins without these modes. Autocast's cache belongs to all threads, and whoever ends first empties it.
         cast = torch.autocast("cpu", cpu[1], enabled=cpu[0], cache_enabled=False)
         with cast, torch.set_grad_enabled(cpu[2]):
             return branch()
 
-    named: list[str] = []
+    named: list[Hashable] = []
     given = _Branches.apply(torch.empty(0, requires_grad=True), [partial(in_this_mode, b) for b in branches], named)
     return dict(zip(named, given, strict=True))  # type: ignore[arg-type]
 
@@ -126,7 +126,7 @@ class _Branches(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, anchor: Tensor, branches: list[Callable[[], dict[str, Tensor]]], named: list[str]
+        ctx: Any, anchor: Tensor, branches: list[Callable[[], dict[Hashable, Tensor]]], named: list[Hashable]
     ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)  # what no loss uses gets none, instead of zeros
         made = _at_once(branches)

@@ -1,6 +1,6 @@
-"""Where a step's pixels come from: the pack, mapped or decoded, or wholly resident on the GPU as uint8; and a thread ahead.
+"""Loading the images of a step: from the pack, or from a copy of it in GPU memory; and preparing batches in a thread.
 
-Shapes: images uint8 [N, H, W, C] in the pack, [B, C, H, W] (channels-last) as they leave.
+Shapes: images are uint8 [N, H, W, C] in the pack and are returned as [B, C, H, W] (channels-last).
 """
 
 from __future__ import annotations
@@ -19,12 +19,15 @@ from mvitac.methods.base import Views
 
 T = TypeVar("T")
 SHARE = 0.4
-"""Of a GPU's free memory that a resident pack may take."""
+"""Share of the free GPU memory that a copy of the pack may take."""
 
 
 class Feed:
-    """The images of ``pack`` for ``device``; on a GPU they are resident if they fit (JPEGs: decoded), else copied through
-    pinned memory."""
+    """Returns images of a pack on a device.
+
+    On a GPU the whole pack is kept in GPU memory if it fits (JPEGs are decoded). Otherwise images are copied through pinned
+    memory.
+    """
 
     def __init__(self, pack: Pack, device: torch.device) -> None:
         self.pack, self.device, self.resident = pack, device, {}
@@ -35,13 +38,13 @@ class Feed:
 
     def _upload(self, images: Images) -> Tensor:
         whole = torch.empty(images.shape, dtype=torch.uint8, device=self.device)
-        for start in range(0, len(images), 4096):  # the file is read once, in order, in pieces
+        for start in range(0, len(images), 4096):  # read the file once, in order
             piece = np.ascontiguousarray(images[start : start + 4096])
             whole[start : start + 4096] = torch.from_numpy(piece)
         return whole
 
     def __call__(self, modality: str, rows: np.ndarray) -> Tensor:
-        """uint8 [len(rows), C, H, W] on the device."""
+        """Images of ``rows``: uint8 [len(rows), C, H, W] on the device."""
         if modality in self.resident:
             index = torch.from_numpy(rows).pin_memory().to(self.device, non_blocking=True)
             return self.resident[modality].index_select(0, index).permute(0, 3, 1, 2)
@@ -52,7 +55,7 @@ class Feed:
 
 
 def ahead(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
-    """``batches`` made by a thread on a stream of their own, so that a GPU's network never waits for its input."""
+    """Prepare ``batches`` in a thread on a CUDA stream of their own, so that the network does not wait for its input."""
     side = torch.cuda.Stream(device)
 
     def on_side() -> Iterator[tuple[Views, Any]]:
@@ -67,12 +70,12 @@ def ahead(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
         stream = torch.cuda.current_stream(device)
         stream.wait_event(made)
         for tensor in [batch.rows, *batch.labels.values(), *(v for views in batch.images.values() for v in views)]:
-            tensor.record_stream(stream)  # else its memory could be taken while the network still reads it
+            tensor.record_stream(stream)  # else its memory could be reused while the network reads it
         yield batch
 
 
 def prefetch(items: Iterator[T], depth: int = 2) -> Iterator[T]:
-    """``items``, made up to ``depth`` ahead by a thread; an error of theirs is raised where the item would have come."""
+    """Prepare up to ``depth`` of the next ``items`` in a thread. Errors are raised in place of the item."""
     made: queue.Queue[tuple[bool, T | BaseException | None]] = queue.Queue(depth)
     stop = threading.Event()
 

@@ -1,7 +1,8 @@
-"""What a run says of itself while it trains: log.jsonl, the progress, and the loggers one may add."""
+"""Logging of a run: log.jsonl, the progress bar, and optional loggers (TensorBoard, Weights & Biases, Trackio)."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -15,12 +16,22 @@ from mvitac.system.files import naming, write_atomic
 from mvitac.system.progress import WIDE, shown
 
 Logger = Callable[[int, dict[str, float]], None]
+"""Called with a step and the values logged at it."""
 EARLY = 3
-"""Steps after which a run logs for the first time, so that others who look at it know its speed soon."""
+"""Step of the first log line, so that the speed is known soon."""
 
 
 class Log:
-    """log.jsonl, the progress, and the loggers; on resume, lines after the checkpoint are dropped."""
+    """Writes log.jsonl, the progress bar and the loggers.
+
+    Args:
+        out: Folder of the run. Lines of its log.jsonl after step ``start`` are removed.
+        start: Number of steps that are already done.
+        num_steps: Number of steps of the run.
+        batch_size: Pairs per step.
+        quiet: Show no progress bar.
+        loggers: Functions that receive all values.
+    """
 
     def __init__(
         self, out: Path, start: int, num_steps: int, batch_size: int, *, quiet: bool, loggers: tuple[Logger, ...]
@@ -33,7 +44,7 @@ class Log:
                     entry = json.loads(line)
                     early = entry["step"] <= start
                 except (ValueError, TypeError, KeyError):
-                    break  # the line that was being written when the run was killed
+                    break  # an incomplete line, written when the run was killed
                 if early:
                     kept.append(line + "\n")
         write_atomic(path, lambda file: file.write("".join(kept).encode()))
@@ -61,11 +72,11 @@ class Log:
         self.since, self.since_step = now, step
         self._write({"step": step, **losses, "lr": lr, "pairs_per_s": round(speed, 1)})
         if self.bars:
-            told = losses if self.bars.console.width >= WIDE else {"loss": losses["loss"]}
-            self.bars.update(self.bar, text=" ".join(f"{name} {value:.2f}" for name, value in told.items()))
+            shown_losses = losses if self.bars.console.width >= WIDE else {"loss": losses["loss"]}
+            self.bars.update(self.bar, text=" ".join(f"{name} {value:.2f}" for name, value in shown_losses.items()))
 
     def advance(self, step: int) -> None:
-        if step == self.start + 1:  # the first step starts everything: it measures nothing
+        if step == self.start + 1:  # the first step includes start-up: do not measure it
             self.since, self.since_step = time.perf_counter(), step
         if self.bars:
             self.bars.update(self.bar, completed=step)
@@ -76,7 +87,7 @@ class Log:
         self.say(f"step {step}: " + ", ".join(best))
 
     def say(self, text: str) -> None:
-        """``text`` on a line of its own above the progress."""
+        """Print ``text`` on a line above the progress bar."""
         if self.bars:
             self.bars.say(text)
 
@@ -90,15 +101,15 @@ class Log:
 
 
 def last_line(run: Path) -> dict[str, Any]:
-    """The last line that the log of the run in a folder has about its losses; {} if there is none yet."""
+    """The last line with losses in the log.jsonl of a run's folder; {} if there is none yet."""
     try:
         lines = (run / "log.jsonl").read_text().splitlines()
-    except OSError:  # not there yet
+    except OSError:  # it does not exist yet
         return {}
     for line in reversed(lines):
         try:
             entry = json.loads(line)
-        except ValueError:  # being written
+        except ValueError:  # the line is being written
             continue
         if "loss" in entry:
             return entry
@@ -106,7 +117,7 @@ def last_line(run: Path) -> dict[str, Any]:
 
 
 def in_a_bar(line: dict[str, Any], num_steps: int, batch_size: int) -> dict[str, Any]:
-    """What a bar (``progress.Bars``) shows of a run in another process, by the last ``line`` of its log."""
+    """Fields of a progress bar (``progress.Bars``) for a run in another process, from the last ``line`` of its log."""
     if not line:
         return {"completed": 0, "left": None, "speed": None}
     step, speed = line["step"], line["pairs_per_s"]
@@ -115,44 +126,35 @@ def in_a_bar(line: dict[str, Any], num_steps: int, batch_size: int) -> dict[str,
 
 
 LOGGERS = ("tensorboard", "wandb", "trackio")
+Started = tuple[Logger, Callable[[], object]]
+"""A logger and the function that closes it."""
 
 
 @contextmanager
 def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger, ...]]:
-    """The sink called ``name`` (none if None) for the run in ``out``; ValueError if its library is not installed."""
+    """Open the logger ``name`` for the run in ``out``.
+
+    Yields:
+        The loggers for ``train``: one, or none if ``name`` is None.
+
+    Raises:
+        ValueError: If there is no such logger, or its library is not installed.
+    """
     if name is None:
         yield ()
         return
     if name not in LOGGERS:
-        raise unknown("sink", name, LOGGERS)
+        raise unknown("logger", name, LOGGERS)
     try:
-        if name == "tensorboard":
-            from torch.utils.tensorboard import SummaryWriter
-
-            def start() -> tuple[Logger, Callable[[], object]]:
-                writer = SummaryWriter(str(out / "tensorboard"))
-
-                def send(step: int, values: dict[str, float]) -> None:
-                    for key, value in values.items():
-                        writer.add_scalar(key, value, step)
-
-                return send, writer.close
-        else:
-            import importlib
-
-            library = importlib.import_module(name)  # wandb and trackio share these three calls
-
-            def start() -> tuple[Logger, Callable[[], object]]:
-                library.init(project="mvitac", name=out.name, config=to_json(run))
-                return lambda step, values: library.log(values, step=step), library.finish
+        library = importlib.import_module("torch.utils.tensorboard" if name == "tensorboard" else name)
     except ImportError:
-        raise ValueError(f"--sink {name} needs its library: pip install 'mvitac[{name}]'") from None
-    # Started by the first values, not before: a run that is refused must leave nothing behind, and --out must be new.
-    started: list[tuple[Logger, Callable[[], object]]] = []
+        raise ValueError(f"--logger {name} needs its library: pip install 'mvitac[{name}]'") from None
+    # Start it with the first values: a run that is refused must leave no files, since --out must be new.
+    started: list[Started] = []
 
     def send(step: int, values: dict[str, float]) -> None:
         if not started:
-            started.append(start())
+            started.append(_tensorboard(library, out) if name == "tensorboard" else _tracker(library, out, run))
         started[0][0](step, values)
 
     try:
@@ -160,3 +162,19 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
     finally:
         for _, close in started:
             close()
+
+
+def _tensorboard(library: Any, out: Path) -> Started:
+    writer = library.SummaryWriter(str(out / "tensorboard"))
+
+    def send(step: int, values: dict[str, float]) -> None:
+        for key, value in values.items():
+            writer.add_scalar(key, value, step)
+
+    return send, writer.close
+
+
+def _tracker(library: Any, out: Path, run: Run) -> Started:
+    """wandb or trackio, which have the same functions."""
+    library.init(project="mvitac", name=out.name, config=to_json(run))
+    return lambda step, values: library.log(values, step=step), library.finish

@@ -1,4 +1,4 @@
-"""Which rows each step learns from, and in which order: a function of (seed, epoch)."""
+"""Rows of each step, in an order that is a function of (seed, epoch)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mvitac.system.distributed import World
 
 
 def training_rows(run: Run, pack: Pack) -> np.ndarray:
-    """Pack rows to pre-train on; a method that learns from labels sees only rows that carry one it needs."""
-    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)  # a pair with a hole in it is no pair
+    """Pack rows to train on: train and unlabelled, with both modalities, and with a label if the method needs labels."""
+    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)
     tasks = run.method.labels_needed(pack.spec)
     if not tasks:
         return rows
@@ -27,8 +27,50 @@ def training_rows(run: Run, pack: Pack) -> np.ndarray:
 
 
 def mix(*numbers: int) -> int:
-    """One 63-bit seed from several numbers, by numpy's SeedSequence."""
+    """Combine several numbers into one 63-bit seed, by numpy's SeedSequence."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
+
+
+class Batches:
+    """Pack rows of each step.
+
+    The order of an epoch depends on (seed, epoch) and, for a pack in shards, on the number of processes.
+
+    Args:
+        run: Gives seed, batch size and sampler.
+        pack: The pack.
+        rows: Pack rows to train on.
+        world: The processes that train together. Default: this one only.
+    """
+
+    def __init__(self, run: Run, pack: Pack, rows: np.ndarray, world: World | None = None) -> None:
+        self.rows, self.seed, self.window, self.world = rows, run.seed, pack.window, world or World()
+        self.per_epoch, self.batch_size = run.steps_per_epoch(len(rows)), run.batch_size
+        self.share = run.batch_size // self.world.size
+        self.touch_groups = pack.touch_groups[rows] if run.sampler == "one-per-touch" else None
+        self.shards = pack.shards[rows]
+        self._epoch = lru_cache(2)(self._order)
+
+    def __getitem__(self, step: int) -> np.ndarray:
+        """Rows [batch_size] of step ``step``, counted from 0."""
+        return self._epoch(step // self.per_epoch)[step % self.per_epoch]
+
+    def own(self, step: int) -> np.ndarray:
+        """The part of step ``step`` that this process reads."""
+        return self[step][self.share * self.world.rank : self.share * (self.world.rank + 1)]
+
+    def num_ahead(self) -> int:
+        """Number of steps whose rows lie in the shards that are read together."""
+        return min(-(-self.window * np.bincount(self.shards).max() // self.share), self.per_epoch)
+
+    def _order(self, epoch: int) -> np.ndarray:
+        """[per_epoch, batch_size]"""
+        seed, num = mix(self.seed, 1, epoch), self.per_epoch * self.batch_size
+        if not self.window:
+            return self.rows[epoch_order(len(self.rows), self.touch_groups, seed)[:num]].reshape(self.per_epoch, -1)
+        size = self.world.size
+        lanes = shard_order(self.shards, self.touch_groups, self.window, size, num, seed)
+        return self.rows[lanes.reshape(size, self.per_epoch, self.share).swapaxes(0, 1).reshape(self.per_epoch, -1)]
 
 
 def batches(
@@ -40,40 +82,27 @@ def batches(
     world: World | None = None,
     expect: Callable[[np.ndarray], None] | None = None,
 ) -> Iterator[np.ndarray]:
-    """Pack rows of each step from ``start`` on; an epoch's order depends on (seed, epoch) alone, and where a pack comes in
-    shards on how many processes take part. ``expect`` (``Pack.expect``) is then told what this process will read."""
-    world = world or World()
-    per_epoch, share = run.steps_per_epoch(len(rows)), run.batch_size // world.size
-    touch_groups = pack.touch_groups[rows] if run.sampler == "one-per-touch" else None
-    shards = pack.shards[rows]
+    """Pack rows of each step from ``start`` to ``num_steps``, as ``Batches`` orders them.
 
-    @lru_cache(2)
-    def epoch_batches(epoch: int) -> np.ndarray:
-        """[per_epoch, batch_size]"""
-        seed, num = mix(run.seed, 1, epoch), per_epoch * run.batch_size
-        if not pack.window:
-            return rows[epoch_order(len(rows), touch_groups, seed)[:num]].reshape(per_epoch, -1)
-        lanes = shard_order(shards, touch_groups, pack.window, world.size, num, seed)
-        return rows[lanes.reshape(world.size, per_epoch, share).swapaxes(0, 1).reshape(per_epoch, -1)]
-
-    def own(step: int) -> np.ndarray:
-        return epoch_batches(step // per_epoch)[step % per_epoch, share * world.rank : share * (world.rank + 1)]
-
-    num_ahead = min(-(-pack.window * np.bincount(shards).max() // share), per_epoch)
+    For a pack in shards, ``expect`` (``Pack.expect``) is called with the rows that this process will read next.
+    """
+    order = Batches(run, pack, rows, world)
+    num_ahead = order.num_ahead() if pack.window else 0
     try:
         for step in range(start, num_steps):
             if expect and pack.window:
-                expect(np.concatenate([own(s) for s in range(step, min(step + num_ahead, num_steps))]))
-            yield epoch_batches(step // per_epoch)[step % per_epoch]
+                expect(np.concatenate([order.own(s) for s in range(step, min(step + num_ahead, num_steps))]))
+            yield order[step]
     finally:
         if expect:
             expect(rows[:0])
 
 
 def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
-    """A permutation of 0..num-1; with ``groups``, all first rows of every group come first, then all second ones, ...
+    """A random permutation of 0..num-1.
 
-    so that any stretch not longer than the number of groups holds hardly two rows of one group.
+    With ``groups`` [num], one row of each group comes first, then a second row of each group, and so on. Any sequence not
+    longer than the number of groups then has hardly two rows of one group.
     """
     rng = np.random.default_rng(seed)
     order = rng.permutation(num)
@@ -89,10 +118,21 @@ def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
 def shard_order(
     shards: np.ndarray, groups: np.ndarray | None, window: int, num_lanes: int, num: int, seed: int
 ) -> np.ndarray:
-    """[num_lanes, num / num_lanes] of 0..N-1, each at most once: the shards (``shards`` [N] is each row's) in a random
-    sequence, cut into one lane per process; within a lane rows are mixed as by ``epoch_order``, ``window`` shards at a time.
+    """A random order of rows 0..N-1 in which each process needs few shards at a time.
 
-    So a process reads its own shards one after another and needs few at a time; only one that is cut is read by two.
+    The shards are put in random order and cut into one lane per process. Within a lane, rows are shuffled as by
+    ``epoch_order``, ``window`` shards at a time. Only a shard that is cut is read by two processes.
+
+    Args:
+        shards: [N], the shard of each row.
+        groups: [N], the touch group of each row, or None.
+        window: Number of shards to shuffle together.
+        num_lanes: Number of processes.
+        num: Number of rows to use.
+        seed: Random seed.
+
+    Returns:
+        [num_lanes, num / num_lanes] row numbers, each at most once.
     """
     place = np.random.default_rng(seed).permutation(shards.max() + 1)[shards]
     lanes = np.argsort(place, kind="stable")[:num].reshape(num_lanes, -1)
@@ -106,8 +146,10 @@ def shard_order(
 
 
 def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
-    """For each of ``rows`` a random other row of its touch group in the same split, and shard if the pack comes in such,
-    or itself if it is alone there."""
+    """For each of ``rows`` a random other row of the same touch group, split and shard.
+
+    A row without such others is its own partner.
+    """
     groups, split, shards = pack.touch_groups, pack.column("split"), pack.shards
     whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()

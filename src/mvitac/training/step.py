@@ -1,10 +1,11 @@
-"""One optimiser step: forward, losses, backward, update; fast or small, and equal to the plain one (tests/training).
+"""One optimiser step: forward, losses, backward, update.
 
-A batch comes as parts, functions that make its views anew, the same each time. One part is the plain step. Several are
-gradient caching (Gao et al., arXiv:2101.06983): every part is embedded without a graph, the losses are taken over all
-embeddings at once, then each part is embedded again and receives its gradient. So the batch, and with it the number of
-negatives, may be any size in the memory of one part; the gradient is that of the whole batch to rounding. BatchNorm
-normalises each part by its own statistics, as it does per GPU, and its running statistics move once per part.
+A batch comes as chunks: functions that create its views, the same ones at each call. With one chunk on one process this is
+the plain step. Otherwise it is gradient caching (Gao et al., arXiv:2101.06983): each chunk is embedded without a graph, the
+losses are computed over all embeddings at once, then each chunk is embedded again and receives its gradient. The batch, and
+with it the number of negatives, can thus have any size in the memory of one chunk. The gradient is that of the whole batch,
+up to rounding (tests/training/test_step.py). BatchNorm normalises each chunk by its own statistics, as it does per GPU, and
+its running statistics are updated once per chunk.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mvitac.methods.base import Contrastive, Method, Views
+from mvitac.methods.base import Contrastive, Embeddings, Method, Views
 from mvitac.run import Optim, Run
 from mvitac.system.distributed import World
 
@@ -22,7 +23,17 @@ Chunk = Callable[[], Views]
 
 
 class Step:
-    """Calling it with the parts of a batch takes one step and returns the losses (detached, on the device)."""
+    """Takes one optimiser step when called.
+
+    Args:
+        run: Settings of the optimiser, precision, chunks, recomputation and compilation.
+        method: The method to train, on ``device``.
+        device: Device of the method.
+        world: The processes that train together. Default: this one only.
+
+    Raises:
+        ValueError: If the method or the trunk does not support these settings.
+    """
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world = method, device, world or World()
@@ -30,7 +41,7 @@ class Step:
         self.optimiser = build_optimiser(run.optim, method)
         if (run.chunk or self.world.size > 1) and not isinstance(method, Contrastive):
             raise ValueError(
-                f"method {run.method.name!r} takes its loss pair by pair: train it in one process, without --chunk"
+                f"method {run.method.name!r} supports neither several processes nor --chunk: leave them out"
             )
         if run.recompute:
             for name, trunk in method.encoders().items():
@@ -40,18 +51,28 @@ class Step:
         set_precision(run.precision)
         self.forward = torch.compile(method, fullgraph=True) if run.compile else method
 
-    def __call__(self, parts: Sequence[Chunk], *, lr: float, seed: int, progress: float) -> dict[str, Tensor]:
-        """``seed`` decides dropout; ``progress`` runs from 0 to 1 over the run."""
+    def __call__(self, chunks: Sequence[Chunk], *, lr: float, seed: int, progress: float) -> dict[str, Tensor]:
+        """Take one step.
+
+        Args:
+            chunks: The chunks of the batch that this process embeds.
+            lr: Learning rate.
+            seed: Random seed of dropout and of random draws in losses.
+            progress: Share of the run that is done after this step, from 0 to 1.
+
+        Returns:
+            The losses, detached, on the device.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = lr
         self.optimiser.zero_grad(set_to_none=True)
-        if len(parts) == 1 and self.world.size == 1:
+        if len(chunks) == 1 and self.world.size == 1:
             torch.manual_seed(seed)
             with self._autocast():
-                losses = self.forward(parts[0]())
+                losses = self.forward(chunks[0]())
             losses["loss"].backward()
         else:
-            losses = self._over_all(parts, seed)
+            losses = self._backward_by_chunks(chunks, seed)
         self.optimiser.step()
         self.method.after_step(progress)
         return {name: value.detach() for name, value in losses.items()}
@@ -59,57 +80,75 @@ class Step:
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
-    def _over_all(self, parts: Sequence[Chunk], seed: int) -> dict[str, Tensor]:
-        """Losses over the embeddings of all parts of all processes; each embeds, and learns from, its own."""
+    def _backward_by_chunks(self, chunks: Sequence[Chunk], seed: int) -> dict[str, Tensor]:
+        """Compute losses over all chunks of all processes, and the gradient of the parameters by gradient caching."""
         method, world = self.method, self.world
         assert isinstance(method, Contrastive)
-        alone = len(parts) == 1  # one part keeps its graph and needs no second pass
+        first_seed = seed + len(chunks) * world.rank  # each chunk has its own dropout, the same in both passes
+        single = len(chunks) == 1  # keeps its graph and needs no second pass
+        statistics = [] if single else _running_statistics(method)
+        before = [buffer.clone() for buffer in statistics]
 
-        def queries(part: int, views: Views) -> dict[str, Tensor]:
-            torch.manual_seed(seed + len(parts) * world.rank + part)  # the same dropout in both passes
-            with self._autocast():
-                return method.queries(views)
-
-        running = [] if alone else _running_statistics(method)
-        before = [buffer.clone() for buffer in running]
-        graphs, keys = [], []
-        for i, part in enumerate(parts):
-            views = part()
-            with torch.set_grad_enabled(alone):
-                graphs.append(queries(i, views))
+        # First pass: embed every chunk.
+        queries, keys = [], []
+        for i, chunk in enumerate(chunks):
+            views = chunk()
+            with torch.set_grad_enabled(single):
+                queries.append(self._queries(views, first_seed + i))
             with torch.no_grad(), self._autocast():
                 keys.append(method.keys(views))
-        own = {name: torch.cat([z[name].detach() for z in graphs]) for name in graphs[0]}
-        everyones = {name: world.gather(z).requires_grad_() for name, z in own.items()}
-        fixed = {name: world.gather(torch.cat([z[name] for z in keys])) for name in keys[0]}
-        torch.manual_seed(seed)  # what the losses draw (CMC's negatives) is the same on every process
-        with self._autocast():
-            losses = method.contrast(everyones | fixed)
-        # Every process takes the whole loss, so the gradient of its own embeddings is complete without communication.
-        sources = [everyones[name] for name in own]
-        found = torch.autograd.grad(losses["loss"], sources, allow_unused=True)  # a loss may be left out of the sum
-        gradients = {name: gradient for name, gradient in zip(own, found, strict=True) if gradient is not None}
-        mine = {
-            name: world.own(gradient, len(own[name])).split([len(z[name]) for z in graphs])
-            for name, gradient in gradients.items()
-        }
-        for buffer, old in zip(running, before, strict=True):
-            buffer.copy_(old)  # the second pass will move them again
-        for i, part in enumerate(parts):
-            z = graphs[i] if alone else queries(i, part())
-            torch.autograd.backward([z[name] for name in mine], [chunks[i] for chunks in mine.values()])
-        world.sum_gradients(self.method)
+
+        # Losses over all embeddings, and the gradient of each embedding of this process.
+        losses, gradients = self._contrast(queries, keys, seed)
+
+        # Second pass: embed every chunk again, and propagate the gradients of its embeddings to the parameters.
+        for buffer, old in zip(statistics, before, strict=True):
+            buffer.copy_(old)  # this pass updates them again
+        for i, chunk in enumerate(chunks):
+            z = queries[i] if single else self._queries(chunk(), first_seed + i)
+            torch.autograd.backward([z[name] for name in gradients[i]], list(gradients[i].values()))
+        world.sum_gradients(method)
         return losses
+
+    def _queries(self, views: Views, seed: int) -> Embeddings:
+        assert isinstance(self.method, Contrastive)
+        torch.manual_seed(seed)
+        with self._autocast():
+            return self.method.queries(views)
+
+    def _contrast(
+        self, queries: list[Embeddings], keys: list[Embeddings], seed: int
+    ) -> tuple[dict[str, Tensor], list[Embeddings]]:
+        """Losses over the embeddings of all processes, and their gradients for ``queries``, chunk by chunk.
+
+        Every process computes the whole loss, so the gradient of its own embeddings needs no communication.
+        """
+        assert isinstance(self.method, Contrastive)
+        own = {name: torch.cat([z[name].detach() for z in queries]) for name in queries[0]}
+        all_queries = {name: self.world.gather(z).requires_grad_() for name, z in own.items()}
+        all_keys = {name: self.world.gather(torch.cat([z[name] for z in keys])) for name in keys[0]}
+        torch.manual_seed(seed)  # what losses draw (CMC's negatives) is the same on every process
+        with self._autocast():
+            losses = self.method.contrast(all_queries | all_keys)
+        # An embedding gets no gradient if its loss is not part of the sum.
+        found = torch.autograd.grad(losses["loss"], list(all_queries.values()), allow_unused=True)
+        sizes = [len(next(iter(z.values()))) for z in queries]
+        by_name = {
+            name: self.world.own(gradient, len(own[name])).split(sizes)
+            for name, gradient in zip(all_queries, found, strict=True)
+            if gradient is not None
+        }
+        return losses, [{name: pieces[i] for name, pieces in by_name.items()} for i in range(len(queries))]
 
 
 def _running_statistics(method: Method) -> list[Tensor]:
-    """Buffers of the modules that are trained: BatchNorm's running statistics, but not those of momentum towers."""
+    """Running statistics of BatchNorm in the trained modules; not those of momentum towers."""
     layers = (m for m in method.modules() if any(p.requires_grad for p in m.parameters(recurse=False)))
     return [buffer for layer in layers for buffer in layer.buffers(recurse=False)]
 
 
 def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
-    """Over the method's trainable parameters only (momentum copies have none); one fused kernel where there is one."""
+    """Create the optimiser of the trainable parameters (momentum copies have none). Uses a fused kernel if available."""
     parameters = [p for p in method.parameters() if p.requires_grad]
     fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
     if config.name == "sgd":
@@ -120,7 +159,7 @@ def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
 
 
 def set_precision(precision: str) -> None:
-    """The whole policy: fp32 is IEEE fp32, never TF32 in silence; tf32 says so; bf16 is autocast, its fp32 rest is IEEE."""
+    """Allow TF32 for precision tf32 only. fp32 is IEEE fp32; bf16 is autocast, and its remaining fp32 is IEEE fp32."""
     tf32 = precision == "tf32"
     torch.backends.cuda.matmul.allow_tf32 = tf32
     torch.backends.cudnn.allow_tf32 = tf32

@@ -1,4 +1,4 @@
-"""The random views of each step's rows: a function of (seed, step)."""
+"""The random views of each step, which are a function of (seed, step)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mvitac.transforms.gel_flip import GelMirror
 from mvitac.transforms.random_views import random_view
 
 
-def feed_parts(
+def load_chunks(
     run: Run,
     pack: Pack,
     rows: np.ndarray,
@@ -33,38 +33,40 @@ def feed_parts(
     num_steps: int,
     mirror: GelMirror | None = None,
 ) -> Iterator[list[Chunk]]:
-    """The parts of each step's batch that this process embeds: chunk by chunk of its own share of the rows.
+    """The chunks of each step's batch that this process embeds.
 
-    Views depend on (seed, step, part) alone, so two processes see what one process sees with a chunk of half the batch.
+    Views depend on (seed, step, number of the chunk) only. Two processes thus see the same views as one process with chunks
+    of half the batch. ``mirror`` is the result of ``gel_mirror``.
     """
     feed = Feed(pack, device)
     share = run.batch_size // world.size
     per_process = share // (run.chunk or share)
-    num_parts = per_process * world.size
+    num_chunks = per_process * world.size
 
-    def part(step: int, batch: np.ndarray, number: int) -> Views:
-        seed = mix(run.seed, step) if num_parts == 1 else mix(run.seed, step, number)
-        chunk = np.split(batch, num_parts)[number]
-        return make_views(run, pack, chunk, num_views, torch.Generator().manual_seed(seed), device, feed, mirror)
+    def make(step: int, batch: np.ndarray, number: int) -> Views:
+        seed = mix(run.seed, step) if num_chunks == 1 else mix(run.seed, step, number)
+        own = np.split(batch, num_chunks)[number]
+        return make_views(run, pack, own, num_views, torch.Generator().manual_seed(seed), device, feed, mirror)
 
     numbers = range(per_process * world.rank, per_process * (world.rank + 1))
     expect = None if feed.resident else pack.expect
     steps = enumerate(batches(run, pack, rows, start, num_steps, world, expect), start=start)
     if per_process == 1 and (device.type == "cuda" or any(isinstance(i, Lazy) for i in pack.images.values())):
-        views = (part(step, batch, numbers[0]) for step, batch in steps)
+        # One chunk per step, and slow to make or needed on a GPU: make the next ones while this one is used.
+        views = (make(step, batch, numbers[0]) for step, batch in steps)
         for made in ahead(views, device) if device.type == "cuda" else prefetch(views):
-            yield [partial(_same, made)]
+            yield [lambda made=made: made]
         return
     for step, batch in steps:
-        yield [partial(part, step, batch, number) for number in numbers]
-
-
-def _same(views: Views) -> Views:
-    return views
+        yield [partial(make, step, batch, number) for number in numbers]
 
 
 def gel_mirror(run: Run, pack: Pack, device: torch.device) -> GelMirror | None:
-    """What flips the touches of ``run``'s views as touches, or None; ValueError if the pack's colours cannot be learned."""
+    """The object that flips touch images with their colours, or None if the run flips pixels only.
+
+    Raises:
+        ValueError: If the colours of the pack's sensors cannot be learned.
+    """
     return GelMirror(pack, device) if run.augment.gel_flip == "colour" else None
 
 
@@ -78,9 +80,9 @@ def make_views(
     feed: Feed,
     mirror: GelMirror | None = None,
 ) -> Views:
-    """Random views of the pack's ``rows`` on ``device``, in the precision the networks read them in.
+    """Make random views of pack rows [B] on ``device``, in the precision that the networks read them in.
 
-    ``mirror`` is what ``gel_mirror`` gave for the run.
+    All randomness comes from ``generator``. ``mirror`` is the result of ``gel_mirror`` for the run.
     """
     assert (mirror is None) == (run.augment.gel_flip == "plain")
     views = [rows] * num_views
@@ -94,8 +96,8 @@ def make_views(
     for modality in pack.spec.modalities:
         config, images[modality] = getattr(run.augment, modality), []
         if mirror and modality == "touch":
-            config = replace(config, flip=0.0)  # the mirror flips
-        fed: dict[int, Tensor] = {}  # two views of one image need it once
+            config = replace(config, flip=0.0)  # the mirror flips instead
+        fed: dict[int, Tensor] = {}  # load an image once for two views
         for source in sources[modality]:
             seen = fed[id(source)] if id(source) in fed else fed.setdefault(id(source), feed(modality, source))
             if mirror and modality == "touch":

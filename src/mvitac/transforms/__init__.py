@@ -1,1 +1,1 @@
-"""Random views of images, on any device."""
+"""Random views of images, and flips of gel images."""

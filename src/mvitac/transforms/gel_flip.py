@@ -1,16 +1,16 @@
-"""What colours a mirrored touch has: flips of touch that a camera behind the gel could have seen.
+"""Flips of touch images with the colours that the sensor would show for the mirrored touch.
 
-An optical gel shows slope as colour, I(x, y) = I0 + rx gx + ry gy, with I0 [3] its picture at rest, gx and gy the slopes
-of the imprint and rx, ry [3] what one unit of slope along x and along y does to the colour. Mirroring pixels leaves gx as
-it is, where a mirrored touch has -gx, and mirrors the lamps with it. The mirrored touch is
+An optical gel shows slope as colour: I(x, y) = I0 + rx gx + ry gy. I0 [3] is the image without contact, gx and gy are the
+slopes of the imprint, and rx, ry [3] are the colour changes per unit of slope along x and y. Mirroring the pixels does not
+change the sign of gx, which a mirrored touch would, and it mirrors the lamps. The correct mirrored image is
 
-    I'(x) = I0(x) + M (I(-x) - I0(-x)),  M [3, 3]: rx to -rx, ry to ry, and what is no slope (ink, shadow) to itself
+    I'(x) = I0(x) + M (I(-x) - I0(-x)),  M [3, 3] maps rx to -rx, ry to ry, and other colours (ink, shadow) to themselves
 
-Nobody has to measure rx and ry: slopes are derivatives of one height, so d gx / dy = d gy / dx, and of all pairs of
-colour mixtures of a sensor's pictures only those of gx and gy obey it (integrability, as in uncalibrated photometric
-stereo: Yuille and Snow, CVPR 1997). I0 is the sensor's mean picture, in the mean colour of the image at hand: slopes of a
-bump add up to nothing, so that colour is lamps and tint, which differ between copies of a sensor and drift. That the mean
-picture holds the average contact does no harm as long as the average contact is its own mirror image.
+rx and ry need no calibration. Slopes are derivatives of one height, so d gx / dy = d gy / dx, and of all pairs of linear
+colour mixtures only those of gx and gy satisfy this (integrability, as in uncalibrated photometric stereo: Yuille and
+Snow, CVPR 1997). I0 is the sensor's mean image, shifted to the mean colour of the given image. The slopes of an imprint
+sum to zero, so the mean colour comes from lamps and tint, which differ between sensors of one type and drift. The mean
+image contains the average contact. This does no harm if the average contact is symmetric.
 """
 
 from __future__ import annotations
@@ -26,27 +26,34 @@ from mvitac.data.pack import Pack
 from mvitac.transforms.random_views import ViewAugment
 
 MIN_ROWS, NUM_ROWS = 32, 256
-"""Training rows of a sensor that are needed, and as many as are looked at, evenly spread."""
+"""Minimum number of training rows of a sensor, and the number of rows that are used, evenly spaced."""
 SIDE = 64
-"""Side in pixels, or a little more, at which colours are learned; what is finer is noise and JPEG."""
+"""Approximate side in pixels at which colours are learned. Finer detail is noise and JPEG artefacts."""
 REST = 16
-"""Side in pixels of the picture at rest: lamps and tint, but no dots, which contact drags along."""
+"""Side in pixels of I0. It resolves lamps and tint, but not the dots, which move with the contact."""
 MAX_CURL, MAX_STRETCH = 0.2, 30.0
-"""Beyond these what was found are not two slopes. Curl is .03 to .11 for gels, simulated and real, .25 to .5 for gray."""
+"""Above these limits the result is not a pair of slopes. Curl is .03 to .11 for gels, simulated and real, and .25 to .5
+for gray images."""
 
 
 def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Learn how pictures of one sensor, their mean taken off, colour slope.
+    """Learn the colours of slope from images of one sensor.
 
-    Returns ``colours`` [3, 2] (rx and ry as columns, up to one common factor), ``mixtures`` [3, 2] (``d @ mixtures`` are
-    gx and gy of a colour ``d``, up to the inverse factor) and ``curl``, 0 for perfect slopes and .5 for noise. ValueError
-    if no two mixtures of colours are slopes of one height.
+    Args:
+        images: Images minus their mean image.
+
+    Returns:
+        ``colours`` [3, 2], rx and ry as columns, up to a common factor; ``mixtures`` [3, 2], where ``d @ mixtures`` are gx
+        and gy of a colour ``d``, up to the inverse factor; and ``curl``, 0 for perfect slopes and .5 for noise.
+
+    Raises:
+        ValueError: If no two mixtures of colours are slopes of one height.
     """
     down = ((images[:, 2:, 1:-1] - images[:, :-2, 1:-1]) / 2).reshape(-1, 3)
     right = ((images[:, 1:-1, 2:] - images[:, 1:-1, :-2]) / 2).reshape(-1, 3)
-    rounding = np.eye(3) * len(down) / 24  # of pictures to whole levels: channels that are equal are never exactly so
+    rounding = np.eye(3) * len(down) / 24  # variance of rounding to whole levels: regularises equal channels
     yy, xx, yx = down.T @ down + rounding, right.T @ right + rounding, down.T @ right
-    # The mixtures p, q [3] with the least |d(p . I)/dy - d(q . I)/dx|^2 as a share of their whole change.
+    # Find mixtures p, q [3] that minimise |d(p . I)/dy - d(q . I)/dx|^2 relative to their total variation.
     change = yy + xx
     shares, pairs = eigh(np.block([[yy, -yx], [-yx.T, xx]]), np.kron(np.eye(2), change))
     mixtures, curl = pairs[:, 0].reshape(2, 3).T, float(shares[0])
@@ -57,14 +64,21 @@ def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.
 
 
 def mirror_colours(colours: np.ndarray, mixtures: np.ndarray) -> np.ndarray:
-    """M [3, 3] of a horizontal flip: rx to -rx, ry and what is neither to themselves."""
+    """M [3, 3] of a horizontal flip: maps rx to -rx, and ry and all other colours to themselves."""
     return np.eye(3) - 2 * np.outer(colours[:, 0], mixtures[:, 0])
 
 
 class GelMirror:
-    """Flips the touch images of ``pack`` as touches, by colours learned once from each sensor's training rows.
+    """Flips touch images of a pack. Colours are learned once, from each sensor's training rows.
 
-    A stacked image is mirrored gel by gel. ValueError where a sensor has too few rows or its colours follow no slope.
+    Each gel of a stacked image is mirrored separately.
+
+    Args:
+        pack: The pack of the images.
+        device: Device of the images to flip.
+
+    Raises:
+        ValueError: If a sensor has too few rows, or its colours do not follow slopes.
     """
 
     def __init__(self, pack: Pack, device: torch.device) -> None:
@@ -75,14 +89,14 @@ class GelMirror:
         rows = pack.rows("train", "unlabelled", having=("touch",))
         names = np.unique(sensors[rows]).tolist()
         self.sensors = np.searchsorted(names, sensors)
-        """[pack.num]: number of each row's sensor; what it says of rows that nothing learns from means nothing."""
+        """[pack.num]: number of each row's sensor. Not meaningful for rows outside the training rows."""
         self.gels: list[list[tuple[Tensor, Tensor]]] = []
-        """For every sensor and gel M' [3, 3] and I0(x) - M I0(-x) [size, size, 3], where I0 is without its mean colour."""
+        """Per sensor and gel: M' [3, 3] and I0(x) - M I0(-x) [size, size, 3], where I0 has zero mean colour."""
         for name in names:
             own = rows[sensors[rows] == name]
             if len(own) < MIN_ROWS:
                 raise ValueError(
-                    f"sensor {name!r} has {len(own)} training rows with touch, its colours take {MIN_ROWS}:"
+                    f"sensor {name!r} has {len(own)} training rows with touch, learning its colours needs {MIN_ROWS}:"
                     " give --augment.gel-flip plain"
                 )
             own = pack.near(own, NUM_ROWS)
@@ -96,7 +110,7 @@ class GelMirror:
     def random(
         self, images: UInt8[Tensor, "B C H W"], rows: np.ndarray, config: ViewAugment, generator: torch.Generator
     ) -> UInt8[Tensor, "B C H W"]:
-        """``images`` of the pack's ``rows``, each mirrored with the probability ``config`` gives to a flip."""
+        """Mirror ``images`` of the pack's ``rows``, each with probability ``config.flip``."""
         num, gels = len(images), images.shape[1] // 3
         which = torch.rand(num, gels if config.independent_sensors else 1, generator=generator) < config.flip
         return self(images, rows, which.expand(num, gels))
@@ -105,7 +119,7 @@ class GelMirror:
     def __call__(
         self, images: UInt8[Tensor, "B C H W"], rows: np.ndarray, which: Bool[Tensor, "B G"]
     ) -> UInt8[Tensor, "B C H W"]:
-        """``images`` of the pack's ``rows`` with the gels ``which`` (on the CPU) mirrored, rounded, channels-last."""
+        """Mirror the gels ``which`` (a mask on the CPU) of ``images`` of the pack's ``rows``. Returns channels-last."""
         out = images.permute(0, 2, 3, 1).clone(memory_format=torch.contiguous_format)
         for sensor in np.unique(self.sensors[rows]):
             here = torch.from_numpy(self.sensors[rows] == sensor)
@@ -121,16 +135,16 @@ class GelMirror:
 
 
 def _shrunk(pack: Pack, rows: np.ndarray) -> Float[Tensor, "N C h w"]:
-    """Touch images of ``rows``, pixels averaged down to about ``SIDE``."""
+    """Touch images of ``rows``, reduced to about ``SIDE`` pixels by averaging."""
     parts = []
-    for some in np.array_split(rows, -(-len(rows) // 32)):  # never all of them in full size
+    for some in np.array_split(rows, -(-len(rows) // 32)):  # never hold all of them in full size
         whole = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][some])).permute(0, 3, 1, 2)
         parts.append(F.avg_pool2d(whole.float(), max(1, pack.size // SIDE)))
     return torch.cat(parts)
 
 
 def _learn(gel: Float[Tensor, "N 3 h w"], size: int) -> tuple[Tensor, Tensor]:
-    """M' and I0(x) - M I0(-x), I0 without its mean colour, of one gel from pictures of it."""
+    """M' and I0(x) - M I0(-x) of one gel from images of it, where I0 has zero mean colour."""
     mean = gel.mean(0, keepdim=True)
     colours, mixtures, _ = slope_colours((gel - mean).permute(0, 2, 3, 1).double().numpy())
     matrix = torch.from_numpy(mirror_colours(colours, mixtures).T).float()

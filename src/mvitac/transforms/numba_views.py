@@ -1,12 +1,12 @@
-"""The CPU's views in one pass per image: crop, resize, flip, grayscale, normalisation; compiled by numba.
+"""Random views on CPUs in one pass per image, compiled by numba: crop, resize, flip, grayscale, normalisation.
 
-The fixed-point arithmetic of torch's antialiased uint8 resize, so its levels bit for bit. Each direction is weighted sums
-of whole lines (of the rows as they lie along the height, of gathered pixels along the width), which LLVM makes vectors of.
-Pixels are resized as four bytes, the last of which means nothing: so one reading fetches a pixel.
+It uses the fixed-point arithmetic of torch's antialiased uint8 resize and gives the same levels, bit for bit. In each
+direction a level is a weighted sum over whole lines (rows of the image along the height, gathered pixels along the width),
+which LLVM vectorises. Pixels are handled as four bytes, the last of them unused, so that one read fetches a pixel.
 """
 
 # pyright: reportCallIssue=false
-# (the first parameter of an intrinsic is numba's own, not its caller's)
+# (numba passes the first parameter of an intrinsic, not the caller)
 from __future__ import annotations
 
 from contextlib import suppress
@@ -18,10 +18,11 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 MAX_SHRINK = 1.5
-"""Side of the image over that of the view, up to which ``TERMS`` neighbours make a level; beyond it little is gained."""
+"""Largest ratio of image side to view side. Up to it a level is a sum of at most ``TERMS`` neighbours; beyond it the gain
+over torch is small."""
 TERMS = 3
 
-# Numba computes in 64 bits what is not kept from it; multipliers of 16 bits are four times as many in a vector.
+# Without these types numba would compute in 64 bits; a vector holds four times as many 16-bit multipliers.
 I32, U8 = ir.IntType(32), ir.IntType(8)
 
 
@@ -38,7 +39,7 @@ def _plus_product(_: Any, total: Any, level: Any, weight: Any) -> Any:
 
 @intrinsic
 def _level(_: Any, total: Any, precision: Any) -> Any:
-    """uint8: the whole part of a weighted sum, int32 with ``precision`` bits behind the point."""
+    """uint8: integer part of a weighted sum, which is an int32 with ``precision`` fractional bits."""
 
     def generate(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
         return builder.trunc(builder.lshr(given[0], given[1]), U8)
@@ -48,7 +49,7 @@ def _level(_: Any, total: Any, precision: Any) -> Any:
 
 @intrinsic
 def _fma(_: Any, a: Any, b: Any, c: Any) -> Any:
-    """float32 ``a`` * ``b`` + ``c``, rounded once, as torch.addcmul has it."""
+    """float32 ``a`` * ``b`` + ``c``, rounded once, as in torch.addcmul."""
 
     def generate(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
         return builder.fma(*given)
@@ -58,7 +59,7 @@ def _fma(_: Any, a: Any, b: Any, c: Any) -> Any:
 
 @intrinsic
 def _byte(_: Any, pixel: Any, shift: Any) -> Any:
-    """uint8: the eight bits of uint32 ``pixel`` from ``shift`` on."""
+    """uint8: eight bits of uint32 ``pixel``, from bit ``shift``."""
 
     def generate(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
         return builder.trunc(builder.lshr(given[0], builder.trunc(given[1], I32)), U8)
@@ -68,9 +69,10 @@ def _byte(_: Any, pixel: Any, shift: Any) -> Any:
 
 @njit(nogil=True)
 def _filter(length: int, size: int, starts: Any, weights: Any) -> Any:
-    """Fill in which of ``length`` levels make each of ``size``: the first of them, and int16 ``weights`` [TERMS, size].
+    """Compute the triangle filter that resizes ``length`` levels to ``size``. When shrinking it is as wide as a step.
 
-    A triangle, as wide as a step where it shrinks. Returns how many levels make one (2 or 3) and the weights' precision.
+    Fills ``starts`` [size], the first source level of each target, and int16 ``weights`` [TERMS, size]. Returns the number
+    of terms (2 or 3) and the number of fractional bits of the weights.
     """
     step = length / size
     reach = max(step, 1.0)
@@ -115,13 +117,13 @@ def _pixel(red: Any, green: Any, blue: Any, precision: Any) -> Any:
     return np.uint32(red) | np.uint32(green) << np.uint32(8) | np.uint32(blue) << np.uint32(16)
 
 
-# A function for every number of terms: numba counts the uses of an array's parts wherever they outlive a branch,
-# and a count costs as much as dozens of pixels.
+# One function for each number of terms: numba counts references to parts of an array that outlive a branch, and a count
+# costs as much as dozens of pixels.
 
 
 @njit(nogil=True)
 def _across_2(pixels: Any, weights: Any, precision: Any, out: Any) -> None:
-    """A row of pixels, uint32 ``out`` [S]: the sum of ``pixels`` [2, S] times int16 ``weights`` [2, S]."""
+    """Fill a row of pixels, uint32 ``out`` [S], with the sum of ``pixels`` [2, S] times int16 ``weights`` [2, S]."""
     half, p, q, u, v = np.int32(1 << (precision - 1)), pixels[0], pixels[1], weights[0], weights[1]
     for x in range(len(out)):
         a, b = p[x], q[x]
@@ -148,7 +150,7 @@ def _across_3(pixels: Any, weights: Any, precision: Any, out: Any) -> None:
 
 @njit(nogil=True)
 def _down_2(lines: Any, first: int, u: Any, v: Any, precision: Any, out: Any) -> None:
-    """A row of levels, uint8 ``out`` [L]: two ``lines`` [h, L] from ``first`` on, times int16 ``u`` and ``v``."""
+    """Fill a row of levels, uint8 ``out`` [L], with the sum of two ``lines`` [h, L] from ``first`` times ``u`` and ``v``."""
     half, a, b = np.int32(1 << (precision - 1)), lines[first], lines[first + 1]
     for j in range(len(out)):
         out[j] = _level(_plus_product(_plus_product(half, a[j], u), b[j], v), precision)
@@ -163,14 +165,14 @@ def _down_3(lines: Any, first: int, u: Any, v: Any, w: Any, precision: Any, out:
 
 @njit(nogil=True)
 def _bfloat16(value: Any) -> Any:
-    """The bits of a float32 as bfloat16, to the nearest, ties to even."""
+    """The bits of a float32 rounded to bfloat16, to nearest, ties to even."""
     bits = np.float32(value).view(np.uint32)
     return np.uint16(np.uint32(bits + np.uint32(0x7FFF) + (bits >> np.uint32(16) & np.uint32(1))) >> np.uint32(16))
 
 
 @njit(nogil=True)
 def _normalise(levels: Any, grayscale: bool, luma: Any, factors: Any, offsets: Any, line: Any) -> None:
-    """A line of uint8 ``levels`` [S * 4], whose fourth channel means nothing, to ``line`` [S * 3]."""
+    """Normalise a line of uint8 ``levels`` [S * 4], whose fourth channel is unused, into ``line`` [S * 3]."""
     for x in range(len(line) // 3):
         red, green, blue = np.float32(levels[4 * x]), np.float32(levels[4 * x + 1]), np.float32(levels[4 * x + 2])
         if grayscale:
@@ -188,7 +190,7 @@ def _normalise(levels: Any, grayscale: bool, luma: Any, factors: Any, offsets: A
 def _resize_rows(
     crop: Any, places: Any, weights: Any, terms: int, precision: Any, channels: int, held: Any, fours: Any, rows: Any
 ) -> None:
-    """Fill ``rows`` [..., S] with sums of pixels of each row of ``crop``, uint8 [h, bytes], the first at ``places``."""
+    """Resize the width: fill ``rows`` [h, S] with weighted sums of pixels of ``crop``, uint8 [h, bytes], from ``places``."""
     pixels = np.empty(weights.shape, np.uint32)
     for y in range(len(crop)):
         _copy(crop[y], held)
@@ -213,7 +215,7 @@ def _finish(
     offsets: Any,
     out: Any,
 ) -> None:
-    """Sums of ``rows`` of pixels, as uint8 [..., S * 4], normalised: ``out`` [S, S * 3]."""
+    """Resize the height of ``rows``, uint8 [h, S * 4], and normalise into ``out`` [S, S * 3]."""
     levels = np.empty(rows.shape[1], np.uint8)
     for y in range(len(out)):
         if terms == 2:
@@ -236,12 +238,12 @@ def _views(
     held: Any,
     fours: Any,
 ) -> None:
-    """``views`` of ``images`` [B, H, W * C]; ``held`` and ``fours`` are scratch: bytes, and the four from each on."""
+    """``views`` of ``images`` [B, H, W * C]. ``held`` is a byte buffer; ``fours`` [i] reads its bytes i to i + 3."""
     size, channels = out.shape[2:]
-    starts, places = np.empty(size, np.int64), np.empty(size, np.uint64)  # unsigned: none counts from the end
+    starts, places = np.empty(size, np.int64), np.empty(size, np.uint64)  # unsigned: no negative indices
     weights, turned = np.empty((TERMS, size), np.int16), np.empty((TERMS, size), np.int16)
     rows = np.zeros((images.shape[1] + TERMS, size), np.uint32)
-    alone = np.empty((size if channels > 3 else 0, 3 * size), out.dtype)
+    sensor = np.empty((size if channels > 3 else 0, 3 * size), out.dtype)
     for i in range(len(images)):
         top, left, height, width = boxes[i]
         for channel in range(0, channels, 3):
@@ -259,11 +261,11 @@ def _views(
                 whole = out[i].reshape(size, 3 * size)
                 _finish(lines, starts, weights, terms, precision, gray, luma, factors, offsets, whole)
             else:
-                _finish(lines, starts, weights, terms, precision, gray, luma, factors, offsets, alone)
-                out[i, :, :, channel : channel + 3] = alone.reshape(size, size, 3)
+                _finish(lines, starts, weights, terms, precision, gray, luma, factors, offsets, sensor)
+                out[i, :, :, channel : channel + 3] = sensor.reshape(size, size, 3)
 
 
-with suppress(RuntimeError):  # nowhere to keep it: every process compiles anew
+with suppress(RuntimeError):  # no writable cache: each process compiles again
     _views.enable_caching()
 
 
@@ -277,14 +279,21 @@ def views(
     factors: np.ndarray,
     offsets: np.ndarray,
 ) -> None:
-    """Fill ``out`` [B, S, S, C], float32 or as uint16 the bits of bfloat16, with the views of uint8 ``images`` [B, H, W, C].
+    """Compute random views. Releases the GIL, so that several threads can fill parts of one ``out``.
 
-    ``boxes``, ``flip`` and ``grayscale`` are those of ``random_views.Drawn``; ``luma``, ``factors`` and ``offsets`` float32 [3].
-    All contiguous. Holds no lock: several threads may fill parts of one ``out``.
+    Args:
+        images: uint8 [B, H, W, C], contiguous as all arguments.
+        boxes: As ``random_views.Drawn``, like ``flip`` and ``grayscale``.
+        flip: [B].
+        grayscale: [B].
+        out: [B, S, S, C], filled with the views: float32, or the bits of bfloat16 as uint16.
+        luma: float32 [3], like ``factors`` and ``offsets``.
+        factors: Factors of the normalisation.
+        offsets: Offsets of the normalisation.
     """
     assert max(images.shape[1:3]) <= MAX_SHRINK * out.shape[1]
     num, height, width, channels = images.shape
-    held = np.zeros((width + TERMS) * channels, np.uint8)  # neighbours past the end of a row have weight 0
+    held = np.zeros((width + TERMS) * channels, np.uint8)  # neighbours beyond the end of a row have weight 0
     fours = np.ndarray(len(held) - 3, np.uint32, held, strides=(1,))
     _views(
         images.reshape(num, height, width * channels), boxes, flip, grayscale, out, luma, factors, offsets, held, fours

@@ -1,13 +1,15 @@
-"""Random views, per image and batched: crop, flips, grayscale, colour jitter, normalisation (paper, appendix B).
+"""Random views of images: crop, flip, grayscale, colour jitter, normalisation (paper, appendix B).
 
-Parameters are drawn first (``draw``), from an explicit generator, then applied (``apply``): so a view is a function of
-(seed, step), the two gels of a stacked pair get the same crop, and CPU and GPU can replay the same parameters.
+``draw`` draws the parameters from an explicit generator, ``apply`` applies them. A view is therefore a function of
+(seed, step), the two gels of a stacked image get the same crop, and CPU and GPU can apply the same parameters.
+
+Shapes: B images of C channels and H x W pixels, stacked from N = C / 3 sensors; views of S x S pixels.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from types import ModuleType
 from typing import Literal
@@ -17,34 +19,36 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mvitac.registry import LATER_IN_DIGEST
+
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as PIL and torchvision use it
-NUM_TRIES = 10  # of a crop that fits, then the largest centred one; as torchvision's RandomResizedCrop
+NUM_TRIES = 10  # to draw a crop that fits, then the largest possible one, as in torchvision's RandomResizedCrop
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewAugment:
-    """What one modality's random views are made of."""
+    """Random views of one modality."""
 
     scale: tuple[float, float] = (0.2, 1.0)
-    """Crop area as a share of the image (paper: .2 to 1)."""
+    """Range of the crop area, as a fraction of the image (paper: .2 to 1)."""
     flip: float = 0.5
     """Probability of a horizontal flip (paper: .5)."""
     grayscale: float = 0.2
     """Probability of grayscale (paper: .2 for materials, none for grasping)."""
     jitter: float = 0.0
-    """Strength of brightness, contrast and per-channel gain jitter, each factor 1 +- jitter (paper: none)."""
-    noise: float = 0.0
-    """Gaussian noise on every pixel of a view, its standard deviation drawn between 0 and this many of 255 levels (paper:
-    none)."""
+    """Strength of brightness, contrast and per-channel gain jitter; each factor is 1 +- jitter (paper: none)."""
+    noise: float = field(default=0.0, metadata=LATER_IN_DIGEST)
+    """Gaussian noise on the pixels. Its standard deviation is drawn per image, between 0 and this number of 255 levels
+    (paper: none)."""
     independent_sensors: bool = False
-    """Draw the two sensors of a stacked touch image apart (as the authors' code does) instead of alike."""
+    """Draw separate parameters for the two sensors of a stacked touch image, as in the authors' code."""
 
     def __post_init__(self) -> None:
         if not 0 < self.scale[0] <= self.scale[1] <= 1:
-            raise ValueError(f"augment scale {self.scale}: give two shares of the area, 0 < low <= high <= 1")
+            raise ValueError(f"augment scale {self.scale}: give two fractions of the area, 0 < low <= high <= 1")
         for name in ("flip", "grayscale"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"augment {name} {getattr(self, name)} is not a probability: give 0 to 1")
@@ -56,17 +60,17 @@ class ViewAugment:
 
 @dataclass(frozen=True, kw_only=True)
 class Augment:
-    """Both modalities' views and the side in pixels of what the encoders see."""
+    """Views of both modalities, and the image sizes that the encoders see."""
 
     size: int = 224
-    """Side of the crop that enters the encoders (paper: 224)."""
+    """Side in pixels of the crops that enter the encoders (paper: 224)."""
     whole: int | None = None
-    """Side at which the frozen encoders see whole images; none = size. A random crop shows things larger than the whole
-    image squeezed into the same side does, so features of whole images gain from a larger side (arXiv:1906.06423).
-    Heads that were trained along (shared space, own classifiers) do not, and keep to ``size`` (docs/simulator.md)."""
-    gel_flip: Literal["plain", "colour"] = "plain"
-    """What a flip of touch mirrors. plain: pixels (paper), and with them the lamps, which no real press does. colour: the
-    touch, as the same sensor would show it, by the colours of slope learned from the training rows."""
+    """Side in pixels at which frozen encoders see whole images. Default: size. Random crops show objects larger than a whole
+    image resized to the same side does, so features of whole images improve with a larger side (arXiv:1906.06423). Heads
+    trained with the encoders (shared space, own classifiers) do not, and always use ``size`` (docs/simulator.md)."""
+    gel_flip: Literal["plain", "colour"] = field(default="plain", metadata=LATER_IN_DIGEST)
+    """How touch images are flipped. plain: mirror the pixels (paper). This also mirrors the lamps, which no real press does.
+    colour: show the mirrored touch as the same sensor would see it, from slope colours learned on the training rows."""
     vision: ViewAugment = ViewAugment()
     touch: ViewAugment = ViewAugment()
 
@@ -76,18 +80,18 @@ class Augment:
                 raise ValueError(f"augment {name} {side}: give a side of 8 to 1024 pixels")
         if self.gel_flip == "colour" and not self.touch.flip:
             raise ValueError(
-                "augment gel_flip 'colour' flips nothing at touch.flip 0: give --augment.touch.flip 0.5 as well"
+                "augment gel_flip 'colour' has no effect at touch.flip 0: also give --augment.touch.flip 0.5"
             )
 
     @property
     def eval_size(self) -> int:
-        """Side of the whole image that probes and predictions see."""
+        """Side in pixels of the whole images that probes and predictions see."""
         return self.size if self.whole is None else self.whole
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """The drawn parameters of one view of B images."""
+    """Parameters of one view of B images."""
 
     boxes: Tensor
     """[B, 4] int64: top, left, height, width of the crop."""
@@ -96,11 +100,11 @@ class Drawn:
     grayscale: Tensor
     """[B] bool."""
     gains: Tensor
-    """[B, 5] float: brightness, contrast, and a gain for each of R, G, B."""
+    """[B, 5] float: brightness, contrast, and gains of R, G, B."""
 
 
 def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -> Drawn:
-    """Parameters of one random view of ``num`` images of side ``size``."""
+    """Draw the parameters of one random view of ``num`` images of ``size`` x ``size`` pixels."""
 
     def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=generator)
@@ -126,7 +130,7 @@ def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -
 def apply(
     images: UInt8[Tensor, "B C H W"], drawn: Drawn, size: int, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "B C S S"]:
-    """The view ``drawn`` of uint8 ``images``: cropped to [size, size], normalised, channels-last, on their device.
+    """Apply the parameters ``drawn``: crop to [size, size], flip, colour, normalise. Returns channels-last on their device.
 
     Computed in fp32 and rounded to ``dtype`` once, as autocast would round it before the first convolution.
     """
@@ -141,7 +145,7 @@ def apply(
 
 @cache
 def fused() -> ModuleType | None:
-    """``mvitac.transforms.numba_views``, where a numba that works with this numpy is installed."""
+    """``mvitac.transforms.numba_views``, or None without a numba that supports the installed numpy."""
     try:
         from mvitac.transforms import numba_views
     except ImportError:
@@ -150,9 +154,9 @@ def fused() -> ModuleType | None:
 
 
 def _in_one_pass(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, compiled: ModuleType) -> Tensor:
-    """The CPU's fast route, without jitter: a share of the images for each of torch's threads.
+    """The fast implementation for CPUs, without jitter. The images are divided among torch's threads.
 
-    The levels of ``_one_by_one``, and so its views bit for bit, but for the last bits of a gray one.
+    Bit-identical to ``_one_by_one``, except for the last bits of grayscale views.
     """
     num, channels = images.shape[:2]
     out = torch.empty(num, size, size, channels, dtype=dtype)
@@ -178,9 +182,9 @@ def _threads(num: int) -> ThreadPoolExecutor:
 
 
 def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
-    """The CPU's route in torch: an image stays in the cache from crop to normalised view, uint8 until the last step."""
+    """The implementation for CPUs in torch. One image at a time stays in the cache, as uint8 until the last step."""
     num, channels = images.shape[:2]
-    out = torch.empty(num, size, size * channels, dtype=dtype)  # a line of pixels with its channels: long inner loops
+    out = torch.empty(num, size, size * channels, dtype=dtype)  # lines of pixels with their channels: long inner loops
     factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device))
     luma = _luma(images.device).flatten()
     jittered = (drawn.gains != 1).any(1)
@@ -198,10 +202,10 @@ def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> 
 
 
 def _crop(image: UInt8[Tensor, "C H W"], box: list[int], flip: bool, size: int) -> UInt8[Tensor, "S S C"]:
-    """Cut, resize (bilinear, antialiased where it shrinks) and flip one image, three channels at a time."""
+    """Crop, resize (bilinear, antialiased when shrinking) and flip one image."""
     top, left, height, width = box
     crop = image[:, top : top + height, left : left + width].unflatten(0, (-1, 3))  # [sensors, 3, h, w]
-    if (height, width) != (size, size):  # torch's kernel for uint8 is vectorised where the channels lie together
+    if (height, width) != (size, size):  # torch's uint8 kernel is vectorised for channels-last images
         crop = F.interpolate(
             crop.contiguous(memory_format=torch.channels_last), (size, size), mode="bilinear", antialias=True
         )
@@ -211,9 +215,10 @@ def _crop(image: UInt8[Tensor, "C H W"], box: list[int], flip: bool, size: int) 
 
 
 def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
-    """The GPU's route: crop, resize and flip of the whole batch as two matrix products, Y @ image @ X'.
+    """The implementation for GPUs: crop, resize and flip the whole batch by two matrix products, Y @ image @ X'.
 
-    The same antialiased filter as the CPU's. In fp16 on a GPU: pixels are exact, weights err by less than 0.1 level.
+    The antialiased filter is the same as on the CPU. On a GPU it uses fp16, in which pixels are exact and the weights cause
+    errors below 0.1 level.
     """
     device, side = images.device, images.shape[-1]
     top, left, height, width = drawn.boxes.to(device, torch.float32, non_blocking=True).unbind(1)
@@ -231,7 +236,7 @@ def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Ten
 
 
 def _resampling(start: Tensor, length: Tensor, side: int, size: int) -> Float[Tensor, "B S H"]:
-    """Weights of every source pixel in each pixel of the cuts [start, start + length), both [B]: a triangle filter."""
+    """Weights of the H source pixels in each of the S pixels of crops [start, start + length): a triangle filter."""
     step = length[:, None, None] / size
     target = torch.arange(size, device=start.device, dtype=torch.float32)[None, :, None] + 0.5
     source = torch.arange(side, device=start.device, dtype=torch.float32)[None, None, :] + 0.5
@@ -243,7 +248,7 @@ def _resampling(start: Tensor, length: Tensor, side: int, size: int) -> Float[Te
 
 @lru_cache
 def _normalisation(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Factor and offset [3] that take levels 0-255 to ImageNet's mean and spread."""
+    """Factor and offset [3] that normalise levels 0-255 by ImageNet's mean and standard deviation."""
     mean, std = (torch.tensor(v, dtype=torch.float64) for v in (IMAGENET_MEAN, IMAGENET_STD))
     return (1 / (255 * std)).float().to(device), (-mean / std).float().to(device)
 
@@ -254,9 +259,9 @@ def _luma(device: torch.device) -> Tensor:
 
 
 def _colour(sensors: Float[Tensor, "B N 3 S S"], drawn: Drawn) -> Float[Tensor, "B N 3 S S"]:
-    """Jitter, then grayscale, of levels in [0, 1], for all N sensors of an image alike."""
+    """Apply jitter, then grayscale, to levels in [0, 1]; the same for all sensors of an image."""
     luma = _luma(sensors.device)
-    if bool((drawn.gains != 1).any()):  # parameters are drawn on the CPU: asking them waits for no GPU
+    if bool((drawn.gains != 1).any()):  # the parameters are on the CPU, so this does not wait for a GPU
         gains = drawn.gains.to(sensors.device, non_blocking=True)
         brightness, contrast = gains[:, 0].view(-1, 1, 1, 1, 1), gains[:, 1].view(-1, 1, 1, 1, 1)
         sensors = sensors * (brightness * gains[:, 2:].view(-1, 1, 3, 1, 1))
@@ -275,20 +280,21 @@ def random_view(
     generator: torch.Generator,
     dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "B C S S"]:
-    """One random view of every image; ``generator`` lives on the CPU and decides all of it."""
+    """One random view of each image. All randomness comes from ``generator``, which is on the CPU."""
     num, channels, side, _ = images.shape
     if config.independent_sensors and channels > 3:
-        apart = [apply(sensor, draw(config, num, side, generator), size, dtype) for sensor in images.split(3, dim=1)]
-        view = torch.cat(apart, dim=1).contiguous(memory_format=torch.channels_last)
+        sensors = [apply(sensor, draw(config, num, side, generator), size, dtype) for sensor in images.split(3, dim=1)]
+        view = torch.cat(sensors, dim=1).contiguous(memory_format=torch.channels_last)
     else:
         view = apply(images, draw(config, num, side, generator), size, dtype)
     return _noisy(view, config.noise, generator) if config.noise else view
 
 
 def _noisy(view: Float[Tensor, "B C S S"], noise: float, generator: torch.Generator) -> Float[Tensor, "B C S S"]:
-    """``view`` with noise as in ``ViewAugment.noise``, no darker than black and no lighter than white.
+    """Add the noise of ``ViewAugment.noise`` and clip to the range from black to white.
 
-    The strengths come from ``generator``, the pixels from one of the view's device: they differ between kinds of devices.
+    The strengths are drawn from ``generator``, the noise from a generator on the view's device. The noise therefore differs
+    between types of devices.
     """
     num, channels, device = len(view), view.shape[1], view.device
     strength = (noise * torch.rand(num, 1, 1, 1, generator=generator)).to(device, non_blocking=True)
@@ -299,11 +305,10 @@ def _noisy(view: Float[Tensor, "B C S S"], noise: float, generator: torch.Genera
 
 
 def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B C S S"]:
-    """The whole image at ``size``, normalised: what probes and predictions see (no randomness)."""
+    """Whole images resized to ``size`` and normalised, without randomness, for probes and predictions."""
     num, _, side, _ = images.shape
     whole = torch.tensor([[0, 0, side, side]]).expand(num, 4)
     never = torch.zeros(num, dtype=torch.bool)
-    route = (
-        _one_by_one if images.device.type == "cpu" else _batched
-    )  # few images or a network behind: numba need not start
-    return route(images, Drawn(whole, never, never, torch.ones(num, 5)), size, torch.float32)
+    # On CPUs not the compiled version: there are few images, or the network takes longer, so numba need not be loaded.
+    implementation = _one_by_one if images.device.type == "cpu" else _batched
+    return implementation(images, Drawn(whole, never, never, torch.ones(num, 5)), size, torch.float32)

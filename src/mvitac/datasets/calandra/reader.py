@@ -69,6 +69,7 @@ class CalandraConfig(DatasetConfig):
     """Grasps of about 106 objects with two GelSights (stacked, 6 channels) and a Kinect, labelled by success."""
 
     name: ClassVar[str] = "calandra"
+    phased: ClassVar[bool] = True
 
     path: Path = Path("data/calandra")
     """Folder with some or all of the shards calandra_corl2017_000.h5 to _037.h5."""

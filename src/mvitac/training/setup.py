@@ -1,0 +1,174 @@
+"""Set-up of pre-training: everything that happens before the first step, and every check that can be made there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mvitac.data.pack import Pack
+from mvitac.methods.base import Method
+from mvitac.model import Model, precision_of
+from mvitac.nn.memory_bank import replicated, shard_banks
+from mvitac.registry import to_json
+from mvitac.run import Run, load_run
+from mvitac.system.device import describe, pick_device, pick_precision
+from mvitac.system.distributed import World, local_device, synchronise_norms
+from mvitac.system.files import brief, check_place, write_json
+from mvitac.system.malloc import keep_freed_memory
+from mvitac.system.provenance import provenance
+from mvitac.training import checkpoint
+from mvitac.training.sampler import training_rows
+from mvitac.training.step import Step
+from mvitac.training.views import gel_mirror
+from mvitac.transforms.gel_flip import GelMirror
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What the training loop works with."""
+
+    asked: Run
+    """The run as it was given."""
+    run: Run
+    """The same with ``precision`` resolved for this machine."""
+    pack: Pack
+    rows: np.ndarray
+    """Pack rows to train on."""
+    mirror: GelMirror | None
+    device: torch.device
+    world: World
+    method: Method
+    step: Step
+    start: int
+    """Number of steps that are already done."""
+    num_steps: int
+
+
+def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
+    """Open the data, build the method and its optimiser, restore a checkpoint, and write run.json.
+
+    Returns:
+        The set-up, or None if the run in ``out`` is already finished.
+    """
+    device = pick_device(local_device(asked.device))
+    run = replace(asked, precision=_precision(asked, device, world))
+    pack = _open_pack(run, world, quiet) if pack is None else pack
+    rows = training_rows(run, pack)
+    run.check(pack.spec, len(rows), pack.size)
+    mirror = gel_mirror(run, pack, device)
+    check_divisible(run, world)
+    resumed = (out / "run.json").exists()
+    if resumed:
+        begun = check_same(asked, pack, out)
+        if (out / "model.safetensors").exists():
+            return None
+        _check_precision(begun, asked, run, out)
+
+    method = _build_method(run, pack, rows, device, world)
+    step = Step(run, method, device, world)
+    num_steps, start = run.num_steps(len(rows)), 0
+    if (out / "checkpoint.pt").exists():
+        start = checkpoint.restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
+    # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
+    world.same_everywhere(replicated(method))
+    if not resumed and world.writes:
+        record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
+        here = {"device": describe(device), "precision": run.precision}
+        write_json(out / "run.json", {**record, **here, **provenance()})
+    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps)
+
+
+def check_out(out: Path, resume: bool) -> None:
+    """Raise ValueError if ``out`` cannot become the folder of the run. Called before any data is simulated or packed."""
+    check_place(out)
+    if (out / "run.json").exists():
+        if not resume:
+            raise ValueError(f"{out} already holds a run: continue it with --resume, or choose another --out")
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ValueError(f"{out} exists and is not a run: choose another --out")
+
+
+def check_divisible(run: Run, world: World) -> None:
+    """Raise ValueError unless each process gets the same number of whole chunks of a batch."""
+    multiple = world.size * max(1, run.chunk)
+    if run.batch_size % multiple:
+        chunks = f" with chunks of {run.chunk} pairs" if run.chunk else ""
+        raise ValueError(
+            f"batch_size {run.batch_size} is not divisible by {world.size} processes{chunks}:"
+            f" give a multiple of {multiple}"
+        )
+
+
+def check_same(run: Run, pack: Pack, out: Path) -> str:
+    """Check that the run in folder ``out`` is ``run`` on ``pack``. Precision auto matches any precision.
+
+    Returns:
+        The precision in which the run in ``out`` was started.
+
+    Raises:
+        ValueError: If it is a different run.
+    """
+    old, record = load_run(out)
+    begun = precision_of(old, record)
+    same = replace(run, precision=begun) if run.precision == "auto" else run
+    if replace(old, precision=begun).digest() != same.digest() or record.get("pack") != pack.digest:
+        raise ValueError(f"{out} holds a different run (other settings or data): give the same ones, or another --out")
+    return begun
+
+
+def _precision(run: Run, device: torch.device, world: World) -> str:
+    """Resolve ``run.precision`` on ``device``. auto is bf16 only if every process supports it."""
+    precision = pick_precision(run.precision, device)
+    return "fp32" if run.precision == "auto" and world.anyone(precision == "fp32") else precision
+
+
+def _check_precision(begun: str, asked: Run, run: Run, out: Path) -> None:
+    """Raise ValueError if the run in ``out`` was started in another precision: its weights would match neither."""
+    if begun != run.precision:
+        raise ValueError(
+            f"{out} was begun in {begun}, and --precision {asked.precision} means {run.precision} on this machine:"
+            f" continue it with --precision {begun}, or delete it to start over in {run.precision}"
+        )
+
+
+def _open_pack(run: Run, world: World, quiet: bool) -> Pack:
+    """Open the data of ``run``. Rank 0 simulates or packs what does not exist yet, then the others open it."""
+    if world.rank:
+        world.wait()
+    pack = run.data.open(quiet=quiet or not world.writes)
+    if not world.rank:
+        world.wait()
+    return pack
+
+
+def _build_method(run: Run, pack: Pack, rows: np.ndarray, device: torch.device, world: World) -> Method:
+    """The method of ``run`` with fresh weights, on ``device``."""
+    if device.type == "cpu":
+        keep_freed_memory()
+    torch.manual_seed(run.seed)
+    method = run.method.build(pack.spec, run.encoder)
+    method.prepare(torch.from_numpy(rows))
+    shard_banks(method, world)
+    method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    _check_image_size(method, run, pack)
+    synchronise_norms(method, world)
+    return method
+
+
+@torch.no_grad()
+def _check_image_size(method: Method, run: Run, pack: Pack) -> None:
+    """Pass two blank images through each trunk, because not every trunk supports every image size."""
+    model = Model(method, run, pack.spec, pack.size)
+    for modality, trunk in model.encoders.items():
+        device = next(trunk.parameters()).device
+        blank = torch.zeros(2, pack.spec.channels(modality), pack.size, pack.size, dtype=torch.uint8, device=device)
+        try:
+            model.features(modality, blank)
+        except Exception as error:  # the type differs between trunks
+            raise ValueError(
+                f"trunk {run.encoder.trunk} does not support images of {run.augment.eval_size} px ({brief(error)}):"
+                " give another --augment.size or --encoder.trunk"
+            ) from None
