@@ -83,7 +83,7 @@ class Plan:
                 raise ValueError(f"row {label!r} is given twice: give each row its own label")
         if len({slug(label) for label in labels}) < len(labels):
             raise ValueError(
-                f"plan {self.name!r}: some labels differ only in punctuation, which folder names drop: rename one"
+                f"plan {self.name!r}: some labels differ only in case or punctuation, which folder names drop: rename one"
             )
         for fold in self.folds:
             if self.folds.count(fold) > 1:
