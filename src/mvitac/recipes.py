@@ -92,7 +92,7 @@ def modern(data: DatasetConfig) -> Run:
 
 
 def demo(data: DatasetConfig) -> Run:
-    """`modern` for a laptop's CPU, in minutes: ResNet-10 from scratch at 48 px, 1,150 steps of 64 pairs.
+    """`modern` for a laptop's CPU: ResNet-10 from scratch at 48 px, 1,150 steps of 64 pairs.
 
     - The paper's momentum keys, because the demo shows the paper's method.
     - ResNet-10 (timm's resnet10t) at 48 px: more steps in the same time. Its score was not compared with ResNet-18's.

@@ -26,10 +26,9 @@ def demo(argv: list[str]) -> None:
         """How many times to pre-train, each from its own seed."""
         run: Annotated[Run, tyro.conf.arg(name="")] = recipe(chosen.get("--recipe", "quick"))
 
-    Options.__doc__ = f"""The whole road on simulated materials: simulate, pre-train, probe, report. A second call goes on
-    where the first stopped.
+    Options.__doc__ = f"""Simulate materials, pre-train, probe and write a report. A second call resumes the first.
 
-      --recipe {"|".join(RECIPES)}  (default quick; demo is that of the published tables)
+      --recipe {"|".join(RECIPES)}  (default quick; demo: the recipe of the published tables)
     """
     options = parse(Options, rest, "demo")
     run_demo(options.run, options.out, options.seeds, Console(markup=False))

@@ -39,7 +39,7 @@ PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", 
 
 @dataclass(frozen=True, kw_only=True)
 class MViTacConfig(MethodConfig):
-    """Momentum contrast within and across vision and touch. On one modality, only its intra-modal loss."""
+    """Momentum contrast within and across vision and touch. With one modality, only its intra-modal loss is used."""
 
     name: ClassVar[str] = "mvitac"
 
@@ -179,7 +179,7 @@ class MViTac(Contrastive):
     def view_pairs(self, head: str) -> tuple[tuple[int, int], ...]:
         """(view of the query, view of the key) of each term of a loss. The paper: ((0, 1),)."""
         crossed = ((0, 1), (1, 0)) if self.config.both_ways else ((0, 1),)
-        # An image's view with itself would be no task, so only inter-modal losses pair equal views.
+        # A view and itself are a trivial pair, so only inter-modal losses pair equal views.
         return (*crossed, (0, 0), (1, 1)) if head == "inter" and self.config.pairs == "all" else crossed
 
     def encoders(self) -> dict[str, nn.Module]:
