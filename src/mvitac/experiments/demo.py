@@ -1,4 +1,4 @@
-"""``mvitac demo``: the whole road on simulated materials, simulate -> pre-train -> probe -> report, resumable."""
+"""``mvitac demo``: simulate materials, pre-train, probe, write a report. Resumable."""
 
 from __future__ import annotations
 
@@ -25,17 +25,24 @@ from mvitac.training.loop import Interrupted, train
 
 
 def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
-    """Pre-train ``run`` with seeds 0 .. num_seeds - 1 below ``out``, probe, report; returns the report's path.
+    """Pre-train ``run`` with several seeds, probe the features, and write a report. Finished parts are not repeated.
 
-    Leaves <out>/seed<i>/ (runs), probe.json (everything), summary.json (task -> modality -> method or control -> mean,
-    low, high, seeds) and report/. What is finished is not done again.
+    Args:
+        run: The run of the first seed.
+        out: Folder for the runs (seed0, seed1, ...), probe.json (all scores), summary.json (task -> modality -> method or
+            control -> mean, low, high, seeds) and report/.
+        num_seeds: Number of seeds.
+        console: Where progress is printed.
+
+    Returns:
+        Path of the report.
     """
     if num_seeds < 1:
         raise ValueError(f"seeds {num_seeds}: give at least 1")
     start = time.perf_counter()
     say = lambda text: console.print(text, soft_wrap=True, highlight=False)  # noqa: E731
     say(
-        f"1/4 simulating {run.data.name}: {getattr(run.data, 'num', '')} pairs, once; later runs find them in the cache"
+        f"1/4 simulating {run.data.name}: {getattr(run.data, 'num', '')} pairs, kept in the cache"
     )
     pack = run.data.open()
     runs = [(replace(run, seed=run.seed + i), out / f"seed{run.seed + i}") for i in range(num_seeds)]
@@ -48,12 +55,12 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
         device = pick_device(run.device)
         say(describe_precision(run.precision, pick_precision(run.precision, device), device))
         train_together(unfinished, steps, console)
-    for seeded, path in runs:  # what is finished is only held against what is asked for
+    for seeded, path in runs:  # a finished run is only checked against the settings
         if not (path / "model.safetensors").exists():
             say(f"2/4 pre-training seed {seeded.seed} (of {num_seeds}): {steps} steps of {run.batch_size} pairs")
         train(seeded, path, resume=True, pack=pack)
     paths = [path for _, path in runs]
-    say("3/4 probing the frozen features, beside controls")
+    say("3/4 probing the frozen features and the controls")
     with shown(console):
         result = probe_runs(paths, ProbeConfig(), pack)
     write_json(out / "probe.json", result)
