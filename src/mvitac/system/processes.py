@@ -99,11 +99,16 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
 
 
 def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dict[Hashable, Tensor]:
-    """The tensors of all ``branches``, which share no parameters and draw no random numbers: networks that are trained
-    together, each in a thread with its share of torch's threads. ``backward()`` takes them side by side as well.
+    """Run networks that are trained together in parallel threads, forward and backward.
 
-    Two networks of one thread each get more out of two cores than one network of two threads, which wait for each other
-    after every layer. In fp32 the numbers are those of one thread, bit for bit.
+    Each gets its share of torch's threads. Two networks with one thread each use two cores better than one network with
+    two threads, which wait for each other after every layer. In fp32 the results equal those of one thread bit for bit.
+
+    Args:
+        branches: Functions that share no parameters and draw no random numbers.
+
+    Returns:
+        The tensors of all branches in one dict.
     """
     threads = torch.get_num_threads()
     if threads < 2 or len(branches) < 2 or torch.compiler.is_compiling() or torch.distributed.is_initialized():
@@ -111,7 +116,7 @@ def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dic
     cpu = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu"), torch.is_grad_enabled()
 
     def in_this_mode(branch: Callable[[], dict[Hashable, Tensor]]) -> dict[Hashable, Tensor]:
-        # A thread begins without these modes. Autocast's cache belongs to all threads, and whoever ends first empties it.
+        # A new thread has none of these modes. All threads share autocast's cache, and the first to end clears it.
         cast = torch.autocast("cpu", cpu[1], enabled=cpu[0], cache_enabled=False)
         with cast, torch.set_grad_enabled(cpu[2]):
             return branch()
@@ -122,13 +127,13 @@ def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dic
 
 
 class _Branches(torch.autograd.Function):
-    """Cuts the graph: the branches keep theirs, and are taken backward when the gradients of all their tensors are there."""
+    """Cut the graph at the branches' outputs, so that backward runs all branches once all gradients are known."""
 
     @staticmethod
     def forward(
         ctx: Any, anchor: Tensor, branches: list[Callable[[], dict[Hashable, Tensor]]], named: list[Hashable]
     ) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)  # what no loss uses gets none, instead of zeros
+        ctx.set_materialize_grads(False)  # None instead of zeros for outputs that no loss uses
         made = _at_once(branches)
         named += [name for tensors in made for name in tensors]
         ctx.made = [list(tensors.values()) for tensors in made]

@@ -1,8 +1,8 @@
-"""How far long work has come, and how long it will take, by what was measured of it.
+"""Progress of long work, with the time left as estimated from measured steps.
 
-``shown`` opens a display and ``work`` adds a line to it, from any depth of calls and any thread. Without ``shown``, as when
-a function is called from Python, nothing is printed. A terminal or a notebook sees bars whose columns are named. A pipe or
-a file gets plain lines: what is done, after the first measured steps the time left, then about every tenth of the time.
+``shown`` opens a display. ``work`` adds a line to it, from any function and any thread. Without ``shown``, e.g. if a function
+is called from Python, nothing is printed. A terminal or a notebook shows bars with named columns. A pipe or a file gets
+plain lines: the work, the time left after the first measured steps, and then a line about every tenth of the time.
 """
 
 from __future__ import annotations
@@ -17,18 +17,21 @@ from rich.table import Column
 from rich.text import Text
 
 WIDE = 120
-"""Columns of a terminal in which there is room for every loss and a long bar."""
+"""Terminal width from which all losses and a long bar are shown."""
 FIRST, OFTEN, SELDOM = 5.0, 10.0, 300.0
-"""Seconds before the first plain line, and the least and the most between two."""
+"""Seconds before the first plain line, and the minimum and maximum between two."""
 _shown: list[Bars] = []
 
 
 class Bars(Progress):
-    """rich's Progress with named columns, or with plain lines where bars cannot move.
+    """rich's Progress with named columns, or with plain lines where bars cannot be drawn.
 
-    Fields of a task: ``unit``, what is counted; ``rate`` and ``scale``, the unit of the speed and how many of them one step
-    is (default: the counted unit); ``text``, further words; ``left`` and ``speed``, seconds left and the speed where they
-    are known otherwise than by this task's own updates; ``silent``, no plain lines.
+    Fields of a task:
+        unit: What is counted.
+        rate, scale: Unit of the speed, and how many of it one step is (default: ``unit``, 1).
+        text: More text.
+        left, speed: Seconds left and the speed, if they are not measured from this task's updates.
+        silent: Print no plain lines.
     """
 
     def __init__(self, console: Console | None = None, **options: Any) -> None:
@@ -48,11 +51,11 @@ class Bars(Progress):
                 self._tell(task)
 
     def say(self, text: str) -> None:
-        """A plain line, above the bars where there are some."""
+        """Print a line, above the bars if there are any."""
         self.console.print(text, soft_wrap=True, highlight=False, markup=False)
 
     def end(self, task_id: TaskID, *, always: bool = True) -> None:
-        """Take a task's bar away, and say what was done; of short work only if ``always``."""
+        """Remove a task's bar and print a summary; for short work only if ``always``."""
         task = self._tasks[task_id]
         self.remove_task(task_id)
         told = self._due.pop(task.description, None) is not None
@@ -78,13 +81,13 @@ class _Column(ProgressColumn):
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words, as exact as one would say them."""
+    """Seconds as rounded text, e.g. "42 s", "11 min", "2.5 h"."""
     minutes, hours = seconds / 60, seconds / 3600
     return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if hours < 2 else f"{hours:.1f} h"
 
 
 def time_left(task: Task) -> float | None:
-    """Seconds that ``task`` will still take; None before its second step is done, as the first one starts everything."""
+    """Seconds left. None before the second step, because the first includes start-up."""
     return task.fields.get("left", task.time_remaining)
 
 
@@ -125,9 +128,9 @@ def _text(task: Task) -> str:
 
 @contextmanager
 def shown(console: Console | None = None, *, quiet: bool = False, **options: Any) -> Iterator[Bars | None]:
-    """Show the ``work`` that is done in this ``with`` on ``console`` (default: stdout); nothing if ``quiet``.
+    """Show all ``work`` inside this ``with`` block on ``console`` (default: stdout), or nothing if ``quiet``.
 
-    Inside another ``shown`` the bars join that one's.
+    A nested ``shown`` uses the display of the outer one.
     """
     if quiet:
         yield None
@@ -146,9 +149,16 @@ def shown(console: Console | None = None, *, quiet: bool = False, **options: Any
 def work(
     what: str, total: int | None = None, unit: str = "", *, announce: bool = True
 ) -> Iterator[Callable[..., None]]:
-    """Some work, of ``total`` units where they can be counted; the function it gives is told of each that is done.
+    """Show one piece of work.
 
-    Without ``announce`` a pipe or a file gets no line at its start.
+    Args:
+        what: Its name.
+        total: Number of units, if known.
+        unit: Name of the unit, e.g. "rows".
+        announce: Print a line at the start in a pipe or a file.
+
+    Yields:
+        A function to call with the number of finished units.
     """
     if not _shown:
         yield lambda num=1: None
@@ -164,7 +174,7 @@ def work(
 
 
 def tick(unit: str) -> None:
-    """One more ``unit`` is done, for the innermost ``work`` that counts them, if one does."""
+    """Count one more ``unit`` for the innermost ``work`` with that unit, if there is one."""
     for bars in _shown[-1:]:
         counting = [task.id for task in bars.tasks if task.fields.get("unit") == unit]
         for task in counting[-1:]:
