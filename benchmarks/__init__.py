@@ -1,1 +1,1 @@
-"""Measurements that take longer than a test: run them as ``python -m benchmarks.NAME``."""
+"""Benchmarks. Run one with ``python -m benchmarks.NAME``."""

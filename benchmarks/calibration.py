@@ -1,7 +1,9 @@
-"""How often equal methods differ: false positives of ``scores.paired_difference`` at p < .05, and what ``interval`` misses.
+"""False positives of ``scores.paired_difference`` at p < .05, and misses of ``scores.interval``.
 
-Two methods of one expected accuracy, three seeds each, on test groups of their own difficulty. What a table can be trusted
-with depends on whose scatter is the larger, that of seeds or that of groups, so both standard errors stand beside it.
+Two simulated methods have the same expected accuracy, several seeds each, and test groups that differ in difficulty.
+The error rates depend on whether seeds or groups vary more, so the standard errors of both are printed.
+
+    python -m benchmarks.calibration [--trials 400] [--seeds 3]
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ import numpy as np
 from mvitac.evaluation.scores import interval, paired_difference
 
 SETTINGS = (
-    # groups, rows in each, standard deviation of the methods' difference over groups, of each method over seeds
+    # test groups, rows per group, standard deviation over groups of the difference between the two methods,
+    # standard deviation over seeds of each method
     (240, 5, 0.1, 0.012),
     (240, 5, 0.1, 0.02),
     (240, 5, 0.1, 0.03),
@@ -25,7 +28,7 @@ SETTINGS = (
 
 
 def records(rates: np.ndarray, rows: int, seed_sd: float, seeds: int, rng: np.random.Generator) -> list[dict]:
-    """One record per seed, of groups with these expected accuracies."""
+    """Draw one record per seed. ``rates`` are the expected accuracies of the groups."""
     return [
         {
             "group_sizes": [rows] * len(rates),
@@ -38,11 +41,11 @@ def records(rates: np.ndarray, rows: int, seed_sd: float, seeds: int, rng: np.ra
 
 def main() -> None:
     """Print one line per setting."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=400, help="pairs of methods per setting")
-    parser.add_argument("--seeds", type=int, default=3, help="seeds of each method")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds per method")
     options = parser.parse_args()
-    print("groups rows seed sd | standard error of seeds, groups (points) | p < .05 | interval misses")
+    print("groups rows seed sd | standard error: seeds, groups (points) | p < .05 | outside interval")
     for groups, rows, group_sd, seed_sd in SETTINGS:
         rng = np.random.default_rng(2)
         differs = misses = 0

@@ -1,7 +1,7 @@
-"""Does the simulator prove anything? The rule it was made by, re-measured with the product's own training and probe.
+"""Check the design rule of the simulator (docs/simulator.md) with the library's own training and probe.
 
-On every task, touch and vision together, unseen groups: a supervised reference must stand at least 20 points above the
-untrained trunk's features and below 97 %. No self-supervised method is looked at here.
+On every task, with touch and vision together and on unseen groups, a supervised reference must be at least 20 points
+above the features of an untrained trunk, and below 97 %. No self-supervised method is used.
 
     python -m benchmarks.difficulty materials|grasps [--world SEED] [--seeds N] [--steps N] [--json FILE]
 """
@@ -30,12 +30,12 @@ MARGIN, CEILING = 0.20, 0.97
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", choices=("materials", "grasps"))
+    parser.add_argument("data", choices=("materials", "grasps"), help="simulated dataset")
     parser.add_argument("--world", type=int, default=0, help="seed of the simulated world")
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--out", type=Path, default=Path("runs/difficulty"))
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--seeds", type=int, default=1, help="number of training seeds")
+    parser.add_argument("--steps", type=int, default=600, help="training steps")
+    parser.add_argument("--out", type=Path, default=Path("runs/difficulty"), help="folder for the runs")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     run = replace(
         recipe("demo", replace(default(SimulatedConfig, options.data), seed=options.world)),
@@ -54,14 +54,14 @@ def main() -> None:
     print_summary(result, console)
     verdicts = {}
     for task, by_modality in result["summary"].items():
-        taught, untrained = by_modality["both"]["supervised"]["mean"], by_modality["both"]["untrained"]["mean"]
+        supervised, untrained = by_modality["both"]["supervised"]["mean"], by_modality["both"]["untrained"]["mean"]
         verdicts[task] = {
-            "supervised": taught,
+            "supervised": supervised,
             "untrained": untrained,
-            "holds": taught - untrained >= MARGIN and taught < CEILING,
+            "holds": supervised - untrained >= MARGIN and supervised < CEILING,
         }
-        scores = f"supervised {100 * taught:.1f}, untrained {100 * untrained:.1f}"
-        console.print(f"{task}: {scores}: the rule {'holds' if verdicts[task]['holds'] else 'DOES NOT HOLD'}")
+        scores = f"supervised {100 * supervised:.1f}, untrained {100 * untrained:.1f}"
+        console.print(f"{task}: {scores}; the rule {'holds' if verdicts[task]['holds'] else 'DOES NOT HOLD'}")
     if options.json:
         write_json(
             options.json,

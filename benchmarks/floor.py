@@ -1,6 +1,7 @@
-"""What no training loop can beat here: the bare networks on random tensors, and the machine's measured arithmetic.
+"""Lower bound on the time of a training step, and the measured peak arithmetic of the machine.
 
-The networks have the same convolutions as ours (`nn/small_conv.py`), so what is left to compare is the loop.
+The bound is the bare networks on random tensors. Their convolutions are those of the library (`nn/small_conv.py`), so
+the comparison is about the training loop alone.
 """
 
 from __future__ import annotations
@@ -18,7 +19,13 @@ from mvitac.nn.small_conv import use_products
 
 
 class Floor:
-    """2 query trunks forward and backward, 2 key trunks forward, heads, optimiser, EMA; no loss, no input, no log."""
+    """Two query trunks forward and backward, two key trunks forward, heads, optimiser, EMA. No loss, input or logging.
+
+    Args:
+        trunk: Name of a timm model.
+        device: Device of the networks.
+        precision: "fp32" or "bf16" (autocast).
+    """
 
     def __init__(self, trunk: str, device: torch.device, precision: str) -> None:
         def tower() -> nn.ModuleDict:
@@ -52,8 +59,8 @@ class Floor:
             torch._foreach_lerp_(*self.weights, 0.01)
 
     def flop(self, images: list[Tensor]) -> int:
-        """Counted floating-point operations of one step (products and sums of convolutions and matrix products)."""
-        # What small convolutions are made of, and torch does not count.
+        """Count the floating-point operations of one step, in convolutions and matrix products."""
+        # Small convolutions are made of addmm_, which torch does not count.
         in_place = {torch.ops.aten.addmm_: lambda total, a, b, **_: 2 * a[0] * a[1] * b[1]}
         with FlopCounterMode(display=False, custom_mapping=in_place) as counter:
             self(images)
@@ -61,7 +68,7 @@ class Floor:
 
 
 def peak(device: torch.device, precision: str) -> dict[str, float]:
-    """Measured FLOP/s of a large matrix product and of a ResNet's 3x3 convolution: the best of several."""
+    """Measure FLOP/s of a large matrix product and of a 3x3 convolution of a ResNet: the best of several calls."""
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     side = 8192 if device.type == "cuda" else 1024
     a, b = (torch.randn(side, side, device=device, dtype=dtype) for _ in range(2))
@@ -76,13 +83,14 @@ def peak(device: torch.device, precision: str) -> dict[str, float]:
 
 
 def best(run: Callable[[], object], device: torch.device, num: int = 8) -> float:
+    """Return the shortest time of ``num`` calls in seconds."""
     return min(clock(run, device) for _ in range(num))
 
 
 def clock(run: Callable[[], object], device: torch.device) -> float:
-    """Seconds of one call, waiting for the device before and after.
+    """Return the seconds of one call. The device is synchronised before and after it.
 
-    With one thread on a CPU these are CPU seconds, which other people's work on the machine changes little.
+    With one thread on a CPU, these are CPU seconds, which depend little on other programs.
     """
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,7 +1,8 @@
-"""Which flip of a touch is nearer to the touch mirrored? Asked of the simulator, which can mirror the thing itself.
+"""Compare two flips of a touch image with the touch of a mirrored object, which the simulator can render.
 
-The colours are learned from a pack of simulated materials, as training does. Then every class is pressed once, as it is
-and mirrored, into clean copies of each sensor (no dots, dirt or noise: these stay where they are in both pictures).
+The colour flip is fitted to a pack of simulated materials, as in training. Then one object of each class is pressed
+twice, as it is and mirrored, into each sensor without dots, dirt and noise (these do not move when the object is
+mirrored).
 
     mvitac data simulate materials --num 2000 --out PACK
     python -m benchmarks.gel_flips PACK [--world SEED] [--picture FILE.png]
@@ -26,11 +27,11 @@ from mvitac.transforms.gel_flip import GelMirror
 WIDTH_MM = 12.8
 SHOWN = "gravel"
 ZOOM = 2
-COLUMNS = ("touch", "plain flip", "flip with its colours", "mirrored touch")
+COLUMNS = ("touch", "plain flip", "colour flip", "mirrored touch")
 
 
 def imprint(world: int, category: int, side: int) -> np.ndarray:
-    """An imprint [side, side] mm of the class's first instance, pressed by 6 N."""
+    """Press the first instance of a class with 6 N. Return the imprint in mm, [side, side]."""
     thing = draw_instance(world, category, 0)
     axis = ((np.arange(side) - (side - 1) / 2) * (WIDTH_MM / side)).astype(np.float32)
     x, y = np.meshgrid(axis, axis)
@@ -40,15 +41,15 @@ def imprint(world: int, category: int, side: int) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("pack", type=Path)
-    parser.add_argument("--world", type=int, default=1, help="seed of the things pressed here")
-    parser.add_argument("--picture", type=Path)
+    parser.add_argument("pack", type=Path, help="pack of simulated materials")
+    parser.add_argument("--world", type=int, default=1, help="simulator seed of the pressed objects")
+    parser.add_argument("--picture", type=Path, help="write a picture of the flips to this file")
     options = parser.parse_args()
     pack = Pack(options.pack)
     mirror, sensors = GelMirror(pack, torch.device("cpu")), pack.column("sensor").astype(str)
     imprints = [imprint(options.world, category, 2 * pack.size) for category in range(len(CLASSES))]
     lines = []
-    print("| sensor | no flip | plain flip | flip with its colours | gain, least to most |\n|---|---:|---:|---:|---:|")
+    print("| sensor | no flip | plain flip | colour flip | gain, smallest to largest |\n|---|---:|---:|---:|---:|")
     for name in sorted(set(sensors)):
         clean = replace(SENSORS[name], marker_pitch_mm=0, dirt=0, scratches=0, noise=0)
         pixel = WIDTH_MM / (2 * pack.size)

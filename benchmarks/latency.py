@@ -1,10 +1,10 @@
-"""How long one pair takes, uint8 in, embeddings and probabilities out, by engine and arithmetic.
+"""Latency of one pair, from uint8 images to embeddings and probabilities, by engine and precision.
 
     python -m benchmarks.latency --threads 2 --out FILE.json
 
-ResNet-18 at 224 px for vision and for touch, batch 1, random weights (speed does not depend on them; the cosine shown is
-to eager, on simulated pairs). The variants take turns, so that a busy machine hurts them alike; beside the wall clock
-stands the processor's own time, which another process's load hardly moves.
+ResNet-18 at 224 px for vision and for touch, batch 1, random weights (speed does not depend on them). The cosine is
+between a variant's embeddings and those of eager mode, on simulated pairs. Variants are interleaved, so that other load
+affects all of them. CPU time is printed next to wall-clock time, because it depends little on other programs.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "OpenVINO int8": {"kind": "openvino", "int8": True},
 }
 ANY = ExportConfig(min_cosine=0.5, accuracy_loss=100.0, num_rows=64)
-"""The figures say what is lost; nothing is refused here."""
+"""The benchmark reports the loss of precision, so every export is accepted."""
 
 
 def in_torch(module: Any) -> Call:
@@ -53,17 +53,15 @@ def in_torch(module: Any) -> Call:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--calls", type=int, default=10)
-    parser.add_argument("--size", type=int, default=224)
-    parser.add_argument("--trunk", default="resnet18.tv_in1k")
-    parser.add_argument("--work", type=Path, help="folder to keep the exports in, for a second call")
-    parser.add_argument(
-        "--no-compile", action="store_true", help="leave torch.compile out: it takes minutes to compile"
-    )
-    parser.add_argument("--out", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--threads", type=int, default=2, help="CPU threads of each engine")
+    parser.add_argument("--rounds", type=int, default=20, help="turns per variant")
+    parser.add_argument("--calls", type=int, default=10, help="calls per turn")
+    parser.add_argument("--size", type=int, default=224, help="image side in pixels")
+    parser.add_argument("--trunk", default="resnet18.tv_in1k", help="timm model")
+    parser.add_argument("--work", type=Path, help="keep the exports in this folder and reuse them")
+    parser.add_argument("--no-compile", action="store_true", help="skip torch.compile, which takes minutes to compile")
+    parser.add_argument("--out", type=Path, help="write the results to this JSON file")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     folder = options.work or Path(tempfile.mkdtemp())
@@ -79,7 +77,7 @@ def main() -> None:
         augment=replace(base.augment, size=options.size),
     )
     model = fresh(run, pack.spec, options.size)
-    from mvitac.deploy.publish import with_readouts  # after the threads are set
+    from mvitac.deploy.publish import with_readouts  # imported after the number of threads is set
 
     graph = ExportModule(with_readouts(model, pack))
     calls: dict[str, Call] = {"eager": in_torch(graph)}

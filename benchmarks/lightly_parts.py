@@ -1,7 +1,8 @@
-"""A MoCo step for two modalities built from lightly's parts, for comparison (`pip install --no-deps lightly lightly-utils`).
+"""A MoCo step for two modalities built from lightly's components (`pip install --no-deps lightly lightly-utils`).
 
-Its projection heads, its NT-Xent loss and its momentum update, put together as its documentation does for one modality, with
-the paper's four losses: every image passes each network once, fp32, the default memory layout, torch's default Adam.
+It uses lightly's projection heads, NT-Xent loss and momentum update, combined as in lightly's documentation for one
+modality, with the four losses of the paper. Each image passes each network once. fp32, default memory layout, torch's
+default Adam.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ INSTALLED = importlib.util.find_spec("lightly") is not None
 
 
 class LightlyStep:
-    """Call it with two views [B, 3, S, S] of vision and two of touch."""
+    """One training step. Call it with two views [B, 3, S, S] of vision and two of touch; it returns the loss."""
 
     def __init__(self, trunk: str, device: torch.device) -> None:
         from lightly.loss import NTXentLoss  # pyright: ignore[reportMissingImports]

@@ -1,6 +1,9 @@
-"""Peak memory and time per pair of one step, in a process of its own: python -m benchmarks.memory '{"batch": 64, ...}'
+"""Peak memory and time per pair of one training step, measured in a separate process.
 
-Memory is what the step adds to the loaded libraries and the data: resident on a CPU, allocated on a GPU.
+    python -m benchmarks.memory '{"batch": 256, "chunk": 32, "size": 224, "trunk": "resnet18", "device": "cpu"}'
+
+Memory is what the step needs in addition to the loaded libraries and the data: resident memory on a CPU, allocated
+memory on a GPU. ``chunk`` 0 means no gradient caching. The result is printed as JSON.
 """
 
 from __future__ import annotations
@@ -52,9 +55,9 @@ def main() -> None:
 
 
 def peak_resident() -> float:
-    """GiB of the most memory this process has held, on Linux.
+    """Return the peak resident memory of this process in GiB (Linux).
 
-    Not getrusage's ru_maxrss: a process that another one started begins there with what that one held.
+    ru_maxrss of getrusage is not usable here: a child process starts with the value of its parent.
     """
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 2**20

@@ -1,15 +1,15 @@
-"""How near packing comes to a bare loop that reads and resizes the same images and keeps nothing.
+"""Time of packing, compared with a bare loop that reads and resizes the same images and keeps nothing.
 
-Sources are made by code in their owners' layouts: Touch and Go as extracted frames (``jpeg``) and as videos (``mp4``; 640 x
-480, a key frame every 12, touches of 30 frames), Calandra as shards in full resolution (``hdf5``; GelSight 960 x 1280,
-Kinect 540 x 960, gzip). For each:
+The sources are generated in the layouts of the original datasets: Touch and Go as extracted frames (``jpeg``) and as
+videos (``mp4``; 640 x 480, a key frame every 12 frames, touches of 30 frames), Calandra as shards in full resolution
+(``hdf5``; GelSight 960 x 1280, Kinect 540 x 960, gzip). Measured for each source:
 
-- ``bare``: a loop that decodes and resizes every image, in as many processes as packing gets
-- ``pack``: ``mvitac.data.build.build``, the whole way to a finished, sealed pack on disk; ratio = bare time / pack time
-- ``bare, every frame`` (mp4): from the first to the last listed frame, where ``bare`` seeks each touch
+- ``bare``: a loop that decodes and resizes every image, in as many processes as packing
+- ``pack``: ``mvitac.data.build.build``, up to the finished pack on disk; ratio = bare time / pack time
+- ``bare, every frame`` (mp4): decode from the first to the last listed frame, while ``bare`` seeks each touch
 - ``owners`` (mp4; needs OpenCV): seek both videos to each listed frame, write both as JPEG, read them back, resize
 
-The ways take turns; medians over rounds. Another source is one more ``Case`` in ``CASES``.
+Methods are interleaved, and medians over rounds are reported. To add a source, add a ``Case`` to ``CASES``.
 
     python -m benchmarks.packing [jpeg] [mp4] [hdf5] [--quick] [--rounds N] [--workers N] [--json FILE]
 """
@@ -48,16 +48,16 @@ STEMS = ("video", "gelsight")
 SHAPES = {"gelsightA": (960, 1280, 3), "gelsightB": (960, 1280, 3), "kinectA_rgb": (540, 960, 3)}
 
 Jobs = list[tuple[Path, list[int]]]
-"""A file or folder, and the numbers of the frames or grasps that are read of it."""
+"""Pairs of a file or folder and the numbers of the frames or grasps to read from it."""
 Way = Callable[[Path, list[int], int], int]
-"""Read what one job names, at a side of so many pixels, and return how many images that were."""
+"""Read the images of one job, resize them to a side in pixels, and return their number."""
 
 
 # -- Touch and Go ------------------------------------------------------------------------------------------------------
 
 
 def paint(recording: int, stem: str, number: int) -> np.ndarray:
-    """A textured picture that moves a little from frame to frame, as a hand-held camera's does."""
+    """Generate a textured image that moves slightly from frame to frame, like that of a hand-held camera."""
     rng = np.random.default_rng([recording, STEMS.index(stem)])
     coarse = Image.fromarray(rng.integers(0, 255, (30, 40, 3), np.uint8))
     fine = np.asarray(coarse.resize((704, 528), Image.Resampling.BICUBIC))
@@ -66,7 +66,7 @@ def paint(recording: int, stem: str, number: int) -> np.ndarray:
 
 
 def write_lists(root: Path, options: argparse.Namespace) -> None:
-    """train.txt and test.txt: a touch in every ``options.period`` frames, so that most frames are between touches."""
+    """Write train.txt and test.txt: one touch in every ``options.period`` frames. Most frames have no touch."""
     lines: dict[str, list[str]] = {"train": [], "test": []}
     for recording in range(options.recordings):
         for touch in range(options.touches):
@@ -79,7 +79,7 @@ def write_lists(root: Path, options: argparse.Namespace) -> None:
 
 
 def listed(root: Path) -> Jobs:
-    """The recordings of the lists, each with its listed frames in order."""
+    """Return the recordings in the lists, each with its listed frames in order."""
     found: dict[str, list[int]] = {}
     for side in ("train", "test"):
         for line in (root / f"{side}.txt").read_text().split():
@@ -131,7 +131,7 @@ def bare_jpeg(folder: Path, numbers: list[int], size: int) -> int:
 
 
 def bare_video(folder: Path, numbers: list[int], size: int) -> int:
-    """Every frame of both videos from the first to the last listed one, as a plain loop over PyAV decodes them."""
+    """Decode all frames of both videos up to the last listed one, in a plain loop over PyAV."""
     wanted, num = set(numbers), 0
     for stem in STEMS:
         shrink = VideoReformatter()
@@ -147,7 +147,7 @@ def bare_video(folder: Path, numbers: list[int], size: int) -> int:
 
 
 def bare_touches(folder: Path, numbers: list[int], size: int) -> int:
-    """The least a video costs: one seek per touch, decoding from the key frame before it to its end."""
+    """Decode as few frames as possible: seek once per touch, then decode from the key frame before it to its end."""
     num = 0
     starts = [n for n in numbers if n - 1 not in set(numbers)]
     for stem in STEMS:
@@ -169,7 +169,7 @@ def bare_touches(folder: Path, numbers: list[int], size: int) -> int:
 
 
 def owners_way(folder: Path, numbers: list[int], size: int) -> int:
-    """Seek per frame and write JPEGs (OpenCV, as in their extract_frame.py), then load and resize them with Pillow."""
+    """Seek each frame and write it as JPEG with OpenCV, as extract_frame.py of the dataset; read it with Pillow."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -188,7 +188,7 @@ def owners_way(folder: Path, numbers: list[int], size: int) -> int:
 
 
 def make_shards(root: Path, options: argparse.Namespace) -> None:
-    """``options.recordings`` shards of ``options.touches`` grasps, of smooth pictures with noise."""
+    """Write ``options.recordings`` shards of ``options.touches`` grasps, with smooth images plus noise."""
     root.mkdir(parents=True)
     rng = np.random.default_rng(0)
     for shard in range(options.recordings):
@@ -206,7 +206,7 @@ def make_shards(root: Path, options: argparse.Namespace) -> None:
 
 
 def grasps(root: Path) -> Jobs:
-    """The shards, each with the numbers of its grasps."""
+    """Return the shards, each with the numbers of its grasps."""
     found: Jobs = []
     for path in sorted(root.glob("calandra_corl2017_*.h5")):
         with h5py.File(path) as file:
@@ -230,18 +230,18 @@ def bare_hdf5(path: Path, numbers: list[int], size: int) -> int:
     return num
 
 
-# -- all of them -------------------------------------------------------------------------------------------------------
+# -- All sources -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Case:
-    """A source on disk, and other ways through the same images, by name; the first is what packing is held against."""
+    """A source on disk, and other ways to read the same images, by name. Packing is compared with the first."""
 
     make: Callable[[Path, argparse.Namespace], None]
     source: Callable[[Path, argparse.Namespace], Source]
     jobs: Callable[[Path], Jobs]
     num_images: int
-    """Images of one frame or grasp."""
+    """Images per frame or grasp."""
     ways: dict[str, Way]
 
 
@@ -259,7 +259,7 @@ CASES = {
 
 
 def in_processes(way: Way, jobs: Jobs, size: int, workers: int) -> int:
-    """``way`` over all ``jobs``; processes are started anew, as packing starts them."""
+    """Apply ``way`` to all ``jobs``. Processes are started for each call, as in packing."""
     if workers == 1:
         return sum(way(*job, size) for job in jobs)
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
@@ -267,7 +267,7 @@ def in_processes(way: Way, jobs: Jobs, size: int, workers: int) -> int:
 
 
 def measure(name: str, options: argparse.Namespace, place: Path) -> dict[str, Any]:
-    """Seconds of every way by round, their medians, and the medians as shares of packing's."""
+    """Return the seconds of each way per round, their medians, and the medians divided by that of packing."""
     case = CASES[name]
     root = options.shards if name == "hdf5" and options.shards else place / name
     if root == place / name:
@@ -284,7 +284,7 @@ def measure(name: str, options: argparse.Namespace, place: Path) -> dict[str, An
                 build(source, place / "pack", size=options.size, workers=options.workers, quiet=True)
             else:
                 assert in_processes(function, jobs, options.size, options.workers) == num, way
-            if number >= 0:  # one round before them fills the page cache and imports what is imported late
+            if number >= 0:  # the first round only fills the page cache and completes lazy imports
                 seconds.setdefault(way, []).append(time.perf_counter() - began)
             shutil.rmtree(place / "pack", ignore_errors=True)
     median = {way: statistics.median(values) for way, values in seconds.items()}
@@ -296,21 +296,23 @@ def measure(name: str, options: argparse.Namespace, place: Path) -> dict[str, An
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("cases", nargs="*", choices=[*CASES, []], help="default: all")
+    parser.add_argument("cases", nargs="*", choices=[*CASES, []], help="sources to measure; default: all")
     parser.add_argument(
-        "--quick", action="store_true", help="two small files and one round, in seconds: no measurement"
+        "--quick", action="store_true", help="check in seconds that it runs: two small files, one round"
     )
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--recordings", type=int, default=4, help="recordings, or shards")
-    parser.add_argument("--touches", type=int, default=8, help="per recording, of 30 frames each; or grasps per shard")
-    parser.add_argument("--period", type=int, default=300, help="frames from touch to touch, 45 or more")
-    parser.add_argument("--shards", type=Path, help="hdf5: a folder of real shards instead of made ones")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--rounds", type=int, default=3, help="measurements per method")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--size", type=int, default=256, help="image side in the pack, in pixels")
+    parser.add_argument("--recordings", type=int, default=4, help="number of recordings, or of shards")
+    parser.add_argument(
+        "--touches", type=int, default=8, help="touches of 30 frames per recording, or grasps per shard"
+    )
+    parser.add_argument("--period", type=int, default=300, help="frames between the starts of two touches; 45 or more")
+    parser.add_argument("--shards", type=Path, help="hdf5: folder of real shards, used instead of generated ones")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     if options.period < TOUCH * 3 // 2:
-        parser.error(f"--period {options.period}: give {TOUCH * 3 // 2} or more, else a touch would run into the next")
+        parser.error(f"--period {options.period}: must be at least {TOUCH * 3 // 2}, or touches would overlap")
     if options.quick:
         options.rounds, options.recordings, options.touches, options.period = 1, 2, 4, 60
     with tempfile.TemporaryDirectory() as place:

@@ -1,4 +1,6 @@
-"""What more processes cost: pairs/s of the step alone and of the step in a world, the same pairs for each process.
+"""Cost of distributed training: time of a step in a process group, divided by its time alone.
+
+Each process has the same number of pairs in both cases, and all measure at the same time.
 
 torchrun --nproc-per-node 2 -m benchmarks.scaling [--batch 32] [--size 224]
 """
@@ -21,10 +23,10 @@ from mvitac.training.step import Step
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--batch", type=int, default=32, help="pairs of each process")
-    parser.add_argument("--size", type=int, default=224)
-    parser.add_argument("--trunk", default="resnet18")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--batch", type=int, default=32, help="pairs per process")
+    parser.add_argument("--size", type=int, default=224, help="image side in pixels")
+    parser.add_argument("--trunk", default="resnet18", help="timm model")
+    parser.add_argument("--rounds", type=int, default=5, help="measurements per variant")
     options = parser.parse_args()
     world = join()
     device = pick_device(local_device("auto"))
@@ -44,7 +46,8 @@ def main() -> None:
     seconds = interleave(variants, options.rounds, device)
     if world.writes:
         print(
-            f"{world.size} processes, {options.batch} pairs each: a step takes {seconds['together'] / seconds['alone']:.2f}x"
+            f"{world.size} processes, {options.batch} pairs each:"
+            f" a step takes {seconds['together'] / seconds['alone']:.2f} times as long as alone"
         )
     if world.size > 1:
         dist.destroy_process_group()

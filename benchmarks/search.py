@@ -1,13 +1,13 @@
-"""Exact search over a million embeddings: time, memory and agreement beside scikit-learn's brute force and vector libraries.
+"""Exact search over a million embeddings: time, memory and agreement with scikit-learn and vector libraries.
 
     python -m benchmarks.search [--quick] [--num 1000000] [--dim 512] [--out FILE.json]
 
-faiss (IndexFlatIP, which copies the bank) and usearch (exact=True, which does not) take part where they are installed
-(`pip install faiss-cpu usearch`); else the result says "not installed". No approximate index is compared.
+faiss (IndexFlatIP, which copies the bank) and usearch (exact=True, which does not) are included if they are installed
+(`pip install faiss-cpu usearch`). Otherwise the result says "not installed". Approximate indices are not compared.
 
-Random unit vectors; batch-1 queries, one at a time, taking turns. Memory is the process's anonymous resident set above
-that of the imported library (the memory-mapped bank lives in the page cache and can be dropped by the system at any
-time), read after each engine's turn in a process of its own.
+Vectors are random with unit length. Queries are sent one at a time, and engines are interleaved. Each engine runs in
+its own process. Memory is the anonymous resident set of the process, minus that after importing the library. It does
+not include the memory-mapped bank, which is in the page cache and can be dropped by the system at any time.
 """
 
 from __future__ import annotations
@@ -34,16 +34,20 @@ ENGINES = {
     "faiss": "faiss",
     "usearch": "usearch.index",
 }
-"""Engine -> the module it needs."""
+"""Engine name -> module that it needs."""
 
 
 def installed() -> list[str]:
-    """The engines that can run here, ours first."""
+    """Return the names of the installed engines, ``mvitac`` first."""
     return [name for name, module in ENGINES.items() if importlib.util.find_spec(module.split(".")[0])]
 
 
 def searcher(name: str, bank: np.ndarray, k: int, threads: int) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from unit queries [Q, E] to the rows [Q, k] of ``bank`` [N, E] nearest by cosine, exactly, best first."""
+    """Return an exact search function of one engine.
+
+    The function takes unit queries [Q, E]. It returns the ``k`` rows of ``bank`` [N, E] with the highest cosine, best
+    first: [Q, k].
+    """
     if name == OURS:
         from mvitac.deploy.search import nearest
 
@@ -63,19 +67,20 @@ def searcher(name: str, bank: np.ndarray, k: int, threads: int) -> Callable[[np.
     from usearch.index import MetricKind, search  # pyright: ignore[reportMissingImports]
 
     def find(queries: np.ndarray) -> np.ndarray:
-        # One query's keys are [k], several queries' [Q, k].
+        # The shape of keys is [k] for one query and [Q, k] for several.
         return np.atleast_2d(search(bank, queries, k, MetricKind.IP, exact=True, threads=threads).keys)
 
     return find
 
 
 def anonymous_mb() -> dict[str, float]:
-    """Current anonymous and file-backed resident memory in MB (Linux)."""
+    """Return the current anonymous and file-backed resident memory and the peak, in MB (Linux)."""
     lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return {k: int(lines[k].split()[0]) / 1024 for k in ("RssAnon", "RssFile", "VmHWM")}
 
 
 def measure(name: str, path: str, num_queries: int, k: int, threads: int, connection: Any) -> None:
+    """Measure one engine in this process: answer queries from ``connection`` until "stop", then send the result."""
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = str(threads)
     from threadpoolctl import threadpool_limits
@@ -113,22 +118,24 @@ def measure(name: str, path: str, num_queries: int, k: int, threads: int, connec
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--num", type=int, default=1_000_000)
-    parser.add_argument("--dim", type=int, default=512)
-    parser.add_argument("--queries", type=int, default=32)
-    parser.add_argument("--k", type=int, default=10)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="20,000 x 128: whether it runs, no figure to report")
-    parser.add_argument("--bank", type=Path, help="where to keep the random bank (default: bank-NxE.npy)")
-    parser.add_argument("--out", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--num", type=int, default=1_000_000, help="number of embeddings")
+    parser.add_argument("--dim", type=int, default=512, help="dimension of the embeddings")
+    parser.add_argument("--queries", type=int, default=32, help="number of queries")
+    parser.add_argument("--k", type=int, default=10, help="neighbours per query")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads per engine")
+    parser.add_argument("--quick", action="store_true", help="check that it runs, with 20,000 x 128 embeddings")
+    parser.add_argument(
+        "--bank", type=Path, help="file of the random embeddings, made if missing (default: bank-NxE.npy)"
+    )
+    parser.add_argument("--out", type=Path, help="write the results to this JSON file")
     options = parser.parse_args()
     if options.quick:
         options.num, options.dim = 20_000, 128
     options.bank = options.bank or Path(f"bank-{options.num}x{options.dim}.npy")
     if options.bank.exists() and (shape := np.load(options.bank, mmap_mode="r").shape) != (options.num, options.dim):
         parser.error(
-            f"--bank {options.bank} holds {shape}, ({options.num}, {options.dim}) asked: delete it or name another"
+            f"--bank {options.bank}: shape {shape}, expected ({options.num}, {options.dim}): delete it or choose another"
         )
     if not options.bank.exists():
         bank = np.lib.format.open_memmap(options.bank, "w+", np.float32, (options.num, options.dim))

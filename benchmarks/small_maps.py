@@ -1,8 +1,9 @@
-"""A step of the demo recipe with its small convolutions as products and as convolutions (``nn/small_conv.py``), in turn.
+"""Speed of small convolutions as matrix products (``nn/small_conv.py``), in a step of recipe `demo`.
 
     python -m benchmarks.small_maps [--threads 1 2] [--rounds 9] [--json FILE]
 
-Views are noise, so what is timed is the networks, losses and optimiser.
+The other variant runs them as convolutions. The two are interleaved. Views are noise, so only the networks, losses and
+optimiser are timed.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ CPU = torch.device("cpu")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of CPU threads to measure")
+    parser.add_argument("--rounds", type=int, default=9, help="measurements per variant")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     keep_freed_memory()
     found = {}
@@ -41,13 +42,14 @@ def main() -> None:
             pace = {name: recipe("demo").batch_size / value for name, value in seconds.items()}
             ratio = seconds["convolutions"] / seconds["products"]
             found[f"{threads} threads, {precision}"] = {"pairs_per_s": pace, "ratio": ratio}
-            told = ", ".join(f"{name} {value:.0f} pairs/s" for name, value in pace.items())
-            print(f"{threads} threads, {precision}: {told}: {ratio:.2f}x", flush=True)
+            speeds = ", ".join(f"{name} {value:.0f} pairs/s" for name, value in pace.items())
+            print(f"{threads} threads, {precision}: {speeds}, ratio {ratio:.2f}", flush=True)
     if options.json:
         write_json(options.json, {"found": found, **provenance()})
 
 
 def variants(precision: str) -> dict:
+    """Return functions that take one step, one with convolutions only and one with matrix products."""
     run = replace(recipe("demo"), precision=precision)
     spec = DataSpec(
         name="noise", vision_channels=3, touch_channels=3, tasks=(), group_by="row", licence="none", source="noise"

@@ -1,12 +1,14 @@
-"""How fast is it, against what the machine can do and against the typical research code? Interleaved, medians, ratios.
+"""Speed of training, input and probe, compared with the bare networks and with typical research code.
 
     python -m benchmarks.speed [--quick] [--device cpu|cuda] [--json FILE]     (make bench)
 
-Where lightly is installed, a step of its parts stands beside ours (``benchmarks/lightly_parts.py``).
-Sections: the step on resident random tensors; the input; both together, end to end; the probe; gradient caching.
-Every speed stands as a share of the bare networks (`benchmarks/floor.py`, same precision) and of the machine's measured
-arithmetic.
-On several GPUs: torchrun --nproc-per-node N -m benchmarks.scaling
+Sections: the step on random tensors in memory, the input, both together (end to end), the probe, and gradient caching.
+Variants are interleaved and medians are compared. A step is compared with the bare networks in the same precision
+(`benchmarks/floor.py`), with the measured peak arithmetic of the machine, with typical research code
+(`benchmarks/typical.py`) and, if lightly is installed, with a step built from its components
+(`benchmarks/lightly_parts.py`).
+
+For several GPUs: torchrun --nproc-per-node N -m benchmarks.scaling
 """
 
 from __future__ import annotations
@@ -57,11 +59,12 @@ from mvitac.transforms import random_views
 from mvitac.transforms.random_views import ViewAugment, draw
 
 PAPER_PAIRS, PAPER_EPOCHS = 91_982, 240
+SECTIONS = ("step", "input", "whole", "probe", "caching")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """How large the measurement is."""
+    """Size of the measurement. ``size`` is the side of a view in pixels, ``batch`` is in pairs."""
 
     trunk: str = "resnet18"
     size: int = 224
@@ -72,7 +75,7 @@ class Scale:
 
 
 class Jpegs(Source):
-    """The same JPEG files as the typical input reads, to be packed."""
+    """The JPEG files that the typical input reads, as a source to pack."""
 
     def __init__(self, folder: Path) -> None:
         self.paths = sorted(folder.glob("vision-*.jpg"))
@@ -94,13 +97,14 @@ class Jpegs(Source):
 
 
 def interleave(variants: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, float]:
-    """Median seconds per call of each variant, called in turn so that a busy moment of the machine hits all alike.
+    """Return the median seconds per call of each variant.
 
-    NaN for one that a GPU has not the memory for, or that torch cannot compile; what it said is printed.
+    Variants are called in turn, so that other load on the machine affects all of them. The value is NaN if a variant
+    runs out of GPU memory or torch cannot compile it; the error is printed.
     """
     seconds: dict[str, list[float]] = {name: [] for name in variants}
     lost: dict[str, str] = {}
-    for turn in range(1 + rounds):  # once for caches, kernels and compilation
+    for turn in range(1 + rounds):  # the first call fills caches, prepares kernels and compiles
         for name, run in variants.items():
             if name in lost:
                 continue
@@ -117,7 +121,7 @@ def interleave(variants: dict[str, Callable[[], object]], rounds: int, device: t
 
 
 def peak_memory(run: Callable[[], object], device: torch.device) -> dict[str, float]:
-    """GiB of a GPU that one call takes over what lies there before it; {} on a CPU or where it does not fit."""
+    """Return the additional GPU memory of one call in GiB (peak); {} on a CPU or out of memory."""
     if device.type != "cuda":
         return {}
     torch.cuda.synchronize(device)
@@ -131,11 +135,12 @@ def peak_memory(run: Callable[[], object], device: torch.device) -> dict[str, fl
 
 
 def known(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """``rows`` without what could not be measured."""
+    """Return ``rows`` without values that could not be measured (NaN)."""
     return {name: {key: value for key, value in row.items() if value == value} for name, row in rows.items()}
 
 
 def our_run(scale: Scale, precision: str, **changes: Any) -> Run:
+    """Return recipe `paper` at this scale, without pretrained weights."""
     base = recipe("paper")
     network = EncoderConfig(trunk=scale.trunk, weights=SCRATCH)
     optim = replace(base.optim, lr=1e-3)
@@ -153,7 +158,7 @@ def our_step(scale: Scale, precision: str, spec: DataSpec, device: torch.device,
 
 
 def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[str, Any]:
-    """Pairs/s of each step, with its share of the floor and of the measured peak in the same precision."""
+    """Measure pairs/s of each step, and its share of the floor and of the measured peak in the same precision."""
     torch.manual_seed(0)
     images = [torch.randn(scale.batch, 3, scale.size, scale.size, device=device) for _ in range(4)]
     close = [image.contiguous(memory_format=torch.channels_last) for image in images]
@@ -203,7 +208,7 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
 
 
 def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
-    """Augmented images/s of each input, without a network; on a CPU also by torch's route, and of the views alone."""
+    """Measure augmented images/s of each input without a network. On a CPU, also of views alone and without numba."""
     typical = typical_batches(folder, scale.size, scale.batch, workers)
     variants: dict[str, Callable[[], object]] = {"typical, JPEG files": lambda: next(typical)}
     images = torch.from_numpy(pack.images["vision"][np.resize(pack.rows("train"), scale.batch)]).permute(0, 3, 1, 2)
@@ -217,12 +222,12 @@ def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
             ours |= {f"{name}, without numba": in_torch(call) for name, call in ours.items()}
         variants |= ours
     seconds = interleave(variants, scale.rounds, device)
-    speeds = {n: (1 if "alone" in n else 4) * scale.batch / s for n, s in seconds.items()}  # four images per pair
+    speeds = {n: (1 if "alone" in n else 4) * scale.batch / s for n, s in seconds.items()}  # a pair is four images
     return known({n: {"images_per_s": v, "over_typical": v / speeds["typical, JPEG files"]} for n, v in speeds.items()})
 
 
 def tuned(call: Callable[[], object]) -> Callable[[], object]:
-    """``call`` with convolutions chosen by trying them, which ``mvitac`` does not ask of cuDNN."""
+    """Wrap ``call`` with cuDNN benchmark mode, which ``mvitac`` does not use."""
 
     def trying() -> object:
         with torch.backends.cudnn.flags(enabled=True, benchmark=True):
@@ -232,7 +237,7 @@ def tuned(call: Callable[[], object]) -> Callable[[], object]:
 
 
 def in_torch(call: Callable[[], object]) -> Callable[[], object]:
-    """``call`` with its views made as where numba is not installed."""
+    """Wrap ``call`` so that torch makes the views, as if numba was not installed."""
 
     def without() -> object:
         with patch.object(random_views, "fused", lambda: None):
@@ -242,12 +247,12 @@ def in_torch(call: Callable[[], object]) -> Callable[[], object]:
 
 
 def feed(run: Run, pack: Pack, device: torch.device) -> Any:
-    """The loop's own parts of one step after another, without end."""
+    """Yield the chunks of one step after another, as the training loop does, without end."""
     return load_chunks(run, pack, pack.rows("train"), 2, device, World(), 0, 10**9)
 
 
 def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
-    """Pairs/s from stored data to updated weights, and what share of the step alone that is."""
+    """Measure pairs/s from stored data to updated weights, also as a share of the step alone."""
     loader, old = typical_batches(folder, scale.size, scale.batch, workers), TypicalStep(scale.trunk, device)
 
     def typical() -> None:
@@ -273,7 +278,7 @@ def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
 
 
 def measure_caching(scale: Scale, device: torch.device, plain: int, large: int, chunk: int) -> dict[str, Any]:
-    """Peak memory and time per pair of plain batches and of a large batch in chunks, each in a process of its own."""
+    """Measure peak memory and time per pair of a plain batch and of a large one in chunks, each in its own process."""
     rows = {}
     for name, batch, part in ((f"plain {plain}", plain, 0), (f"{large} in chunks of {chunk}", large, chunk)):
         settings = {"batch": batch, "chunk": part, "size": scale.size, "trunk": scale.trunk, "device": device.type}
@@ -283,8 +288,11 @@ def measure_caching(scale: Scale, device: torch.device, plain: int, large: int, 
 
 
 def measure_probe(scale: Scale, pack: Pack, device: torch.device, num: int = 5000) -> dict[str, Any]:
-    """Seconds of 5 seeds x 3 tasks x 3 modalities of the paper's probe on ``num`` pairs: features once, heads together;
-    and encoding every epoch anew for every head, as the field's code does (one pass is measured, the rest multiplied)."""
+    """Measure the seconds of the paper's probe, 5 seeds x 3 tasks x 3 modalities, on ``num`` pairs.
+
+    One variant computes features once and trains all heads together. The other encodes in every epoch for every head,
+    as typical research code does; one pass is measured and multiplied.
+    """
     seeds, classes = list(range(5)), [20, 2, 2]
     run = our_run(scale, "fp32")
     model = Model(run.method.build(pack.spec, run.encoder).to(device), run, pack.spec, pack.size)
@@ -305,6 +313,7 @@ def measure_probe(scale: Scale, pack: Pack, device: torch.device, num: int = 500
 
 
 def show(console: Console, title: str, rows: dict[str, dict[str, float]]) -> None:
+    """Print ``rows`` as a table."""
     table = Table(title=title, title_justify="left")
     names = list(dict.fromkeys(itertools.chain.from_iterable(rows.values())))
     for column in ("", *names):
@@ -316,15 +325,17 @@ def show(console: Console, title: str, rows: dict[str, dict[str, float]]) -> Non
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="under a minute: a small trunk at 64 px")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--batch", type=int, nargs="+", help="default 32 on a CPU, 256 and 1024 on a GPU")
-    parser.add_argument("--rounds", type=int)
+    parser.add_argument("--quick", action="store_true", help="small trunk at 64 px, under a minute")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
     parser.add_argument(
-        "--workers", type=int, help="of the typical DataLoader; default none on a CPU, up to 8 on a GPU"
+        "--batch", type=int, nargs="+", help="pairs per batch; default 32 on a CPU, 256 and 1024 on a GPU"
     )
-    parser.add_argument("--sections", nargs="+", default=["step", "input", "whole", "probe", "caching"])
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--rounds", type=int, help="measurements per variant; default 5 on a CPU, 10 on a GPU")
+    parser.add_argument(
+        "--workers", type=int, help="processes of the typical DataLoader; default 0 on a CPU, up to 8 on a GPU"
+    )
+    parser.add_argument("--sections", nargs="+", default=list(SECTIONS), choices=SECTIONS, help="default: all")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     device, console = torch.device(options.device), Console()
     cuda = device.type == "cuda"
@@ -346,7 +357,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_jpegs(folder / "jpegs", max(scale.num_pairs, *batches))
-        stored = round(scale.size * 8 / 7)  # 256 for 224 px; beyond 1.5 times views take torch's route (augment.apply)
+        stored = round(scale.size * 8 / 7)  # 256 for 224 px; above 1.5 times, torch makes the views
         pack = build(Jpegs(folder / "jpegs"), folder / "pack", size=stored, quiet=True)
         for batch in batches:
             at = replace(scale, batch=batch, compile=scale.compile and batch == batches[0])  # compiling takes a minute

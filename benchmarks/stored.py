@@ -1,7 +1,8 @@
-"""What it costs to store a pack's images as JPEG: bytes on disk, error, and images/s of random batches, against raw.
+"""Cost of storing images as JPEG instead of raw: bytes on disk, pixel error, and images/s of random batches.
 
-The images are those of a raw pack, or of simulated materials. Both packs are read warm, in turn; medians over rounds. The
-threads that decode are as many as OMP_NUM_THREADS says, else one per core, 8 at most.
+The images come from a raw pack or from simulated materials. Both packs are in the page cache, reads are interleaved,
+and medians over rounds are reported. OMP_NUM_THREADS sets the number of decoding threads; default: one per core, at
+most 8.
 
     python -m benchmarks.stored [PACK] [--num N] [--quality 95] [--batch 128] [--rounds 5] [--json FILE]
 """
@@ -49,7 +50,7 @@ class Rows(Source):
 
 
 def speed(pack: Pack, batch: int, seed: int) -> float:
-    """Images/s of one epoch in random batches, all modalities."""
+    """Read one epoch in random batches, all modalities. Return images/s."""
     order = np.random.default_rng(seed).permutation(pack.num)
     began = time.perf_counter()
     for start in range(0, pack.num, batch):
@@ -61,11 +62,11 @@ def speed(pack: Pack, batch: int, seed: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("pack", nargs="?", type=Path, help="a raw pack (default: simulated materials at 256 px)")
-    parser.add_argument("--num", type=int, default=400, help="rows")
-    parser.add_argument("--quality", type=int, default=95)
-    parser.add_argument("--batch", type=int, default=128)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--num", type=int, default=400, help="number of rows")
+    parser.add_argument("--quality", type=int, default=95, help="JPEG quality")
+    parser.add_argument("--batch", type=int, default=128, help="rows per read")
+    parser.add_argument("--rounds", type=int, default=5, help="epochs per pack")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         config = MaterialsConfig(num=options.num, size=256)
@@ -82,7 +83,7 @@ def main() -> None:
                 "raw_over_jpeg_bytes": before.size / (kept.path / f"{m}.jpegs").stat().st_size,
                 "mean_error_levels": float(np.abs(before - after).mean()),
             }
-            print(m, *(f"{name} {value:.2f}" for name, value in result["modalities"][m].items()))
+            print(m, *(f"{name.replace('_', ' ')} {value:.2f}" for name, value in result["modalities"][m].items()))
     print("images/s:", ", ".join(f"{name} {value:,.0f}" for name, value in speeds.items()))
     if options.json:
         write_json(options.json, {**result, "quality": options.quality, "rounds": rounds, **provenance()})

@@ -1,8 +1,9 @@
-"""What it costs to train from shards: pairs/s of an epoch's batches and bytes fetched over those of the set, beside a pack.
+"""Speed of reading shards compared with a pack, and bytes fetched per epoch as a share of the dataset.
 
-Images are noise. Shards are read from file:// into a cache that holds two windows and a file, less than the set; each epoch
-is read as training reads it. With --step-ms a batch is followed by that much sleep, for the network's step, and what is
-reported is the time spent waiting for input. Both are read in turn, warm (the disk's own speed is not in it).
+Images are noise. Shards are read from file:// into a cache with room for two windows and one file, less than the
+dataset. Epochs are read as in training, from shards and from the pack alternately. Files are in the page cache, so the
+speed of the disk is not measured. With --step-ms, each batch is followed by a sleep that stands for the network's step,
+and the time spent waiting for input is reported.
 
     python -m benchmarks.streaming [--num 2000] [--size 256] [--shard-mb 16] [--window 8] [--batch 128] [--step-ms 0]
 """
@@ -35,7 +36,7 @@ from mvitac.training.sampler import batches, training_rows
 
 @dataclass
 class Noise(Source):
-    """Pairs of noise, eight to a touch."""
+    """Pairs of noise images, eight per touch."""
 
     num: int
     size: int
@@ -57,7 +58,7 @@ class Noise(Source):
 
 
 def epoch(run: Run, pack: Pack, number: int, step_s: float) -> float:
-    """Seconds that an epoch's batches were waited for."""
+    """Read one epoch. Return the seconds spent waiting for its batches."""
     rows = training_rows(run, pack)
     per_epoch, waited = run.steps_per_epoch(len(rows)), 0.0
     order = batches(run, pack, rows, number * per_epoch, (number + 1) * per_epoch, expect=pack.expect)
@@ -73,14 +74,14 @@ def epoch(run: Run, pack: Pack, number: int, step_s: float) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num", type=int, default=2000, help="pairs")
-    parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--shard-mb", type=float, default=16)
-    parser.add_argument("--window", type=int, default=8)
-    parser.add_argument("--batch", type=int, default=128)
-    parser.add_argument("--step-ms", type=float, default=0)
-    parser.add_argument("--epochs", type=int, default=5)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--num", type=int, default=2000, help="number of pairs")
+    parser.add_argument("--size", type=int, default=256, help="image side in pixels")
+    parser.add_argument("--shard-mb", type=float, default=16, help="size of a shard in MB")
+    parser.add_argument("--window", type=int, default=8, help="shards that are mixed at a time")
+    parser.add_argument("--batch", type=int, default=128, help="pairs per batch")
+    parser.add_argument("--step-ms", type=float, default=0, help="sleep after each batch, in ms")
+    parser.add_argument("--epochs", type=int, default=5, help="epochs; medians are reported")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         pack = build(Noise(options.num, options.size), Path(place) / "pack", size=options.size, workers=0, quiet=True)
@@ -107,7 +108,7 @@ def main() -> None:
             "pairs_per_s_of_waiting": {n: pairs / statistics.median(seconds) for n, seconds in times.items()},
         }
         for name, value in result.items():
-            print(name, value)
+            print(name.replace("_", " "), value)
     if options.json:
         write_json(options.json, {"options": {**vars(options), "json": None}, **result, **provenance()})
 

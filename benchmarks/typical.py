@@ -1,8 +1,8 @@
-"""The typical research step and input of this field, written for comparison: what `mvitac` is measured against.
+"""Baseline for comparison: a training step and input pipeline as in typical research code of this field.
 
-As the released code of several papers works: images lie as JPEG files, PIL decodes and augments them one by one in a
-DataLoader, the intra- and the inter-modal loss each pass the images through the networks again, the momentum update is a
-Python loop over parameters, everything is fp32 in the default memory layout.
+It follows the released code of several papers. Images are JPEG files. PIL decodes and augments them one by one in a
+DataLoader. The intra- and inter-modal losses use separate forward passes. The momentum update is a Python loop over
+parameters. Everything is fp32 in the default memory layout.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class TypicalStep:
-    """Two modalities, query and key network each with two heads; call it with four views [B, 3, S, S]."""
+    """A step on two modalities. Query and key networks have two heads each. Call it with four views [B, 3, S, S]."""
 
     def __init__(self, trunk: str, device: torch.device) -> None:
         def tower() -> nn.ModuleDict:
@@ -70,7 +70,7 @@ class TypicalStep:
 
 
 class TypicalDataset(Dataset):
-    """Pairs of JPEG files, 640x480 as cameras and sensors write them; four PIL views of each."""
+    """Pairs of 640x480 JPEG files. An item is four PIL views: two of vision, two of touch."""
 
     def __init__(self, folder: Path, size: int) -> None:
         self.paths = sorted(folder.glob("vision-*.jpg"))
@@ -97,7 +97,7 @@ class TypicalDataset(Dataset):
 
 
 def write_jpegs(folder: Path, num: int) -> None:
-    """Write ``num`` pairs of photograph-like 640x480 JPEG files."""
+    """Write ``num`` pairs of 640x480 JPEG files with photograph-like content."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     grains = rng.normal(0, 4, (8, 480, 640, 3))
@@ -109,7 +109,7 @@ def write_jpegs(folder: Path, num: int) -> None:
 
 
 def typical_batches(folder: Path, size: int, batch: int, workers: int) -> Iterator[list[Tensor]]:
-    """Endless shuffled batches of four views [B, 3, S, S]."""
+    """Yield shuffled batches of four views [B, 3, S, S], without end."""
     random.seed(0)
     loader = DataLoader(TypicalDataset(folder, size), batch, shuffle=True, num_workers=workers, drop_last=True)
     while True:

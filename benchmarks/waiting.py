@@ -1,9 +1,10 @@
-"""How long OpenMP's threads should spin while they wait for each other: a step alone and beside a busy program.
+"""Effect of OpenMP's spin-waiting on the time of a step, alone and next to a busy program.
 
     python -m benchmarks.waiting [--rounds 3] [--json FILE]
 
-Each figure is a step of recipe `paper` (ResNet-10, 48 px, batch 64, bf16, all cores) in a process of its own
-(``benchmarks.memory``), variants in turn. `mvitac` sets GOMP_SPINCOUNT=10000 (``cli/main.py``), libgomp by itself 300,000.
+Each value is a step of recipe `paper` (ResNet-10, 48 px, batch 64, bf16, all cores) in a separate process
+(``benchmarks.memory``). Variants are interleaved. `mvitac` sets GOMP_SPINCOUNT=10000 (``cli/main.py``); libgomp's
+default is 300,000.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ STEP = {"batch": 64, "chunk": 0, "size": 48, "trunk": "resnet10t", "device": "cp
 
 
 def ms_per_pair(variables: dict[str, str]) -> float:
-    """Of one step in a fresh process with these environment variables."""
+    """Measure one step in a new process with these environment variables. Return ms per pair."""
     clean = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS")}
     command = [sys.executable, "-m", "benchmarks.memory", json.dumps(STEP)]
     out = subprocess.run(command, env=clean | variables, capture_output=True, text=True, check=True).stdout
@@ -38,8 +39,8 @@ def ms_per_pair(variables: dict[str, str]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--rounds", type=int, default=3, help="measurements per variant")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     medians: dict[str, dict[str, float]] = {}
     for others in (0, 1):
@@ -52,7 +53,7 @@ def main() -> None:
         for name in VARIANTS:
             median = statistics.median(found[name] for found in rounds)
             medians.setdefault(name, {})[f"beside {others}"] = median
-            print(f"{name:16} beside {others} busy programs: {median:7.2f} ms per pair", flush=True)
+            print(f"{name:16} with {others} busy programs: {median:7.2f} ms per pair", flush=True)
     if options.json:
         write_json(options.json, {"ms_per_pair": medians, "step": STEP, **provenance()})
 

@@ -1,14 +1,16 @@
 #!/usr/bin/env bash
-# Everything behind docs/results/real.md: manifests, then all methods of Tables I and II on every set. CPU only.
-#   examples/real.sh ../shared/data runs/real --jobs 2       (data, output, options of mvitac compare; resumes anywhere)
-#   STEPS=150 SETS="vt60 physiclear-by-group" examples/real.sh ...    (shorter runs; only these sets)
+# Reproduce docs/results/real.md: write the manifests, then run all methods of Tables I and II on every dataset (CPU).
+# Arguments: data folder, output folder, options of mvitac compare. A stopped script continues where it was stopped.
+#   examples/real.sh ../shared/data runs/real --jobs 2
+#   STEPS=150 SETS="vt60 physiclear-by-group" examples/real.sh ...    # shorter runs, only these datasets
 set -euo pipefail
 data=$1 out=$2
 shift 2
 options=("$@")
 [ -d "$out/manifests" ] || python "$(dirname "$0")/real_manifests.py" "$data" "$out/manifests"
 
-# methods NAME PLAN BATCH OPTIONS...: one table. Batch: the power of two nearest to the grasps or recordings in train, at most 64.
+# methods NAME PLAN BATCH OPTIONS...: make one table. BATCH is the power of two nearest to the number of grasps or
+# recordings in train, at most 64.
 methods() {
   local name=$1 plan=$2 batch=$3
   shift 3

@@ -1,10 +1,10 @@
-"""Derive the manifests behind docs/results/real.md from a folder of real data sets (see that page for their owners).
+"""Write the manifests for docs/results/real.md from a folder of real datasets. That page lists the datasets.
 
     python examples/real_manifests.py ../shared/data runs/real/manifests
 
-What a derived manifest adds to the set's own: cross-validation columns ``fold1`` ... (whole objects; every object is
-tested once), the numbers behind the control probes, and for vt60 the weak pairs. Nothing here looks at a label to
-choose a fold's members other than to spread the classes over the folds. Image paths stay where they are.
+A written manifest has the columns of the dataset's own manifest, plus cross-validation columns ``fold1`` ... (by whole
+objects; each object is in test once), the values for the control probes, and for vt60 the weak pairs. Labels are used
+only to spread the classes over the folds. Images are not copied; the manifests point to them.
 """
 
 import csv
@@ -25,7 +25,7 @@ def read(file: Path) -> Rows:
 
 
 def write(rows: Rows, file: Path, folder: Path, images: tuple[str, ...]) -> None:
-    """Write ``rows`` with the columns ``images`` rewritten from ``folder``-relative to ``file``-relative paths."""
+    """Write ``rows``. Paths in the columns ``images`` are relative to ``folder`` and become relative to ``file``."""
     file.parent.mkdir(parents=True, exist_ok=True)
     back = os.path.relpath(folder.resolve(), file.parent.resolve())
     for row in rows:
@@ -38,15 +38,17 @@ def write(rows: Rows, file: Path, folder: Path, images: tuple[str, ...]) -> None
 
 
 def add_folds(rows: Rows, num: int, *, by: str, stratum: str, val_every: int = 2) -> None:
-    """Columns fold1..fold<num>: every object is test once; of the next fold's, every ``val_every``-th is val.
+    """Add columns fold1..fold<num>. Each object is in test once. Every ``val_every``-th of the next fold is in val.
 
-    Objects are dealt in turn, stratum by stratum, so that each fold has its share of every stratum.
+    Objects are assigned to folds round-robin, sorted by stratum, so that every stratum is spread over the folds.
     """
     names: dict[str, str] = {}
     for row in rows:
         names.setdefault(row[by], row[stratum])
     shuffled = np.random.default_rng(0).permutation(sorted(names)).tolist()
-    order = {name: i for i, name in enumerate(sorted(shuffled, key=lambda name: names[name]))}  # stable: still shuffled
+    order = {
+        name: i for i, name in enumerate(sorted(shuffled, key=lambda name: names[name]))
+    }  # stable: keeps the shuffle
     for fold in range(num):
         for row in rows:
             rank, home = divmod(order[row[by]], num)
@@ -55,7 +57,7 @@ def add_folds(rows: Rows, num: int, *, by: str, stratum: str, val_every: int = 2
 
 
 def slip_grasp(folder: Path, out: Path) -> None:
-    """Leave one object out; the sweep of gripper widths, raw and relative to the object's own mean width."""
+    """Leave one object out. Add gripper widths relative to the mean width of the object."""
     rows = read(folder / "manifest.csv")
     widths: dict[str, dict[str, float]] = defaultdict(dict)
     for row in rows:
@@ -68,7 +70,7 @@ def slip_grasp(folder: Path, out: Path) -> None:
 
 
 def slip_gsmini(folder: Path, out: Path) -> None:
-    """Three folds of objects; motion since the recording's first frame, as the mean absolute difference of each gel."""
+    """Three folds of objects. Add the motion of each gel: mean absolute difference to the first frame."""
     rows = [row for row in read(folder / "manifest.csv") if row["label_conflict"] == "0"]
     slips: dict[str, list[float]] = defaultdict(list)
     first: dict[tuple[str, str], np.ndarray] = {}
@@ -83,12 +85,12 @@ def slip_gsmini(folder: Path, out: Path) -> None:
         row["often"] = f"{np.mean(slips[row['object']]):.2f}"  # only to spread objects that slip over the folds
     add_folds(rows, 3, by="object", stratum="often")
     for row in rows:
-        del row["often"]  # a label in disguise
+        del row["often"]  # derived from the label
     write(rows, out / "slip_gsmini.csv", folder, ("left", "right"))
 
 
 def physiclear(folder: Path, out: Path) -> None:
-    """The owners' split as it is; their objects without labels become "unlabelled"."""
+    """Keep the split of the dataset's owners. Their objects without labels become "unlabelled"."""
     rows = read(folder / "manifest.csv")
     for row in rows:
         row["owners_split"] = row.pop("split") or "unlabelled"
@@ -96,7 +98,7 @@ def physiclear(folder: Path, out: Path) -> None:
 
 
 def vt60(folder: Path, out: Path) -> None:
-    """Weak pairs: the k-th touch of an object with its (k mod 24)-th photo; two objects of a category in each fold."""
+    """Pair touch k of an object with its photo (k mod 24). Each fold has two objects of each category."""
     photos: dict[str, list[str]] = defaultdict(list)
     everything = read(folder / "manifest.csv")
     for row in everything:
@@ -118,4 +120,7 @@ if __name__ == "__main__":
         sys.exit(f"usage: python {sys.argv[0]} DATA_FOLDER OUT_FOLDER")
     for make in (slip_grasp, slip_gsmini, physiclear, vt60):
         source = Path(sys.argv[1]) / make.__name__
-        make(source, Path(sys.argv[2])) if (source / "manifest.csv").is_file() else print(f"{source}: not there")
+        if (source / "manifest.csv").is_file():
+            make(source, Path(sys.argv[2]))
+        else:
+            print(f"{source}: no manifest.csv, skipped")

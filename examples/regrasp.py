@@ -1,17 +1,19 @@
-"""Lift, or open and grasp again? A policy that looks and feels before it lifts, and what its success gains by touch.
+"""Re-grasping with touch: a policy that predicts the success of a grasp before it lifts, and how much touch helps it.
 
     mvitac pretrain --data grasps --out runs/grasps
     python examples/regrasp.py runs/grasps [--seeds 5] [--candidates 4] [--json FILE]
 
-One episode is one thing and a few candidate grasps of it, in an order that a seed draws. The policy closes its fingers on
-the first ('during': closed, not lifted), predicts success, lifts if that is likelier than failure, and else opens and takes
-the next; if none convinces, it goes back to the most promising. Its encoders are the run's, frozen; its head is a logistic
-regression on the grasps of the training objects. Scored on objects that neither has seen. "Best of all" closes on every
-candidate before it chooses. A choice by chance, an oracle, the mean imprint alone and encoders with random weights stand
-beside it; the oracle is the most that any choice among these candidates can do.
+An episode is one object and a few candidate grasps in random order. The policy closes the fingers on the first
+candidate (phase 'during': closed, not lifted) and predicts the probability of success. If it is at least .5, the policy
+lifts. If not, it opens and tries the next candidate. If no candidate reaches .5, it lifts the one with the highest
+probability. "Best of all" tries every candidate before it chooses.
 
-Intervals resample test objects and seeds (orders of the candidates); they hold for this run's encoders and this head, not
-for another pre-training.
+The encoders are those of the run, frozen. The head is a logistic regression, trained on the grasps of the training
+objects. Scores are on test objects, which neither encoders nor head have seen. For comparison: a random choice, an
+oracle (the upper limit for these candidates), the mean imprint alone, and encoders with random weights.
+
+Confidence intervals resample test objects and seeds (orders of the candidates). They are valid for this run's encoders
+and this head, not for another pre-training.
 """
 
 from __future__ import annotations
@@ -41,11 +43,14 @@ KEYS = {
     "touch": {"observation.images.gel_left": "touch", "observation.images.gel_right": "touch"},
 }
 NEVER = float("inf")
-"""A threshold no probability reaches: every candidate is tried, the most promising lifted."""
+"""A threshold that no probability reaches: all candidates are tried, and the best is lifted."""
 
 
 def decide(p: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """Which candidate is lifted and how many were tried, [E] each, given success probabilities ``p`` [E, K] in order."""
+    """Return the index of the lifted candidate and the number of tried candidates, [E] each.
+
+    ``p`` [E, K] are the success probabilities of the candidates, in the order in which they are tried.
+    """
     sure = p >= threshold
     convinced = sure.any(1)
     lifted = np.where(convinced, sure.argmax(1), p.argmax(1))
@@ -53,9 +58,18 @@ def decide(p: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.ndarra
 
 
 def episodes(objects: np.ndarray, candidates: int, seed: int) -> np.ndarray:
-    """Positions [E, K] of grasps: each object's are shuffled and dealt out in hands of ``candidates``, none twice.
+    """Divide the grasps of each object randomly into episodes of K = ``candidates`` grasps. No grasp is used twice.
 
-    ``objects`` [N] are the grasps' object numbers. ValueError if an object has too few grasps for one hand.
+    Args:
+        objects: Object number of each grasp, [N].
+        candidates: Grasps per episode.
+        seed: Seed of the order.
+
+    Returns:
+        Indices of the grasps, [E, K].
+
+    Raises:
+        ValueError: An object has fewer than ``candidates`` grasps.
     """
     rng = np.random.default_rng(seed)
     hands = []
@@ -63,21 +77,21 @@ def episodes(objects: np.ndarray, candidates: int, seed: int) -> np.ndarray:
         own = rng.permutation(np.flatnonzero(objects == thing))
         if len(own) < candidates:
             raise ValueError(
-                f"an object has {len(own)} grasps, {candidates} candidates asked: simulate more, or ask fewer"
+                f"an object has {len(own)} grasps, fewer than {candidates} candidates: simulate more or ask for fewer"
             )
         hands.append(own[: len(own) // candidates * candidates].reshape(-1, candidates))
     return np.concatenate(hands)
 
 
 def observe(pack: Pack, rows: np.ndarray) -> dict[str, torch.Tensor]:
-    """The observation dict of pack rows, as a robot would hand it to its policy: uint8 images [B, 3, S, S]."""
+    """Return the observation dict of pack rows, as a robot gives it to a policy: uint8 images [B, 3, S, S]."""
     vision, gels = (torch.from_numpy(pack.images[m][rows]).permute(0, 3, 1, 2) for m in ("vision", "touch"))
     return dict(zip([*KEYS["vision"], *KEYS["touch"]], (vision, gels[:, :3], gels[:, 3:]), strict=True))
 
 
 @torch.no_grad()
 def encode(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Features [N, D] of the policy's encoder on "vision" and "touch"; what it gives on both is these side by side."""
+    """Return the features [N, D] of the policy's encoder on "vision" and "touch". Those on both are concatenated."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     encoders = {m: ObservationEncoder(model, keys).to(device).eval() for m, keys in KEYS.items()}
     chunks = np.array_split(rows, -(-len(rows) // 128))
@@ -86,14 +100,20 @@ def encode(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def predict(x: np.ndarray, y: np.ndarray, rows: ProbeSplit) -> np.ndarray:
-    """Success probability [num_test] of the test rows, from ``x`` and ``y`` of all rows: train, val, test in this order."""
+    """Fit a head and return the success probability of the test rows, [num_test].
+
+    ``x`` and ``y`` have all rows, in the order train, val, test.
+    """
     val, test = len(rows.train), len(rows.train) + len(rows.val)
     head, _ = fit_linear(x[:val], y[:val], x[val:test], y[val:test])
     return head(x[test:])[:, 1]
 
 
 def play(p: np.ndarray, y: np.ndarray, objects: np.ndarray, hands: np.ndarray, threshold: float) -> dict[str, Any]:
-    """Episodes and held lifts by object, and the mean number of grasps: a record for ``evaluation.scores.interval``."""
+    """Play all episodes. Return episodes and successes per object and the mean number of tried grasps.
+
+    The result is a record for ``mvitac.evaluation.scores.interval``.
+    """
     lifted, tried = decide(p[hands], threshold)
     thing, held = objects[hands[:, 0]], y[hands[np.arange(len(hands)), lifted]]
     num = int(objects.max()) + 1
@@ -105,17 +125,20 @@ def play(p: np.ndarray, y: np.ndarray, objects: np.ndarray, hands: np.ndarray, t
 
 
 def experiment(model: Model, pack: Pack, seeds: int, candidates: int) -> dict[str, Any]:
-    """Success of every policy, JSON-ready: name -> "again" and "best" -> mean, low, high, tried; and the gain of touch."""
+    """Return the success of every policy and the gain of touch, ready for JSON.
+
+    "success": policy -> "again" or "best" -> mean, low, high, tried. "gain": pair of policies -> mean, low, high, p.
+    """
     task = next((t for t in pack.spec.tasks if t.name == "success"), None)
     if task is None or not task.only or pack.spec.vision_channels != 3 or pack.spec.touch_channels != 6:
-        raise ValueError(f"{pack.path} holds no grasps with a camera and two gels: train a run with --data grasps")
+        raise ValueError(f"{pack.path} has no grasps with a camera and two gels: train a run with --data grasps")
     if seeds < 1 or candidates < 1:
-        raise ValueError(f"seeds {seeds}, candidates {candidates}: give at least 1 of each")
+        raise ValueError(f"seeds {seeds}, candidates {candidates}: each must be at least 1")
     rows = split_rows(pack, task, "both")
     every = np.concatenate([rows.train, rows.val, rows.test])
     labels = pack.labels("success")
     if len(set(labels[rows.train])) < 2:
-        raise ValueError(f"{pack.path}: all training grasps ended alike, nothing can be learned: simulate more")
+        raise ValueError(f"{pack.path}: all training grasps have the same label: simulate more grasps")
     objects = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
     hands = [episodes(objects, candidates, seed) for seed in range(seeds)]
     x = encode(model, pack, every)
@@ -171,12 +194,13 @@ def _summary(records: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def show(found: dict[str, Any], console: Console) -> None:
-    title = "{objects} unseen objects, {episodes} episodes a seed, {seeds} seeds, {candidates} candidates".format(
+    """Print the results of ``experiment`` as a table."""
+    title = "{objects} test objects, {episodes} episodes per seed, {seeds} seeds, {candidates} candidates".format(
         **found
     )
-    table = Table(title=f"{title}: lifts that held, %", title_justify="left")
-    for column in ("decides by", "re-grasp", "95 %", "tried", "best of all", "95 %"):
-        table.add_column(column, justify="left" if column == "decides by" else "right")
+    table = Table(title=f"{title}: success in %", title_justify="left")
+    for column in ("policy", "re-grasp", "95 %", "tried", "best of all", "95 %"):
+        table.add_column(column, justify="left" if column == "policy" else "right")
     for name, rules in found["success"].items():
         again, best = rules["again"], rules["best"]
         cells = [f"{100 * again['mean']:.1f}", _range(again), f"{again['tried']:.2f}", f"{100 * best['mean']:.1f}"]
@@ -194,9 +218,9 @@ def _range(cell: dict[str, float]) -> str:
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("run", help="folder of a run trained on grasps")
-    parser.add_argument("--seeds", type=int, default=5, help="orders of the candidates to draw")
-    parser.add_argument("--candidates", type=int, default=4, help="grasps that an episode may try")
+    parser.add_argument("run", help="folder of a run trained with --data grasps")
+    parser.add_argument("--seeds", type=int, default=5, help="number of random orders of the candidates")
+    parser.add_argument("--candidates", type=int, default=4, help="candidate grasps per episode")
     parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args(argv)
     try:

@@ -1,11 +1,13 @@
-"""A ROS 2 node: image topics in, predictions and embeddings out.
+"""A ROS 2 node that subscribes to image topics and publishes predictions and embeddings.
 
     python examples/ros2_node.py exports/first --vision /camera/image_raw --touch /gel/image_raw
 
-Subscribes to sensor_msgs/Image (rgb8 or bgr8), publishes std_msgs/String on ~/prediction and std_msgs/Float32MultiArray on
-~/embedding. A prediction is JSON: number of the touch, contact (true; false once, when it ends), age in ms, and the class
-and confidence of each task. Faults go to the node's log. Only ``main`` needs ROS: ``Node`` works on anything with the fields
-of an Image message, which is how it is tested.
+It subscribes to sensor_msgs/Image (rgb8 or bgr8), and publishes std_msgs/String on ~/prediction and
+std_msgs/Float32MultiArray on ~/embedding. A prediction is JSON: number of the touch, contact (true; false once, when
+the contact ends), age in ms, and class and confidence of each task. Errors are written to the node's log.
+
+Only ``main`` needs ROS. ``Node`` accepts any object with the fields of an Image message, so it can be tested without
+ROS.
 """
 
 from __future__ import annotations
@@ -25,7 +27,11 @@ from mvitac.live.streams import Stream
 
 
 def to_rgb(message: Any) -> np.ndarray:
-    """uint8 RGB [H, W, 3] of a sensor_msgs/Image; rows may be padded. ValueError names a foreign encoding."""
+    """Convert a sensor_msgs/Image to uint8 RGB [H, W, 3]. Rows may be padded.
+
+    Raises:
+        ValueError: The encoding is not rgb8 or bgr8.
+    """
     if message.encoding not in ("rgb8", "bgr8"):
         raise ValueError(f"encoding {message.encoding!r}: publish rgb8 or bgr8")
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
@@ -34,7 +40,7 @@ def to_rgb(message: Any) -> np.ndarray:
 
 
 class Topic(Source):
-    """A topic as a source: ``put`` what arrives, then pump."""
+    """A topic as a camera source. Call ``put`` with each message, then pump the stream."""
 
     def __init__(self) -> None:
         self.message: Any = None
@@ -50,7 +56,7 @@ class Topic(Source):
 
 
 class Node:
-    """Messages in by modality, ``publish(kind, value)`` out: "prediction" (str) and "embedding" (list of float)."""
+    """Take image messages and call ``publish(kind, value)``: "prediction" (str) or "embedding" (list of float)."""
 
     def __init__(
         self,
@@ -66,18 +72,18 @@ class Node:
             m: [Stream(f"{m} {i}", topic, clock=clock) for i, topic in enumerate(topics)]
             for m, topics in self.topics.items()
         }
-        # Live needs no embedding; the node publishes it, so the engine's last outputs are kept.
+        # Live does not return embeddings, so the last outputs of the engine are kept to publish them.
         self.live = Live(Kept(engine, self.outputs), self.streams, clock=clock, tell=lambda event: warn(event.text))  # type: ignore[arg-type]
         self.touched = False
 
     def image(self, modality: str, message: Any, which: int = 0) -> None:
-        """Take one Image message; publishes if it completes an answer."""
+        """Take one Image message, and publish if there is a new prediction."""
         self.topics[modality][which].put(message)
         self.streams[modality][which].pump()
         self.tick()
 
     def tick(self) -> None:
-        """Publish what is new; called now and then as well, for topics that have fallen silent say nothing of it."""
+        """Publish new results. Also called by a timer, because a topic that stops sends no message."""
         predicted, before = self.live.tick(), self.touched
         self.touched = self.live.touch is not None
         number = {"touch": self.live.num_touches, "contact": self.touched}
@@ -91,7 +97,7 @@ class Node:
 
 
 class Kept:
-    """An engine that leaves its last outputs in a dict."""
+    """An engine that stores its last outputs in a dict."""
 
     def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
         self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
@@ -103,16 +109,18 @@ class Kept:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("export", help="folder written by `mvitac export`")
     parser.add_argument("--vision", action="append", default=[], help="image topic of the camera")
-    parser.add_argument("--touch", action="append", default=[], help="image topic of a touch sensor; twice for two")
+    parser.add_argument(
+        "--touch", action="append", default=[], help="image topic of a touch sensor; give it twice for two"
+    )
     options, rest = parser.parse_known_args()
     engine = Engine(options.export)
     for modality in ("vision", "touch"):
         takes = engine.inputs.get(modality, (0, 0, 0))[2] // 3
         if len(getattr(options, modality)) != takes:
-            parser.error(f"the model takes {takes} {modality} topic(s): give --{modality} TOPIC as many times")
+            parser.error(f"the model needs {takes} {modality} topic(s): give --{modality} TOPIC {takes} times")
 
     import rclpy  # pyright: ignore[reportMissingImports]
     from rclpy.qos import QoSProfile, ReliabilityPolicy  # pyright: ignore[reportMissingImports]
@@ -131,7 +139,7 @@ def main() -> None:
         publisher.publish(message(data=value))
 
     node = Node(engine, publish, warn=ros.get_logger().warning)
-    # A queue of one: the five of the usual profile of sensors would come oldest first, and pass for new.
+    # Keep only the newest message: the usual sensor profile queues five and delivers the oldest first.
     newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     for modality, topics in (("vision", options.vision), ("touch", options.touch)):
         for which, topic in enumerate(topics):

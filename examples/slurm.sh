@@ -1,5 +1,6 @@
 #!/bin/bash
-# Pre-train on 2 nodes x 8 GPUs: sbatch examples/slurm.sh. A killed or requeued job continues from its last checkpoint.
+# Pre-train on 2 nodes with 8 GPUs each: PACK=/data/pack sbatch examples/slurm.sh
+# A killed or requeued job continues from its last checkpoint.
 #SBATCH --job-name=mvitac
 #SBATCH --nodes=2
 #SBATCH --ntasks-per-node=1
@@ -10,7 +11,7 @@
 #SBATCH --signal=TERM@120
 
 set -euo pipefail
-PACK=${PACK:?give the pack: PACK=/data/pack sbatch examples/slurm.sh}
+PACK=${PACK:?set PACK to the folder of a pack: PACK=/data/pack sbatch examples/slurm.sh}
 OUT=${OUT:-runs/slurm}
 HEAD=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
 

@@ -71,7 +71,7 @@ def test_hands_are_of_one_object_and_use_no_grasp_twice() -> None:
     assert (objects[hands] == objects[hands[:, :1]]).all()
     assert np.array_equal(hands, regrasp.episodes(objects, 3, 0))
     assert not np.array_equal(hands, regrasp.episodes(objects, 3, 1))
-    with pytest.raises(ValueError, match="an object has 3 grasps, 4 candidates asked"):
+    with pytest.raises(ValueError, match="an object has 3 grasps, fewer than 4 candidates"):
         regrasp.episodes(objects, 4, 0)
 
 
@@ -108,14 +108,14 @@ def test_touch_that_knows_the_outcome_lifts_like_the_oracle(
     assert found["gain"]["both - vision"]["mean"] == pytest.approx(success["both"] - success["vision"])
     assert found["success"]["first grasp"]["again"]["tried"] == 1
     shown = capsys.readouterr().out
-    assert "10 unseen objects" in shown and f"{100 * success['vision']:.1f}" in shown
+    assert "10 test objects" in shown and f"{100 * success['vision']:.1f}" in shown
 
 
 def test_what_cannot_be_played_is_named(run: Path, smoke_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for argv, says in (
-        ([str(smoke_run)], "holds no grasps with a camera and two gels"),
-        ([str(run), "--seeds", "0"], "give at least 1 of each"),
-        ([str(run), "--candidates", "9"], "an object has 5 grasps, 9 candidates asked"),
+        ([str(smoke_run)], "has no grasps with a camera and two gels"),
+        ([str(run), "--seeds", "0"], "each must be at least 1"),
+        ([str(run), "--candidates", "9"], "an object has 5 grasps, fewer than 9 candidates"),
     ):
         with pytest.raises(SystemExit):
             regrasp.main(argv)

@@ -58,7 +58,14 @@ def auto(pack: Pack, **changes: object) -> Run:
 
 def test_recipes_ask_for_auto_but_those_that_are_fixed() -> None:
     asked = {name: recipe(name).precision for name in RECIPES}
-    assert asked == {"paper": "fp32", "authors": "fp32", "modern": "auto", "demo": "auto", "smoke": "fp32"}
+    assert asked == {
+        "paper": "fp32",
+        "authors": "fp32",
+        "modern": "auto",
+        "demo": "auto",
+        "quick": "auto",
+        "smoke": "fp32",
+    }
 
 
 @pytest.mark.parametrize(
@@ -104,7 +111,7 @@ def test_auto_on_gpus(capability: tuple[int, int], expected: str, monkeypatch: p
 
 def test_nothing_below_train_takes_auto_for_fp32(pack: Pack) -> None:
     run = auto(pack)
-    with pytest.raises(AssertionError, match="what auto means is decided before"):
+    with pytest.raises(AssertionError, match="auto is resolved earlier"):
         Step(run, run.method.build(pack.spec, run.encoder), CPU)
 
 

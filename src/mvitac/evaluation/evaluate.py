@@ -82,9 +82,8 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
     for task in tasks:
         for modality in modalities:
             split_rows(pack, task, modality)
-    if session.controls:  # load these weights first: missing ones should not surface at the end
-        for weights in start_weights([m.run for m in models], session.imagenet):
-            build_trunk(replace(models[0].run.encoder, weights=weights), 3)
+    if session.controls:
+        _check_weights(models, session)
     records: Records = []
     retrieval: Records = []
     num = len(models) * len(tasks) * len(modalities) * len(session.probes)
@@ -133,6 +132,12 @@ def _check_models(paths: Sequence[Path], models: Sequence[Model], pack: Pack) ->
                     f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
                     f" it was trained on {model.spec.name!r}"
                 )
+
+
+def _check_weights(models: Sequence[Model], session: ProbeConfig) -> None:
+    """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
+    for weights in start_weights([m.run for m in models], session.imagenet):
+        build_trunk(replace(models[0].run.encoder, weights=weights), 3)
 
 
 def _probe_run(
