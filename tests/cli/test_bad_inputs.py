@@ -225,7 +225,7 @@ OPTIONS: list[tuple[str, str, list[str]]] = [
     ("twice-task", "probe {run} --tasks pattern pattern", ["pattern", "twice"]),
     ("twice-modality", "probe {run} --modalities touch touch", ["touch", "twice"]),
     ("no-runs", "probe", ["run's folder"]),
-    ("no-probes", "probe {run} --probes", ["no probes", "linear, paper, knn"]),
+    ("no-probes", "probe {run} --probes", ["no probe", "linear, paper, knn"]),
     ("steps-of-a-lifetime", PRETRAIN + "--steps 1000000000", ["1000000000", "at most"]),
     ("epochs-of-a-lifetime", PRETRAIN + "--steps None --epochs 1e300", ["epochs", "1e+300", "at most"]),
     ("batch-larger-than-data", PRETRAIN + "--batch-size 100", ["72 rows", "batch_size is 100", "72 or less"]),

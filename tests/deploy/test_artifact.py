@@ -243,8 +243,8 @@ def test_probes_of_another_shape_are_refused(copy: Path) -> None:
     tensors = safetensors.torch.load_file(copy / "probes.safetensors")
     for name, wrong, message in (
         ("pattern.touch.weight", torch.zeros(3, 9), "reads 9 features"),
-        ("pattern.touch.bias", torch.zeros(2), "do not belong to 3 classes"),
-        ("pattern.touch.weight", torch.full((3, 64), torch.nan), "not all numbers"),
+        ("pattern.touch.bias", torch.zeros(2), "do not fit 3 classes"),
+        ("pattern.touch.weight", torch.full((3, 64), torch.nan), "not all finite"),
     ):
         safetensors.torch.save_file({**tensors, name: wrong}, copy / "probes.safetensors")
         reseal(copy)

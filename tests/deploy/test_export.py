@@ -192,7 +192,7 @@ def test_rows_that_check_and_calibrate_are_of_every_class(
     class Stop(Exception):
         pass
 
-    def checked(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+    def checked(model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray, *_: object) -> dict[str, np.ndarray]:
         seen.extend(rows.tolist())
         raise Stop
 

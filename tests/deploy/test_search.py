@@ -96,7 +96,7 @@ def test_find_command_draws_what_it_found(
     assert main(["find", str(tmp_path / "bad.png"), "--in", str(index)]) == 2
     assert "cannot be read as a picture" in capsys.readouterr().err
     assert main(["find", "--in", str(index)]) == 2
-    assert "say what to find" in capsys.readouterr().err
+    assert "name the picture to search for" in capsys.readouterr().err
 
 
 def test_find_subtracts_the_background(

@@ -263,8 +263,9 @@ def test_a_page_of_very_many_and_of_none(browser: Browser, artifact: Path, pack:
     """100,000 rows, in which every answer is right: filtered to its mistakes, there is nothing to show."""
     port = free_port()
     code = (
-        "import mvitac, numpy as np; from mvitac.explorer import page, serve; from mvitac.landscape import Landscape;"
-        f"land = Landscape(mvitac.load({str(artifact)!r}), mvitac.Pack({str(pack.path)!r}));"
+        "import mvitac, numpy as np; from mvitac.report.explorer import page, serve;"
+        "from mvitac.report.explorer_data import ExplorerData;"
+        f"land = ExplorerData(mvitac.load({str(artifact)!r}), mvitac.Pack({str(pack.path)!r}));"
         "i = np.arange(100_000) % len(land.rows); land.rows = land.rows[i]; land.split = np.full(len(i), 'test');"
         "noise = np.random.default_rng(0).normal(0, 0.05, (len(i), 64)).astype('f4');"
         "land.x = {m: x[i] + noise for m, x in land.x.items()};"

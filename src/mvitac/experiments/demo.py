@@ -41,9 +41,7 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
         raise ValueError(f"seeds {num_seeds}: give at least 1")
     start = time.perf_counter()
     say = lambda text: console.print(text, soft_wrap=True, highlight=False)  # noqa: E731
-    say(
-        f"1/4 simulating {run.data.name}: {getattr(run.data, 'num', '')} pairs, kept in the cache"
-    )
+    say(f"1/4 simulating {run.data.name}: {getattr(run.data, 'num', '')} pairs, kept in the cache")
     pack = run.data.open()
     runs = [(replace(run, seed=run.seed + i), out / f"seed{run.seed + i}") for i in range(num_seeds)]
     steps = run.num_steps(len(pack.rows("train")))
