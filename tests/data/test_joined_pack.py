@@ -157,4 +157,4 @@ def test_probe_learns_on_one_pack_and_meets_another(
     assert {r["source"] for r in result["records"]} == {"mvitac", "majority", "untrained", "pixels", "border"}
     assert "probes learned on" in capsys.readouterr().out
     assert main(["probe", str(tmp_path / "run"), "--learn-on", str(pack.path)]) == 2
-    assert "say with --on which pack they are scored on" in " ".join(capsys.readouterr().err.split())
+    assert "name the pack on which they are scored, --on PACK" in " ".join(capsys.readouterr().err.split())

@@ -194,7 +194,7 @@ def test_the_ros_node_itself(onnx: Path, monkeypatch: pytest.MonkeyPatch, capsys
     monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera"])
     with pytest.raises(SystemExit):
         ros2_node.main()
-    assert "the model takes 1 touch topic(s): give --touch TOPIC" in capsys.readouterr().err
+    assert "the model needs 1 touch topic(s): give --touch TOPIC" in capsys.readouterr().err
 
 
 def test_a_message_is_read_as_rgb() -> None:

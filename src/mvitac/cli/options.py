@@ -108,7 +108,7 @@ def check_json(path: Path | None) -> None:
     if path:
         check_place(path)
         if path.is_dir():
-            raise ValueError(f"--json {path} is a folder: give the name of a file")
+            raise ValueError(f"--json {path} is a folder: give another place, the name of a file")
 
 
 def _one_line(text: str, prog: str) -> str:
