@@ -1,8 +1,9 @@
 """Progress of long work, with the time left as estimated from measured steps.
 
 ``shown`` opens a display. ``work`` adds a line to it, from any function and any thread. Without ``shown``, e.g. if a
-function is called from Python, nothing is printed. A terminal or a notebook shows bars with named columns. A pipe or a file gets
-plain lines: the work, the time left after the first measured steps, and then a line about every tenth of the time.
+function is called from Python, nothing is printed. A terminal or a notebook shows bars with named columns. A pipe or a
+file gets plain lines: the work, the time left after the first measured steps, and then a line about every tenth of the
+time.
 """
 
 from __future__ import annotations
