@@ -54,7 +54,7 @@ class _Options:
     slurm_partition=gpu,timeout_min=600,gpus_per_node=1, and stop; the same command without it makes the tables."""
 
 
-_MANUAL = """Many runs into one table: methods x settings x seeds, beside controls and the paper's numbers.
+_MANUAL = """Many runs into one table: methods x settings x seeds, next to controls and the paper's numbers.
 
     First choose, then change single fields below:
       --plan {plans}|FILE.toml|FILE.json  (default table1)

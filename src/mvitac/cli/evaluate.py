@@ -23,7 +23,7 @@ from mvitac.system.progress import shown, work
 
 @dataclass(frozen=True, kw_only=True)
 class _ProbeOptions:
-    """Score frozen features by linear probes, kNN and retrieval, each beside its controls."""
+    """Score frozen features by linear probes, kNN and retrieval, each next to its controls."""
 
     runs: Positional[tuple[Path, ...]]
     """Folder of each finished run: seeds of one method, or several methods, on the same data."""

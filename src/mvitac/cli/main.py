@@ -25,7 +25,7 @@ how good the features are.
   data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
   data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
-  probe RUN...         linear probes beside their controls
+  probe RUN...         linear probes next to their controls
   compare              many runs into the paper's tables (--plan NAME or FILE)
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub

@@ -96,4 +96,4 @@ def train_together(runs: Sequence[tuple[Run, Path]], num_steps: int, console: Co
                     future.result()
             bars.end(overall)
         except KeyboardInterrupt:  # the terminal sent it to the runs as well, which stop after their step
-            raise Interrupted("stopped; the same command goes on from here") from None
+            raise Interrupted("stopped; the same command continues from here") from None

@@ -35,6 +35,13 @@ def percent(mean: float, low: float, high: float) -> str:
     return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
+def resampled(group_by: str, num_seeds: int) -> str:
+    """What the 95 % intervals of ``num_seeds`` runs cover."""
+    if num_seeds > 1:
+        return f"bootstrap over test {group_by}s and seeds"
+    return f"bootstrap over test {group_by}s; one seed, so they leave out the variation between seeds"
+
+
 def cell(task: dict[str, Any], source: str, modality: str) -> str:
     """The score of one source, or '' if it has none. Controls without features appear in every column."""
     value = task.get(modality, {}).get(source) or task.get("none", {}).get(source)
@@ -43,6 +50,7 @@ def cell(task: dict[str, Any], source: str, modality: str) -> str:
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
     """Print one table per task: accuracy in percent, mean and 95 % interval."""
+    seeds = 0
     for name, task in result["summary"].items():
         modalities = columns_of(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
@@ -54,7 +62,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         for source in sources_of(task):
             table.add_row(source, *(cell(task, source, m) for m in modalities))
         console.print(table)
-    console.print(f"95 % intervals: bootstrap over test {result['group_by']}s and seeds.", style="dim")
+    console.print(f"95 % intervals: {resampled(result['group_by'], seeds)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
 
