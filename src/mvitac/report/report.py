@@ -23,7 +23,6 @@ from mvitac.report import galleries, tables
 from mvitac.report import html as page
 from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
-from mvitac.report.tables import resampled
 from mvitac.run import load_run
 from mvitac.system.files import write_atomic
 from mvitac.system.progress import duration, shown, work
@@ -160,7 +159,7 @@ def _page(study: Study) -> str:
     notes = "".join(f" Note: {note}." for note in spec.notes)
     foot = page.paragraph(
         f"Data: {spec.name}, from {spec.source}; licence {spec.licence}.{notes}"
-        f" 95 % intervals: {resampled(spec.group_by, len({r.run.seed for r in study.runs}))}."
+        f" 95 % intervals: {tables.resampled(spec.group_by, len({r.run.seed for r in study.runs}))}."
         f" Written by mvitac {__version__}; this page makes no network request."
     )
     return page.html_page(title, _head(study, title), [section for section in drawn if section[2]], foot)
