@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import multiprocessing
+import numbers
 import os
 import zlib
 from collections.abc import Iterator, Sequence
@@ -138,7 +140,8 @@ def _check_image(sample: Sample, modality: str, spec: DataSpec, size: int) -> np
 
 
 def _check_columns(columns: dict[str, Any], spec: DataSpec) -> None:
-    for name in ("id", "group", "split", *(f"label_{t.name}" for t in spec.tasks)):
+    targets = {target.name for task in spec.values for target in task.targets}
+    for name in ("id", "group", "split", *(f"label_{t.name}" for t in spec.tasks), *sorted(targets)):
         if name not in columns:
             raise ValueError(f"column {name!r} is missing")
     for name in ("id", "group"):
@@ -150,3 +153,7 @@ def _check_columns(columns: dict[str, Any], spec: DataSpec) -> None:
         label = columns[f"label_{task.name}"]
         if isinstance(label, bool) or not isinstance(label, (int, np.integer)) or not -1 <= label < len(task.classes):
             raise ValueError(f"label_{task.name} is {label!r}: {task.name} has classes 0 to {len(task.classes) - 1}")
+    for name in sorted(targets):
+        value = columns[name]
+        if isinstance(value, bool) or not isinstance(value, numbers.Real) or math.isinf(value):
+            raise ValueError(f"{name} is {value!r}: a value is a finite number, or NaN for none")

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 
 from mvitac.data import notebook
 from mvitac.data.jpeg import Jpegs, Lazy
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import DataSpec, ValueTask
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json
 
@@ -146,6 +146,13 @@ class Pack:
                 known[~np.isin(self.column(about.split), splits)] = -1
             self._labels[task, *splits] = known
         return self._labels[task, *splits]
+
+    def values(self, task: ValueTask) -> np.ndarray:
+        """Return float64 values [N, T] of the targets of ``task``; NaN if not measured or excluded by ``task.only``."""
+        found = np.stack([self.column(target.name).astype(float) for target in task.targets], axis=1)
+        for name, value in task.only.items():
+            found[self.column(name).astype(str) != value] = np.nan
+        return found
 
     @functools.cached_property
     def _labels(self) -> dict[tuple[str, ...], np.ndarray]:
@@ -268,7 +275,9 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
     """Check what every reader of a pack's table relies on; ValueError names the column, the row and what is allowed."""
     labels = {f"label_{task.name}": len(task.classes) for task in spec.tasks}
     controls = [c for columns in spec.controls.values() for c in columns]
-    for name in ("id", "group", "split", *labels, *controls, *(c for task in spec.tasks for c in task.only)):
+    targets = {target.name: target for task in spec.values for target in task.targets}
+    asked = (*labels, *controls, *targets, *(c for task in spec.all_tasks for c in task.only))
+    for name in ("id", "group", "split", *asked):
         if name not in table.column_names:
             raise unknown("column", name, table.column_names)
     for name in ("id", "group", "split", "touch_group", *labels):
@@ -278,7 +287,7 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
     for name in (f"has_{modality}" for modality in spec.modalities):
         if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
             raise ValueError(f"column {name} holds {table.column(name).type}: write true or false in every row")
-    for column in dict.fromkeys(("split", *(task.split for task in spec.tasks))):
+    for column in dict.fromkeys(("split", *(task.split for task in spec.all_tasks))):
         if column not in table.column_names:
             raise unknown("column", column, table.column_names)
         for split in table.column(column).unique().to_pylist():
@@ -287,7 +296,9 @@ def check_table(table: pa.Table, spec: DataSpec) -> None:
     for name, num in labels.items():
         _check_labels(table.column(name), name, num)
     for name in controls:
-        _check_numbers(table.column(name), name)
+        _check_numbers(table.column(name), name, "a control needs a number in every row", np.isfinite)
+    for name in targets:
+        _check_numbers(table.column(name), name, "a value is a finite number, or NaN for none", _finite_or_nan)
     _check_ids(table.column("id").to_pylist())
 
 
@@ -306,12 +317,17 @@ def _check_labels(column: pa.ChunkedArray, name: str, num: int) -> None:
         raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
 
 
-def _check_numbers(column: pa.ChunkedArray, name: str) -> None:
+def _finite_or_nan(values: np.ndarray) -> np.ndarray:
+    return ~np.isinf(values)
+
+
+def _check_numbers(column: pa.ChunkedArray, name: str, need: str, allowed: Callable[[np.ndarray], np.ndarray]) -> None:
     kind = column.type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-        raise ValueError(f"column {name} holds {kind}: a control needs a number in every row")
-    if (bad := ~np.isfinite(column.to_numpy(zero_copy_only=False).astype(float))).any():
-        raise ValueError(f"column {name} is not a number in row {_first(bad)}: a control needs one")
+        raise ValueError(f"column {name} holds {kind}: {need}")
+    values = column.to_numpy(zero_copy_only=False).astype(float)
+    if (bad := ~allowed(values)).any():
+        raise ValueError(f"column {name} is {values[_first(bad)]} in row {_first(bad)}: {need}")
 
 
 def _check_ids(ids: list[Any]) -> None:

@@ -23,6 +23,33 @@ class Task:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Target:
+    """A measured number and its unit, e.g. force_n in N. ``name`` is the column of the table; NaN = not measured."""
+
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValueTask:
+    """A regression task for probes: one number (a force) or several (the six numbers of a pose)."""
+
+    name: str
+    targets: tuple[Target, ...]
+    only: dict[str, str] = field(default_factory=dict)
+    """Column -> value that a row must have to belong to the task, as for ``Task``."""
+    split: str = "split"
+    """Column with the split of this task."""
+
+    def __post_init__(self) -> None:
+        if not self.targets:
+            raise ValueError(f"task {self.name!r} has no targets: name at least one column with its unit")
+
+
+AnyTask = Task | ValueTask
+
+
+@dataclass(frozen=True, kw_only=True)
 class DataSpec:
     """What methods, probes and reports need to know about a dataset."""
 
@@ -43,6 +70,8 @@ class DataSpec:
     """Notes to print with every result, e.g. what train and test of a published split share."""
     difference: bool = field(default=False, metadata=LATER)
     """Whether touch is stored as (touch - background) / 2 + 128. Packs from before this field have False."""
+    values: tuple[ValueTask, ...] = field(default=(), metadata=LATER)
+    """Tasks whose answer is a number with a unit."""
 
     def __post_init__(self) -> None:
         if not (self.vision_channels or self.touch_channels):
@@ -50,10 +79,21 @@ class DataSpec:
         for name, channels in (("vision_channels", self.vision_channels), ("touch_channels", self.touch_channels)):
             if channels < 0 or channels % 3:
                 raise ValueError(f"{name} {channels}: give a multiple of 3, three for each camera or sensor")
-        names = [task.name for task in self.tasks]
+        names = [task.name for task in self.all_tasks]
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"task {name!r} occurs twice: give each task its own name")
+        units: dict[str, str] = {}
+        for target in (target for task in self.values for target in task.targets):
+            if units.setdefault(target.name, target.unit) != target.unit:
+                raise ValueError(
+                    f"{target.name!r} has two units, {units[target.name]} and {target.unit}: give a column one unit"
+                )
+
+    @property
+    def all_tasks(self) -> tuple[AnyTask, ...]:
+        """Tasks with classes, then tasks with values."""
+        return (*self.tasks, *self.values)
 
     def channels(self, modality: str) -> int:
         return {"vision": self.vision_channels, "touch": self.touch_channels}[modality]

@@ -15,14 +15,17 @@ import torch
 import torch.nn.functional as F
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import DataSpec, Task
+from mvitac.data.spec import AnyTask, DataSpec, Task, ValueTask
 from mvitac.evaluation.probe import (
+    ProbeSplit,
     cross_modal,
     labels_of,
     names_in,
     probe_all,
     probe_features,
     probe_model,
+    probes_of,
+    score_predictions,
     score_rows,
     split_rows,
 )
@@ -32,8 +35,9 @@ from mvitac.run import Run
 from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
 
-CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority")
-"""Names of the controls in the order of a table. The dataset's own controls come before the last."""
+CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority", "mean")
+"""Names of the controls in the order of a table. The dataset's own controls come before the last two, of which a task has
+one: the most common class, or the mean value."""
 Records = list[dict[str, Any]]
 
 
@@ -54,7 +58,7 @@ def borders(pack: Pack, modality: str, rows: np.ndarray, side: int = 16, width: 
 def controls_of(
     runs: Sequence[Run],
     pack: Pack,
-    tasks: Sequence[Task],
+    tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     probes: Sequence[str],
     imagenet: Path | None = None,
@@ -76,8 +80,8 @@ def controls_of(
     """
     records = _label_controls(pack, tasks)
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)
-    num_trunks = len(probes) * (len(starts) + len(weights))
-    num = len(tasks) * (len(modalities) * (1 + num_trunks) + ("touch" in modalities))
+    fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
+    num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
     with work("fitting probes of the controls", num, "probes"):
         records += _pixel_controls(pack, tasks, modalities)
         found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes)
@@ -93,22 +97,31 @@ def _named(source: str, seed: int | None, found: Records) -> Records:
     return [{"source": source, "seed": seed, **record} for record in found]
 
 
-def _label_controls(pack: Pack, tasks: Sequence[Task]) -> Records:
-    """The most common class, and the dataset's own controls: numbers in columns of its table."""
+def _label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
+    """What needs no image: the most common class or the mean value, and the dataset's own controls (table columns)."""
     records = []
     for task in tasks:
-        rows, num = split_rows(pack, task), len(task.classes)
-        common = np.bincount(labels_of(pack, task)[rows.fitted], minlength=num).argmax()
-        found = {"majority": score_rows(pack, task, rows.test, np.eye(num)[np.full(len(rows.test), common)])}
+        rows = split_rows(pack, task)
+        found = {"majority" if isinstance(task, Task) else "mean": _guess(pack, task, rows)}
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column)[rows.all].astype(float) for column in columns], axis=1)
-            found[name] = probe_features(x, pack, task, rows, "linear", 0)
+            found[name] = probe_features(x, pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0)
         for name, result in found.items():
             records += _named(name, None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
     return records
 
 
-def _pixel_controls(pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]) -> Records:
+def _guess(pack: Pack, task: AnyTask, rows: ProbeSplit) -> dict[str, Any]:
+    """Scores of one answer for all rows."""
+    if isinstance(task, ValueTask):
+        mean = np.nanmean(pack.values(task)[rows.fitted], axis=0)
+        return score_predictions(pack, task, rows.test, np.tile(mean, (len(rows.test), 1)))
+    num = len(task.classes)
+    common = np.bincount(labels_of(pack, task)[rows.fitted], minlength=num).argmax()
+    return score_rows(pack, task, rows.test, np.eye(num)[np.full(len(rows.test), common)])
+
+
+def _pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
     """Thumbnails of every modality, and the border of the tactile image."""
 
     def pixels(modality: str, rows: np.ndarray) -> np.ndarray:
@@ -124,7 +137,7 @@ def _pixel_controls(pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]
 def _untrained_trunks(
     starts: Sequence[tuple[Run, DataSpec]],
     pack: Pack,
-    tasks: Sequence[Task],
+    tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     probes: Sequence[str],
 ) -> tuple[Records, Records]:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, start_weights
-from mvitac.evaluation.probe import PROBES, Probe, cross_modal, probe_model, split_rows
+from mvitac.evaluation.probe import PROBES, Probe, cross_modal, probe_model, probes_of, split_rows, with_classes
 from mvitac.evaluation.scores import summarise
 from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
@@ -86,7 +86,7 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         _check_weights(models, session)
     records: Records = []
     retrieval: Records = []
-    num = len(models) * len(tasks) * len(modalities) * len(session.probes)
+    num = len(models) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
     with work("fitting probes", num, "probes"):
         scored = in_threads(
             lambda each: _probe_run(*each, pack, tasks, modalities, session),
@@ -105,7 +105,8 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         "pack": pack.digest,
         "group_by": pack.spec.group_by,
         "notes": list(pack.spec.notes),
-        "classes": {task.name: list(task.classes) for task in tasks},
+        "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
+        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
         "records": records,
         "retrieval": retrieval,
         "summary": summarise(records, session.probes[0]),
@@ -145,7 +146,7 @@ def _probe_run(
     model: Model,
     source: str,
     pack: Pack,
-    tasks: Sequence[Task],
+    tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     session: ProbeConfig,
 ) -> tuple[Records, Records]:
@@ -202,11 +203,11 @@ def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
     return [", ".join("/".join(place.parts[-num:]) for place in group) for group in listed]
 
 
-def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[Task], list[str]]:
+def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     """The tasks and modalities that ``session`` asks for; ValueError if the data lacks one."""
-    known = {task.name: task for task in pack.spec.tasks}
+    known = {task.name: task for task in pack.spec.all_tasks}
     if not known:
-        raise ValueError(f"dataset {pack.spec.name!r} has no labels: nothing to probe")
+        raise ValueError(f"dataset {pack.spec.name!r} has no labels and no values: nothing to probe")
     for name in session.tasks:
         if name not in known:
             raise unknown("task", name, known)

@@ -14,11 +14,13 @@ import torch
 from torch import Tensor
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import Classifier, fit_knn, fit_linear, fit_papers, spread_out
 from mvitac.evaluation.features import features
+from mvitac.evaluation.regressors import Regressor, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
+from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
 from mvitac.registry import unknown
 from mvitac.system.progress import tick
@@ -26,6 +28,8 @@ from mvitac.system.progress import tick
 PROBES = ("linear", "paper", "knn")
 """linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
 Probe = Literal["linear", "paper", "knn"]
+VALUE_PROBES = ("linear", "knn")
+"""Probes of tasks with values: ridge regression, alpha chosen on validation groups, and the mean of the 20 nearest."""
 MIN_GALLERY = 11
 """Least number of test groups for retrieval. With fewer, the first five are half of all groups or more."""
 
@@ -52,8 +56,8 @@ class ProbeSplit:
         return np.concatenate([self.train, self.val, self.test])
 
 
-def split_rows(pack: Pack, task: Task, modality: str = "none") -> ProbeSplit:
-    """Labelled rows of ``task`` by split.
+def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
+    """Labelled (or measured) rows of ``task`` by split.
 
     Without a validation split, a fifth of the training groups is set aside for it.
 
@@ -66,9 +70,9 @@ def split_rows(pack: Pack, task: Task, modality: str = "none") -> ProbeSplit:
         ValueError: If no labelled row is left in train or in test.
     """
     having = names_in(modality, pack)
-    labels = pack.column(f"label_{task.name}")
+    known = answered(pack, task)
     found = {s: pack.rows(s, only=task.only, having=having, by=task.split) for s in ("train", "val", "test")}
-    train, val, test = (rows[labels[rows] >= 0] for rows in found.values())
+    train, val, test = (rows[known[rows]] for rows in found.values())
     if not len(train) or not len(test):
         where = "train" if not len(train) else "test"
         lacking = f" with {' and '.join(having)}" if having else ""
@@ -77,7 +81,7 @@ def split_rows(pack: Pack, task: Task, modality: str = "none") -> ProbeSplit:
         groups = pack.column("group")[train].astype(str)
         names = np.random.default_rng(0).permutation(np.unique(groups))
         held = np.isin(groups, names[: max(1, len(names) // 5)])
-        if held.all() or len(set(labels[train[~held]])) < 2:  # a single group: no rows can be held out
+        if held.all() or _num_classes(pack, task, train[~held]) == 1:  # a single group: no rows can be held out
             return ProbeSplit(train, train, test)
         train, val = train[~held], train[held]
     return ProbeSplit(train, val, test)
@@ -88,16 +92,31 @@ def names_in(modality: str, pack: Pack) -> tuple[str, ...]:
     return tuple(pack.spec.modalities) if modality == "both" else () if modality == "none" else (modality,)
 
 
+def answered(pack: Pack, task: AnyTask) -> np.ndarray:
+    """bool [N]: which rows have a label, or a value of at least one target."""
+    if isinstance(task, ValueTask):
+        return ~np.isnan(pack.values(task)).all(1)
+    return labels_of(pack, task) >= 0
+
+
+def _num_classes(pack: Pack, task: AnyTask, rows: np.ndarray) -> int:
+    """Number of classes among ``rows``; 0 for values."""
+    return 0 if isinstance(task, ValueTask) else len(set(labels_of(pack, task)[rows]))
+
+
 def labels_of(pack: Pack, task: Task) -> np.ndarray:
     """Integer labels of all rows; -1 = unlabelled."""
     return pack.column(f"label_{task.name}").astype(int)
 
 
 def probe_features(
-    x: np.ndarray, pack: Pack, task: Task, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
+    x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
 ) -> dict[str, Any]:
     """Fit and score one probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one."""
     num = len(rows.fitted)
+    if isinstance(task, ValueTask):
+        predict, extra = fit_values(x[:num], pack, task, rows, kind)
+        return {**score_predictions(pack, task, rows.test, predict(x[num:])), **extra}
     predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
     return {**score_rows(pack, task, rows.test, predict(x[num:])), **extra}
 
@@ -124,8 +143,27 @@ def fit_probe(
     raise unknown("probe", kind, PROBES)
 
 
+def fit_values(
+    x: np.ndarray, pack: Pack, task: ValueTask, rows: ProbeSplit, kind: str
+) -> tuple[Regressor, dict[str, Any]]:
+    """Fit one probe of a task with values on features ``x`` of ``rows.fitted``.
+
+    Returns:
+        A function from features [N, D] to values [N, T], and what was chosen (alpha of ``linear``, which is ridge).
+    """
+    y = pack.values(task)[rows.fitted]
+    if kind == "linear":
+        predict, alphas = fit_ridge(x, y, len(rows.val))
+        return predict, {"alpha": alphas}
+    if kind == "curve":
+        return fit_curve(x, y, len(rows.val)), {}
+    if kind == "knn":
+        return fit_neighbours(x, y), {}
+    raise unknown("probe of values", kind, VALUE_PROBES)
+
+
 def probe_model(
-    model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str], probes: Sequence[str]
+    model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Probe every task and modality that ``model`` has an encoder for, and its own classifiers where it has some.
 
@@ -145,7 +183,7 @@ def probe_model(
         return np.concatenate(found, axis=1)
 
     records = probe_all(source, pack, tasks, modalities, probes, model.run.seed)
-    return records + _own_classifiers(model, pack, tasks, modalities)
+    return records + _own_classifiers(model, pack, with_classes(tasks), modalities)
 
 
 def _own_classifiers(
@@ -167,6 +205,16 @@ def _own_classifiers(
     return records
 
 
+def with_classes(tasks: Sequence[AnyTask]) -> list[Task]:
+    """The tasks that ask for a class."""
+    return [task for task in tasks if isinstance(task, Task)]
+
+
+def score_predictions(pack: Pack, task: ValueTask, rows: np.ndarray, predicted: np.ndarray) -> dict[str, Any]:
+    """Score values ``predicted`` [len(rows), T] of pack ``rows``."""
+    return score_values(pack.values(task)[rows], predicted, _group_numbers(pack, rows), task.targets)
+
+
 def score_rows(pack: Pack, task: Task, rows: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
     """Score class ``probabilities`` [len(rows), K] of pack ``rows``."""
     return score(labels_of(pack, task)[rows], probabilities, _group_numbers(pack, rows), len(task.classes))
@@ -180,26 +228,31 @@ def _group_numbers(pack: Pack, rows: np.ndarray) -> np.ndarray:
 def probe_all(
     source: FeatureSource,
     pack: Pack,
-    tasks: Sequence[Task],
+    tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     probes: Sequence[str],
     seed: int,
 ) -> list[dict[str, Any]]:
-    """Records of every (task, modality, probe) on the features of ``source``.
+    """Records of every (task, modality, probe) on the features of ``source``. The paper's probe has no values.
 
     Each fitted probe advances the ``progress.work`` that counts "probes".
     """
-    papers = _papers(source, pack, tasks, modalities, seed) if "paper" in probes else {}
+    papers = _papers(source, pack, with_classes(tasks), modalities, seed) if "paper" in probes else {}
     records = []
     for task in tasks:
         for modality in modalities:
             rows = split_rows(pack, task, modality)
             x = source(modality, rows.all)
-            for kind in probes:
+            for kind in probes_of(task, probes):
                 result = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
                 tick("probes")
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
+
+
+def probes_of(task: AnyTask, probes: Sequence[str]) -> list[str]:
+    """Those of ``probes`` that ``task`` can have."""
+    return [kind for kind in probes if isinstance(task, Task) or kind in VALUE_PROBES]
 
 
 def _papers(

@@ -6,11 +6,14 @@ these groups and the seeds: rows within a group are near-copies, groups are inde
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
+
+from mvitac.evaluation.value_scores import mean_r2
 
 NUM_DRAWS = 2000
 """Number of bootstrap draws of every interval."""
@@ -79,7 +82,7 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 
 def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
-    """Mean accuracy over runs and its 95 % interval, by a two-level bootstrap over test groups and seeds.
+    """Mean accuracy (R2 of values) over runs and its 95 % interval, by a two-level bootstrap over test groups and seeds.
 
     Groups are drawn, not rows, since rows of a group are near-copies. With a single group the interval is 0 to 1.
 
@@ -89,15 +92,29 @@ def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
     Returns:
         Mean, lower end and upper end, in 0 .. 1.
     """
-    sizes = np.array(records[0]["group_sizes"], float)
-    correct = np.array([r["group_correct"] for r in records], float)  # [S, G]
-    mean = float(correct.sum(1).mean() / sizes.sum())
-    if len(sizes) < 2:
-        return mean, 0.0, 1.0
+    num_groups = num_groups_of(records[0])
+    mean = float(np.mean([mean_of(record) for record in records]))
+    if num_groups < 2:
+        return mean, least_of(records[0]), 1.0
     rng = np.random.default_rng(0)
-    seeds = rng.integers(0, len(correct), (NUM_DRAWS, len(correct)))
-    low, high = np.percentile(_means(correct, sizes, seeds, _drawn_groups(len(sizes), rng)), [2.5, 97.5])
-    return mean, max(0.0, float(low)), min(1.0, float(high))
+    seeds = rng.integers(0, len(records), (NUM_DRAWS, len(records)))
+    low, high = np.percentile(_draws(records, mean, seeds, _drawn_groups(num_groups, rng)), [2.5, 97.5])
+    return mean, max(least_of(records[0]), float(low)), min(1.0, float(high))
+
+
+def mean_of(record: dict[str, Any]) -> float:
+    """The score that tables show: R2, mean over targets, or accuracy."""
+    return record["r2"] if "group_sums" in record else sum(record["group_correct"]) / sum(record["group_sizes"])
+
+
+def least_of(record: dict[str, Any]) -> float:
+    """The lowest possible score of the record's kind."""
+    return -math.inf if "group_sums" in record else 0.0
+
+
+def num_groups_of(record: dict[str, Any]) -> int:
+    """Number of test groups."""
+    return len(record["group_sums"]["n"][0]) if "group_sums" in record else len(record["group_sizes"])
 
 
 def paired_difference(
@@ -116,21 +133,26 @@ def paired_difference(
         Mean difference, lower and upper end of its 95 % interval, and the two-sided p: twice the fraction of draws on
         the other side of zero, at least ``least_p``. With a single group p is 1.
     """
-    sizes = np.array(ours[0]["group_sizes"], float)
-    assert all(list(r["group_sizes"]) == list(sizes) for r in (*ours, *theirs)), "scored on different test rows"
-    a, b = (np.array([r["group_correct"] for r in found], float) for found in (ours, theirs))  # [S, G]
-    mean = float((a.sum(1).mean() - b.sum(1).mean()) / sizes.sum())
-    if len(sizes) < 2:
+    num_groups = num_groups_of(ours[0])
+    assert len({_rows_of(record) for record in (*ours, *theirs)}) == 1, "scored on different test rows"
+    means = [float(np.mean([mean_of(record) for record in found])) for found in (ours, theirs)]
+    mean = means[0] - means[1]
+    if num_groups < 2:
         return mean, -1.0, 1.0, 1.0
     rng = np.random.default_rng(0)
-    drawn_a = rng.integers(0, len(a), (NUM_DRAWS, len(a)))
+    drawn_ours = rng.integers(0, len(ours), (NUM_DRAWS, len(ours)))
     together = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
-    drawn_b = drawn_a if together else rng.integers(0, len(b), (NUM_DRAWS, len(b)))
-    weights = _drawn_groups(len(sizes), rng)
-    draws = _means(a, sizes, drawn_a, weights) - _means(b, sizes, drawn_b, weights)
+    drawn_theirs = drawn_ours if together else rng.integers(0, len(theirs), (NUM_DRAWS, len(theirs)))
+    weights = _drawn_groups(num_groups, rng)
+    draws = _draws(ours, means[0], drawn_ours, weights) - _draws(theirs, means[1], drawn_theirs, weights)
     low, high = np.percentile(draws, [2.5, 97.5])
     tail = min(int((draws <= 0).sum()), int((draws >= 0).sum()))
-    return mean, float(low), float(high), min(1.0, max(2 * (tail + 1) / (NUM_DRAWS + 1), least_p(len(sizes))))
+    return mean, float(low), float(high), min(1.0, max(2 * (tail + 1) / (NUM_DRAWS + 1), least_p(num_groups)))
+
+
+def _rows_of(record: dict[str, Any]) -> str:
+    """Number of test rows of each group, and of each target."""
+    return str(record["group_sums"]["n"] if "group_sums" in record else list(record["group_sizes"]))
 
 
 def least_p(num_groups: int) -> float:
@@ -143,21 +165,33 @@ def _drawn_groups(num: int, rng: np.random.Generator) -> np.ndarray:
     return np.stack([np.bincount(g, minlength=num) for g in rng.integers(0, num, (NUM_DRAWS, num))])
 
 
-def _means(correct: np.ndarray, sizes: np.ndarray, seeds: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Accuracy of each draw, [draws], from ``correct`` [S, G] of ``sizes`` [G] rows.
+def _draws(records: Sequence[dict[str, Any]], mean: float, seeds: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Mean score over seeds of each draw, [draws].
 
     A bootstrap of n items underestimates their variance by the factor (n - 1) / n: little for 240 groups, a third for 3
     seeds. So each level's deviations are scaled by sqrt(n / (n - 1)) (Davison and Hinkley 1997, section 3.8).
+
+    Args:
+        records: One record per seed.
+        mean: Their mean score.
+        seeds: Seeds of each draw, [draws, S].
+        weights: How often each draw has each group, [draws, G].
     """
-    num_seeds, num_groups = correct.shape
-    per_seed = weights @ correct.T / np.maximum(weights @ sizes, 1)[:, None]  # [draws, S]
-    all_seeds = per_seed.mean(1)
+    per_seed = np.stack([_weighted(record, weights) for record in records], axis=1)  # [draws, S]
+    all_seeds, num_groups, num_seeds = per_seed.mean(1), weights.shape[1], len(records)
     over_seeds = np.take_along_axis(per_seed, seeds, axis=1).mean(1) - all_seeds
-    over_groups = all_seeds - correct.sum() / num_seeds / sizes.sum()
-    stretched = over_groups * (num_groups / (num_groups - 1)) ** 0.5
+    stretched = (all_seeds - mean) * (num_groups / (num_groups - 1)) ** 0.5
     if num_seeds > 1:
         stretched += over_seeds * (num_seeds / (num_seeds - 1)) ** 0.5
-    return correct.sum() / num_seeds / sizes.sum() + stretched
+    return mean + stretched
+
+
+def _weighted(record: dict[str, Any], weights: np.ndarray) -> np.ndarray:
+    """Score of one record in each draw, [draws]."""
+    if "group_sums" in record:
+        return mean_r2(record, weights)
+    sizes, correct = np.array(record["group_sizes"], float), np.array(record["group_correct"], float)
+    return weights @ correct / np.maximum(weights @ sizes, 1)
 
 
 Cell = tuple[str, str, str]

@@ -46,7 +46,7 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
     rows = [name for label in result["rows"] for name in (label, label + END_TO_END)]
     found = {source for _, _, source in records}
     own = sorted(found - set(rows) - set(CONTROLS))  # the data's own controls
-    controls = [*(s for s in CONTROLS[:-1] if s in found), *own, *(s for s in CONTROLS[-1:] if s in found)]
+    controls = [*(s for s in CONTROLS[:-2] if s in found), *own, *(s for s in CONTROLS[-2:] if s in found)]
     lines = []
     for source in (*rows, *controls):
         for modality in MODALITY_ORDER:

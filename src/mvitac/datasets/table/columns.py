@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mvitac.data.pack import SPLITS
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask, Target, Task, ValueTask
 from mvitac.datasets.table.image_columns import Background, Refs
 from mvitac.datasets.table.manifest import Manifest, number_of
 from mvitac.datasets.table.splits import BY_GROUP, assign_splits, check_leak, check_sides, check_split_names
@@ -87,6 +88,49 @@ def read_task(selected: Selection, column: str, counts: Sequence[bool]) -> tuple
     return Task(name=column, classes=tuple(classes)), [labels.get(cell, -1) for cell in cells]
 
 
+def value_task(text: str) -> ValueTask:
+    """Parse "force_n:N", or "pose=z_mm:mm,tilt_deg:deg" for a task with several targets."""
+    name, _, listed = text.rpartition("=")
+    pairs = [part.strip().rpartition(":") for part in listed.split(",")]
+    if not all(column and unit for column, _, unit in pairs) or len({column for column, _, _ in pairs}) < len(pairs):
+        raise ValueError(f"values {text!r}: write column:unit, or name=column:unit,column:unit, e.g. force_n:N")
+    if not name and len(pairs) > 1:
+        raise ValueError(f"values {text!r}: give several columns one name, e.g. pose={listed}")
+    targets = tuple(Target(name=column, unit=unit) for column, _, unit in pairs)
+    return ValueTask(name=name.strip() or targets[0].name, targets=targets)
+
+
+def read_values(
+    selected: Selection, tasks: Sequence[ValueTask], counts: Sequence[bool]
+) -> tuple[dict[str, list[float]], list[list[int]]]:
+    """Return the columns of numbers of ``tasks``, NaN where a cell is empty or its row does not count.
+
+    For each task also 0 for the rows with a value and -1 for the others, like the labels of a task with one class.
+    """
+    columns: dict[str, list[float]] = {}
+    for target in (target for task in tasks for target in task.targets):
+        columns[target.name] = [math.nan] * len(counts)
+        for i, (row, counted) in enumerate(zip(selected.rows, counts, strict=True)):
+            if counted and (cell := row[target.name]):
+                value = number_of(cell)
+                if value is None:
+                    raise ValueError(
+                        f"{selected.where} row {selected.numbers[i]}: {target.name} is {cell!r}: give a finite number in"
+                        f" {target.unit} without the unit, or leave the cell empty"
+                    )
+                columns[target.name][i] = value
+    for name, found in columns.items():
+        if len({value for value in found if value == value}) < 2:  # NaN differs from itself
+            raise ValueError(
+                f"{selected.where}: column {name!r} has fewer than two different values: nothing to predict"
+            )
+    known = [
+        [0 if any(not math.isnan(columns[t.name][i]) for t in task.targets) else -1 for i in range(len(counts))]
+        for task in tasks
+    ]
+    return columns, known
+
+
 def read_controls(
     selected: Selection, controls: dict[str, tuple[str, ...]], labels: Sequence[Sequence[int]]
 ) -> tuple[dict[str, list[float]], dict[str, tuple[str, ...]]]:
@@ -121,7 +165,7 @@ def split_rows(
     selected: Selection,
     column: str,
     grouping: Grouping,
-    tasks: Sequence[Task],
+    tasks: Sequence[AnyTask],
     labels: Sequence[Sequence[int]],
     *,
     shares: tuple[float, float],

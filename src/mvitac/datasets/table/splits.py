@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mvitac.data.pack import SPLITS
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask
 from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.registry import unknown
 
@@ -130,7 +130,7 @@ def check_leak(where: str, split: str, what: str, values: Sequence[str], splits:
 
 
 def check_sides(
-    where: str, split: str, splits: Sequence[str], tasks: Sequence[Task], targets: Sequence[Sequence[int]], num: int
+    where: str, split: str, splits: Sequence[str], tasks: Sequence[AnyTask], targets: Sequence[Sequence[int]], num: int
 ) -> None:
     """Check that there are rows to pre-train on and, for each task, labelled rows in train and test."""
     counts = Counter(splits)

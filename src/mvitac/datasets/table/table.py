@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,15 @@ import tyro
 from mvitac.data.source import Lost, Sample, Source, one_stamp
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.datasets.table.columns import Grouping, Selection, read_controls, read_task, split_rows
+from mvitac.datasets.table.columns import (
+    Grouping,
+    Selection,
+    read_controls,
+    read_task,
+    read_values,
+    split_rows,
+    value_task,
+)
 from mvitac.datasets.table.image_columns import (
     Background,
     Refs,
@@ -30,7 +38,7 @@ from mvitac.datasets.table.image_columns import (
 from mvitac.datasets.table.manifest import Condition, Manifest
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP, group_by_video
-from mvitac.registry import to_json
+from mvitac.registry import LATER, to_json
 from mvitac.system.files import digest
 
 VERSION = 3
@@ -58,6 +66,9 @@ class RowsConfig(DatasetConfig, ABC):
     "left" and "right"; "" = none."""
     labels: tuple[str, ...] = ()
     """Columns that become tasks. Classes are the sorted distinct values; an empty cell or NaN is unlabelled."""
+    values: tuple[str, ...] = field(default=(), metadata=LATER)
+    """Columns of numbers to predict, as column:unit, e.g. force_n:N; or several as one task: pose=z_mm:mm,tilt_deg:deg.
+    An empty cell or NaN is not measured."""
     group: str | None = None
     """Column of the group (object, recording), the unit of splits and confidence intervals; default: "group" if it
     exists, else the video of the row's frame, else each row is its own group."""
@@ -113,6 +124,8 @@ class RowsConfig(DatasetConfig, ABC):
             raise ValueError("a background is only used with subtract-background: add that option, or leave this out")
         for text in (*self.only, *self.label_only, *self.no_contact):
             Condition.parse(text)
+        for text in self.values:
+            value_task(text)
 
     def _check_columns(self) -> None:
         if len(self.touch) > 2:
@@ -160,8 +173,10 @@ class Rows(Source):
         self._split = config.split or ("split" if "split" in manifest.columns else BY_GROUP)
         self._sensor = config.sensor or ("sensor" if "sensor" in manifest.columns else None)
         label_columns = config.labels or manifest.labels
+        value_tasks = [value_task(text) for text in config.values]
+        targets = [target.name for task in value_tasks for target in task.targets]
         label_conditions = [Condition.parse(text) for text in config.label_only]
-        _check_columns(config, manifest, [*label_columns, self._group, self._split, self._sensor])
+        _check_columns(config, manifest, [*label_columns, *targets, self._group, self._split, self._sensor])
 
         selected = self._select(manifest)
         columns = (self._vision, self._touch, selected.numbers)
@@ -171,7 +186,8 @@ class Rows(Source):
         grouping = self._grouping(selected)
         counts = [all(condition.holds(row) for condition in label_conditions) for row in selected.rows]
         read = [read_task(selected, column, counts) for column in label_columns]
-        tasks, labels = [task for task, _ in read], [label for _, label in read]
+        values, measured = read_values(selected, value_tasks, counts)
+        tasks, labels = [*(task for task, _ in read), *value_tasks], [*(label for _, label in read), *measured]
         splits = split_rows(
             selected,
             self._split,
@@ -186,7 +202,7 @@ class Rows(Source):
 
         own: dict[str, Sequence[Any]] = {"id": selected.ids(), "group": grouping.groups}
         own |= {"touch_group": grouping.touch_groups, "split": splits}
-        own |= {f"label_{task.name}": label for task, label in read}
+        own |= {f"label_{task.name}": label for task, label in read} | values
         own |= {f"has_{modality}": [not lacks for lacks in lacking] for modality, lacking in missing.items()}
         self._rows = self._make_rows(selected, own, extra)
 
@@ -201,7 +217,8 @@ class Rows(Source):
             name=self._title,
             vision_channels=3 if self._vision else 0,
             touch_channels=3 * len(self._touch),
-            tasks=tuple(tasks),
+            tasks=tuple(task for task, _ in read),
+            values=tuple(value_tasks),
             group_by=grouping.group_by,
             controls=controls,
             licence=config.licence,

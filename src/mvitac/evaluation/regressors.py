@@ -1,0 +1,73 @@
+"""Regressors fitted on frozen features: ridge, nearest neighbours, and a curve through a few columns.
+
+Shapes: features [N, D], values [N, T] in the task's units, NaN = not measured. Each target is fitted on the rows that have
+it. A fitted regressor is a function from features to values [N, T].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from sklearn.linear_model import RidgeCV
+from sklearn.model_selection import PredefinedSplit
+from sklearn.neighbors import KNeighborsRegressor
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import SplineTransformer, StandardScaler
+from threadpoolctl import threadpool_limits
+
+Regressor = Callable[[np.ndarray], np.ndarray]
+
+ALPHAS = tuple(10.0**k for k in range(-1, 6))
+"""Candidate strengths of ridge regularisation, on standardised features and targets."""
+NEIGHBOURS = 20
+
+
+def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Regressor, list[float]]:
+    """Fit ridge regression on standardised features and targets.
+
+    Each target's alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
+
+    Returns:
+        The regressor and the chosen alpha of each target.
+    """
+    fitted = _fit_each(x, y, num_val, lambda: [])
+    return _joined(fitted), [float(pipeline[-1].alpha_) for pipeline, _, _ in fitted]
+
+
+def fit_curve(x: np.ndarray, y: np.ndarray, num_val: int) -> Regressor:
+    """Fit a smooth curve: ridge on cubic splines of each column of ``x``, for controls of a few columns."""
+    return _joined(_fit_each(x, y, num_val, lambda: [SplineTransformer(n_knots=6, extrapolation="linear")]))
+
+
+def fit_neighbours(x: np.ndarray, y: np.ndarray) -> Regressor:
+    """Mean value of the 20 nearest rows by cosine."""
+    fitted = []
+    for target in y.T:
+        have = ~np.isnan(target)
+        model = KNeighborsRegressor(n_neighbors=min(NEIGHBOURS, int(have.sum())), metric="cosine")
+        fitted.append((model.fit(x[have], target[have]), 0.0, 1.0))
+    return _joined(fitted)
+
+
+Fitted = tuple[Any, float, float]
+"""A scikit-learn regressor of one standardised target, and the target's mean and standard deviation."""
+
+
+def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, basis: Callable[[], list[Any]]) -> list[Fitted]:
+    held = np.where(np.arange(len(x)) < len(x) - num_val, -1, 0)  # -1: always fitted on, 0: held out
+    fitted = []
+    for target in y.T:
+        have = ~np.isnan(target)
+        mean, std = target[have].mean(), target[have].std() + 1e-12
+        both = len(set(held[have])) == 2
+        ridge = RidgeCV(ALPHAS, cv=PredefinedSplit(held[have]) if both else None)
+        with threadpool_limits(1):  # as for logistic regression: threads wait longer than they compute
+            pipeline = make_pipeline(StandardScaler(), *basis(), ridge).fit(x[have], (target[have] - mean) / std)
+        fitted.append((pipeline, mean, std))
+    return fitted
+
+
+def _joined(fitted: list[Fitted]) -> Regressor:
+    return lambda z: np.stack([model.predict(z) * std + mean for model, mean, std in fitted], axis=1)

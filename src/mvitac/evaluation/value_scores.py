@@ -1,0 +1,90 @@
+"""Scores of predicted values: R2, mean absolute error and root mean squared error in the target's unit.
+
+Like accuracy, R2 is computed from sums over each test group, so that intervals can draw groups again (``scores``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mvitac.data.spec import Target
+
+SUMS = ("n", "error", "squared_error", "value", "squared_value")
+"""What a record keeps of each test group and target: [T][G] sums over its measured rows."""
+NUM_RANGES = 8
+NUM_POINTS = 200
+
+
+def score_values(y: np.ndarray, predicted: np.ndarray, groups: np.ndarray, targets: Sequence[Target]) -> dict[str, Any]:
+    """Score predictions [N, T] against measured values ``y`` [N, T] in the units of ``targets``; NaN = not measured.
+
+    Args:
+        y: Measured values.
+        predicted: Predicted values.
+        groups: Group number of each row, for intervals.
+        targets: Names and units.
+
+    Returns:
+        "r2" (mean over targets), "targets" (R2, MAE and RMSE of each, with "ranges": error by range of the true value),
+        "group_sums" (``SUMS``), and "points": up to 200 pairs of true and predicted value per target, drawn at random.
+    """
+    num_groups = int(groups.max()) + 1
+    sums: dict[str, list[list[float]]] = {name: [] for name in SUMS}
+    scored, points = [], []
+    drawn = np.sort(np.random.default_rng(0).permutation(len(y))[:NUM_POINTS])
+    for t, target in enumerate(targets):
+        have = ~np.isnan(y[:, t])
+        true, error, group = y[have, t], predicted[have, t] - y[have, t], groups[have]
+        terms = (np.ones(len(true)), abs(error), error**2, true, true**2)
+        for name, term in zip(SUMS, terms, strict=True):
+            sums[name].append(np.bincount(group, weights=term, minlength=num_groups).tolist())
+        scored.append(
+            {
+                "name": target.name,
+                "unit": target.unit,
+                "r2": float(r_squared({name: np.array(sums[name][-1]).sum() for name in SUMS})),
+                "mae": float(abs(error).mean()),
+                "rmse": float((error**2).mean() ** 0.5),
+                "ranges": error_by_range(true, error),
+            }
+        )
+        shown = drawn[have[drawn]]
+        points.append([[float(f"{v:.5g}") for v in (y[i, t], predicted[i, t])] for i in shown])
+    return {
+        "r2": float(np.mean([each["r2"] for each in scored])),
+        "targets": scored,
+        "num_test": int((~np.isnan(y)).any(1).sum()),
+        "group_sums": sums,
+        "points": points,
+    }
+
+
+def r_squared(sums: dict[str, Any]) -> Any:
+    """R2 from ``SUMS`` (numbers or arrays): 1 - squared error / squared deviation from the mean of the same rows."""
+    spread = sums["squared_value"] - sums["value"] ** 2 / np.maximum(sums["n"], 1)
+    return 1 - sums["squared_error"] / np.maximum(spread, 1e-12)
+
+
+def error_by_range(true: np.ndarray, error: np.ndarray) -> list[dict[str, float]]:
+    """Mean absolute error, bias and count in up to 8 ranges of the true value, each with as many rows."""
+    edges = np.unique(np.quantile(true, np.linspace(0, 1, NUM_RANGES + 1)))
+    place = np.clip(np.searchsorted(edges, true, side="right") - 1, 0, max(0, len(edges) - 2))
+    return [
+        {
+            "low": float(edges[k]),
+            "high": float(edges[min(k + 1, len(edges) - 1)]),
+            "mae": float(abs(error[place == k]).mean()),
+            "bias": float(error[place == k].mean()),
+            "n": int((place == k).sum()),
+        }
+        for k in np.unique(place)
+    ]
+
+
+def mean_r2(record: dict[str, Any], weights: np.ndarray) -> np.ndarray:
+    """R2, mean over targets, of each draw [draws] in which group g counts ``weights`` [draws, G] times."""
+    sums = {name: weights @ np.array(record["group_sums"][name], float).T for name in SUMS}  # [draws, T]
+    return r_squared(sums).mean(-1)
