@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from mvitac.data.jpeg import Lazy
 from mvitac.data.pack import Images, Pack
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.registry import unknown
 from mvitac.system.files import brief
 
@@ -41,13 +41,14 @@ class JoinedPack(Pack):
         self.spec = replace(
             learn.spec,
             name=f"{score.path.name}, probes learned on {learn.path.name}",
-            tasks=tuple(task for task, _ in tasks),
+            tasks=tuple(task for task, _ in tasks if isinstance(task, Task)),
+            values=tuple(task for task, _ in tasks if isinstance(task, ValueTask)),
             controls={name: given for name, given in learn.spec.controls.items() if theirs.get(name) == given},
             notes=tuple(dict.fromkeys((*learn.spec.notes, *score.spec.notes))),
         )
         self.images: dict[str, Images] = {m: _Both(learn.images[m], score.images[m]) for m in self.spec.modalities}
         group = self.column("group").astype(str)
-        for task in self.spec.tasks:
+        for task in self.spec.all_tasks:
             seen = np.isin(self.column(task.split), ["train", "val"])
             shared = np.intersect1d(group[seen], group[self.rows("test", by=task.split)])
             if len(shared):
@@ -68,17 +69,27 @@ def _check_shapes(learn: Pack, score: Pack) -> None:
             )
 
 
-def _common_tasks(learn: Pack, score: Pack) -> list[tuple[Task, Task]]:
+def _common_tasks(learn: Pack, score: Pack) -> list[tuple[AnyTask, AnyTask]]:
     """Return the tasks that both packs have, as defined by each."""
-    known = {task.name: task for task in learn.spec.tasks}
-    tasks = [(known[task.name], task) for task in score.spec.tasks if task.name in known]
+    known = {task.name: task for task in learn.spec.all_tasks}
+    tasks = [(known[task.name], task) for task in score.spec.all_tasks if task.name in known]
     if not tasks:
-        names = [", ".join(task.name for task in pack.spec.tasks) or "none" for pack in (learn, score)]
+        names = [", ".join(task.name for task in pack.spec.all_tasks) or "none" for pack in (learn, score)]
         raise ValueError(f"no task is in both packs: {learn.path} has {names[0]}, {score.path} {names[1]}")
     for ours, theirs in tasks:
         if (ours.only, ours.split) != (theirs.only, theirs.split):
             raise ValueError(f"task {ours.name!r} is about other rows or split otherwise in {score.path}")
+        if isinstance(ours, ValueTask) or isinstance(theirs, ValueTask):
+            asked = [_targets(task) for task in (ours, theirs)]
+            if asked[0] != asked[1]:
+                raise ValueError(f"task {ours.name!r} is {asked[0]} in {learn.path} and {asked[1]} in {score.path}")
     return tasks
+
+
+def _targets(task: AnyTask) -> str:
+    if isinstance(task, Task):
+        return "classes"
+    return ", ".join(f"{target.name} in {target.unit}" for target in task.targets)
 
 
 class _Both(Lazy):
@@ -96,7 +107,7 @@ class _Both(Lazy):
         return images
 
 
-def _side(pack: Pack, tasks: list[tuple[Task, Task]], splits: set[str], name: str, keep: set[str]) -> pa.Table:
+def _side(pack: Pack, tasks: list[tuple[AnyTask, AnyTask]], splits: set[str], name: str, keep: set[str]) -> pa.Table:
     """Return the columns of ``pack`` that probes read.
 
     Rows of splits other than ``keep`` get the split "hidden" in the columns ``splits``. Labels are numbered as in the first
@@ -106,6 +117,7 @@ def _side(pack: Pack, tasks: list[tuple[Task, Task]], splits: set[str], name: st
         "id",
         "group",
         *(c for task, _ in tasks for c in task.only),
+        *(target.name for task, _ in tasks if isinstance(task, ValueTask) for target in task.targets),
         *(c for cs in pack.spec.controls.values() for c in cs),
     }
     columns = {n: pack.table.column(n) for n in pack.table.column_names if n in read}
@@ -115,7 +127,7 @@ def _side(pack: Pack, tasks: list[tuple[Task, Task]], splits: set[str], name: st
     for modality in pack.spec.modalities:
         columns[f"has_{modality}"] = pa.array(pack.has(modality))
     own = {task.name: task for task in pack.spec.tasks}
-    for task, _ in tasks:
+    for task in (task for task, _ in tasks if isinstance(task, Task)):
         numbers = [task.classes.index(c) if c in task.classes else -2 for c in own[task.name].classes]
         labels = np.array([*numbers, -1])[pack.column(f"label_{task.name}").astype(int)]  # -1 (no label) is the last
         if (labels == -2).any():

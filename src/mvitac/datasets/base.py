@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from mvitac.data.build import build, check_request, stored_as
@@ -59,7 +59,10 @@ class DatasetConfig(Registered, ABC):
         key = digest({"fingerprint": source.fingerprint(), "size": self.size, **kept, **changed})[:16]
         path = cache_dir() / "packs" / f"{self.name}-{key}"
         if path.exists():
-            return Pack(path)
+            pack = Pack(path)
+            # A pack from before its reader named values has their columns already.
+            pack.spec = replace(pack.spec, values=source.spec().values)
+            return pack
         try:
             check_place(path)
         except ValueError as error:

@@ -13,7 +13,7 @@ import tyro
 
 from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
-from mvitac.data.spec import DataSpec, Task
+from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.sim import grasps, materials
 
@@ -81,6 +81,7 @@ class Materials(Source):
                 Task(name="soft", classes=("hard", "soft")),
                 Task(name="rough", classes=("smooth", "rough")),
             ),
+            values=(ValueTask(name="force", targets=(Target(name="force_n", unit="N"),)),),
             group_by="instance",
             licence=LICENCE,
             source=f"mvitac.sim.materials version {materials.VERSION}",
@@ -148,6 +149,13 @@ class Grasps(Source):
             touch_channels=6,
             # 'after' shows the outcome, so only 'during' (fingers closed, before the lift) has the label.
             tasks=(Task(name="success", classes=("failure", "success"), only={"phase": "during"}),),
+            values=(
+                ValueTask(
+                    name="normal force",
+                    targets=tuple(Target(name=f"normal_{side}_n", unit="N") for side in ("left", "right")),
+                    only={"phase": "during"},
+                ),
+            ),
             group_by="object",
             controls={"contact only": ("contact_left", "contact_right")},
             licence=LICENCE,

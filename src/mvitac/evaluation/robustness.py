@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import ProbeSplit, fit_probe, names_in, probe_features, score_rows, split_rows
+from mvitac.evaluation.probe import ProbeSplit, fit_probe, names_in, probe_features, score_rows, split_rows, with_classes
 from mvitac.model import Model
 
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}
@@ -60,14 +60,14 @@ class _Case:
         return probe_features(self.joined()[keep], self.pack, self.task, rows, "linear", self.seed)
 
 
-def stress(model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]) -> list[dict[str, Any]]:
-    """Records of every stress for each task and modality that ``model`` has an encoder for.
+def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> list[dict[str, Any]]:
+    """Records of every stress for each task with classes and each modality that ``model`` has an encoder for.
 
     Rows and noise are drawn alike for all models of one seed, so that differences are paired.
     """
     seed, records = model.run.seed, []
     noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
-    for task, modality in ((task, modality) for task in tasks for modality in modalities):
+    for task, modality in product(with_classes(tasks), modalities):
         names = names_in(modality, pack)
         if not set(names) <= set(model.encoders):
             continue

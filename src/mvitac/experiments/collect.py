@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work, seconds_of
@@ -175,7 +175,7 @@ def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Rec
     return records, retrieval
 
 
-def leaks(pack: Pack, tasks: Sequence[Task]) -> str:
+def leaks(pack: Pack, tasks: Sequence[AnyTask]) -> str:
     """Describe leaks of each split that ``tasks`` use: groups in both train and test, and test rows used in pre-training.
 
     Returns an empty string if there is none.

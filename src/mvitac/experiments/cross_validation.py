@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.evaluation.probe import MIN_GALLERY
 from mvitac.evaluation.scores import pool
@@ -48,7 +48,7 @@ def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "au
     return works
 
 
-def _check_tested_once(fold: str, pack: Pack, tasks: Sequence[Task], tested: dict[tuple[str, str], str]) -> None:
+def _check_tested_once(fold: str, pack: Pack, tasks: Sequence[AnyTask], tested: dict[tuple[str, str], str]) -> None:
     """Add the test groups of ``fold`` to ``tested``: (split column, group) -> fold."""
     groups = pack.column("group").astype(str)
     for column in dict.fromkeys(("split", *(task.split for task in tasks))):
