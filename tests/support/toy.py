@@ -16,9 +16,13 @@ import pyarrow as pa
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
-from mvitac.data.spec import DataSpec, Task
+from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 
 NUM_CLASSES = 3
+LIGHT = (
+    ValueTask(name="light", targets=(Target(name="level", unit="levels"),)),
+    ValueTask(name="both", targets=(Target(name="level", unit="levels"), Target(name="weight", unit="N"))),
+)
 
 
 @dataclass
@@ -27,6 +31,8 @@ class Toy(Source):
     vision_channels: int = 3
     touch_channels: int = 3
     damaged: tuple[int, ...] = ()
+    values: bool = False
+    """Also two numbers: the image's brightness in levels, and a weight in N that every third row lacks."""
     extra: dict[str, Any] = field(default_factory=dict)
 
     def spec(self) -> DataSpec:
@@ -38,6 +44,7 @@ class Toy(Source):
                 Task(name="pattern", classes=("columns", "rows", "checks")),
                 Task(name="bright", classes=("dark", "light")),
             ),
+            values=LIGHT if self.values else (),
             group_by="instance",
             controls={"noise only": ("noise",)},
             licence="none",
@@ -76,6 +83,9 @@ class Toy(Source):
             "label_bright": bright,
             "noise": float(rng.normal()),
         }
+        if self.values:
+            columns["level"] = float(90 + 60 * bright + rng.normal())
+            columns["weight"] = float("nan") if item % 3 == 0 else category + 0.1 * float(rng.normal())
         return [Sample(vision=image(self.vision_channels), touch=image(self.touch_channels), columns=columns)]
 
 

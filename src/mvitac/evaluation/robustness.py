@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,15 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import ProbeSplit, fit_probe, names_in, probe_features, score_rows, split_rows, with_classes
+from mvitac.evaluation.probe import (
+    ProbeSplit,
+    fit_probe,
+    names_in,
+    probe_features,
+    score_rows,
+    split_rows,
+    with_classes,
+)
 from mvitac.model import Model
 
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}

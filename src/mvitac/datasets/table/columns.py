@@ -78,7 +78,7 @@ def read_task(selected: Selection, column: str, counts: Sequence[bool]) -> tuple
     if len(names) == labelled >= 10:
         raise ValueError(
             f"{selected.where}: column {column!r} has another value in each of its {labelled} rows (e.g."
-            f" {min(names)!r}): classes must repeat; is it a measurement or a name?"
+            f" {min(names)!r}): classes must repeat; a measurement is named with --values {column}:UNIT"
         )
     if all(number_of(name) is not None for name in names):
         classes = sorted(names, key=lambda name: (float(name), name))

@@ -1,0 +1,227 @@
+"""Tasks with values: numbers in the table, ridge probes, and scores in the unit."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from sklearn.metrics import mean_absolute_error, r2_score, root_mean_squared_error
+
+from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.data.spec import DataSpec, Target, Task, ValueTask
+from mvitac.datasets.folder import FolderConfig
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.probe import split_rows
+from mvitac.evaluation.regressors import fit_curve, fit_ridge
+from mvitac.evaluation.scores import interval, paired_difference
+from mvitac.evaluation.value_scores import mean_r2, score_values
+from mvitac.recipes import recipe
+from mvitac.training.loop import train
+from support.toy import Toy
+
+NEWTON = (Target(name="force_n", unit="N"),)
+POSE = (Target(name="z_mm", unit="mm"), Target(name="tilt_deg", unit="deg"))
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    path = tmp_path_factory.mktemp("measured") / "pack"
+    return build(Toy(values=True), path, size=32, workers=1, quiet=True)
+
+
+# -- scores -----------------------------------------------------------------------------------------------------------
+
+
+def drawn(num: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    y = rng.normal(3, 2, (num, 2))
+    return y, y + rng.normal(0, (0.5, 1.5), (num, 2)), rng.integers(0, 12, num)
+
+
+def test_scores_are_those_of_scikit_learn_over_the_rows_that_were_measured() -> None:
+    y, guess, groups = drawn()
+    y[::3, 1] = np.nan
+    record = score_values(y, guess, groups, POSE)
+    for t, found in enumerate(record["targets"]):
+        have = ~np.isnan(y[:, t])
+        assert found["r2"] == pytest.approx(r2_score(y[have, t], guess[have, t]))
+        assert found["mae"] == pytest.approx(mean_absolute_error(y[have, t], guess[have, t]))
+        assert found["rmse"] == pytest.approx(root_mean_squared_error(y[have, t], guess[have, t]))
+        assert sum(part["n"] for part in found["ranges"]) == have.sum()
+    assert record["r2"] == pytest.approx(np.mean([found["r2"] for found in record["targets"]]))
+    assert record["num_test"] == len(y)
+    json.dumps(record, allow_nan=False)
+
+
+def test_r2_of_a_draw_is_that_of_its_rows() -> None:
+    y, guess, groups = drawn()
+    record = score_values(y, guess, groups, POSE)
+    weights = np.random.default_rng(1).integers(0, 3, (5, 12))
+    for found, times in zip(mean_r2(record, weights), weights, strict=True):
+        rows = np.repeat(np.arange(len(y)), times[groups])
+        assert found == pytest.approx(r2_score(y[rows], guess[rows]))
+
+
+def test_the_interval_of_r2_holds_it_and_a_worse_method_is_told_apart() -> None:
+    y, guess, groups = drawn(600)
+    noise = np.random.default_rng(2).normal(0, 1, y.shape)
+    good, bad = ({**score_values(y, g, groups, POSE), "seed": 0} for g in (guess, guess + noise))
+    mean, low, high = interval([good])
+    assert low < mean < high < 1
+    assert mean == pytest.approx(r2_score(y, guess))
+    difference, low, high, p = paired_difference([good], [bad])
+    assert 0 < low < difference < high and p < 0.05
+
+
+def test_error_by_range_finds_where_predictions_are_wrong() -> None:
+    y = np.linspace(0, 8, 400)[:, None]
+    record = score_values(y, np.minimum(y, 6), np.arange(400) % 4, NEWTON)  # saturates above 6 N
+    ranges = record["targets"][0]["ranges"]
+    assert all(part["mae"] == 0 for part in ranges if part["high"] < 6)
+    assert ranges[-1]["bias"] < -1.3 and ranges[-1]["high"] == pytest.approx(8)
+
+
+# -- probes -----------------------------------------------------------------------------------------------------------
+
+
+def test_ridge_finds_a_linear_relation_in_any_unit_and_skips_what_was_not_measured() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(0, (1, 100, 0.01), (400, 3))
+    y = x @ np.array([[2000.0, 0.001], [3.0, 0], [0, 0.4]]) + [1e5, 0]
+    y[:200, 1] = np.nan
+    predict, alphas = fit_ridge(x[:300], y[:300], 60)
+    assert len(alphas) == 2
+    assert r2_score(y[300:], predict(x[300:])) > 0.999
+
+
+def test_alpha_is_chosen_on_the_held_out_rows() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(80, 60))
+    y = x[:, :1] + rng.normal(0, 3, (80, 1))  # noise: weak regularisation overfits
+    memorised = np.concatenate([x[:60], x[:20]]), np.concatenate([y[:60], y[:20]])  # held out rows that were learned
+    assert fit_ridge(x, y, 20)[1][0] > fit_ridge(*memorised, 20)[1][0]
+
+
+def test_a_control_may_be_a_curve() -> None:
+    x = np.linspace(-1, 1, 200)[:, None]
+    y = x**2
+    assert r2_score(y, fit_curve(x, y, 50)(x)) > 0.99
+    assert r2_score(y, fit_ridge(x, y, 50)[0](x)) < 0.1
+
+
+def test_rows_of_a_task_have_at_least_one_of_its_values(measured: Pack) -> None:
+    light, both = measured.spec.values
+    only_weight = replace(both, targets=both.targets[1:])
+    assert len(split_rows(measured, light).all) == len(split_rows(measured, both).all) == measured.num
+    assert len(split_rows(measured, only_weight).all) == measured.num * 2 // 3
+
+
+def test_probes_of_classes_and_values_side_by_side(measured: Pack, tmp_path: Path) -> None:
+    run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
+    result = probe_runs([train(run, tmp_path / "run", quiet=True)], ProbeConfig(probes=("linear", "paper", "knn")))
+    found = {(r["task"], r["source"], r["modality"], r["probe"]): r for r in result["records"]}
+    assert result["targets"]["both"] == [{"name": "level", "unit": "levels"}, {"name": "weight", "unit": "N"}]
+    assert found["light", "mvitac", "touch", "linear"]["r2"] > 0.4  # brightness survives any trunk
+    assert found["light", "pixels", "touch", "linear"]["r2"] > 0.9
+    assert found["light", "mean", "none", "linear"]["r2"] <= 0
+    assert ("light", "noise only", "none", "linear") in found
+    assert ("light", "mvitac", "touch", "knn") in found and ("light", "mvitac", "touch", "paper") not in found
+    assert ("pattern", "mvitac", "touch", "paper") in found and ("pattern", "mean", "none", "linear") not in found
+    assert result["summary"]["light"]["touch"]["mvitac"]["mean"] == found["light", "mvitac", "touch", "linear"]["r2"]
+
+
+# -- data -------------------------------------------------------------------------------------------------------------
+
+
+def manifest(root: Path, cells: list[str], column: str = "force_n") -> Path:
+    rows = []
+    for i, cell in enumerate(cells):
+        Image.new("RGB", (16, 16), (i, i, i)).save(root / f"{i}.png")
+        rows.append({"touch": f"{i}.png", "group": f"g{i}", column: cell, "z_mm": str(i / 2)})
+    with (file := root / "pairs.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return file
+
+
+def test_columns_of_a_table_become_values(tmp_path: Path) -> None:
+    file = manifest(tmp_path, [str(i / 4) if i % 5 else "" for i in range(20)])
+    config = FolderConfig(path=file, values=("force_n:N", "pose=z_mm:mm,force_n:N"), size=16)
+    pack = build(config.source(), tmp_path / "pack", size=16, workers=1, quiet=True)
+    force, pose = pack.spec.values
+    assert force == ValueTask(name="force_n", targets=NEWTON)
+    assert [target.name for target in pose.targets] == ["z_mm", "force_n"]
+    values = pack.values(pose)
+    assert np.array_equal(np.isnan(values[:, 1]), np.arange(20) % 5 == 0)
+    assert np.array_equal(values[:, 0], np.arange(20) / 2)
+    assert Pack(pack.path).spec == pack.spec
+    assert set(pack.column("split")) == {"train", "val", "test"}
+
+
+def test_a_pack_without_values_has_the_digest_it_had(tmp_path: Path) -> None:
+    file = manifest(tmp_path, ["1"] * 8)
+    assert "values" not in json.dumps(FolderConfig(path=file).source().fingerprint())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("force_n", "write column:unit"),
+        ("force_n:", "write column:unit"),
+        ("force_n:N,z_mm:mm", "give several columns one name"),
+        ("pose=z_mm:mm,z_mm:mm", "write column:unit"),
+    ],
+)
+def test_values_are_written_with_their_unit(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FolderConfig(values=(text,))
+
+
+@pytest.mark.parametrize(("cell", "message"), [("3 N", "'3 N': give a finite number in N"), ("inf", "'inf'")])
+def test_a_value_is_a_finite_number(tmp_path: Path, cell: str, message: str) -> None:
+    file = manifest(tmp_path, ["1", "2", cell, "3"])
+    with pytest.raises(ValueError, match=message):
+        FolderConfig(path=file, values=("force_n:N",)).source()
+
+
+def test_a_column_that_never_changes_cannot_be_predicted(tmp_path: Path) -> None:
+    file = manifest(tmp_path, ["1"] * 8)
+    with pytest.raises(ValueError, match="fewer than two different values"):
+        FolderConfig(path=file, values=("force_n:N",)).source()
+
+
+def test_a_name_is_one_task_and_a_column_has_one_unit() -> None:
+    kept = {"name": "d", "vision_channels": 0, "touch_channels": 3, "group_by": "g", "licence": "", "source": ""}
+    task = Task(name="force_n", classes=("a", "b"))
+    with pytest.raises(ValueError, match="'force_n' occurs twice"):
+        DataSpec(tasks=(task,), values=(ValueTask(name="force_n", targets=NEWTON),), **kept)
+    other = ValueTask(name="weight", targets=(Target(name="force_n", unit="mN"),))
+    with pytest.raises(ValueError, match="two units, N and mN"):
+        DataSpec(tasks=(), values=(ValueTask(name="force_n", targets=NEWTON), other), **kept)
+
+
+def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:
+    other = Pack(measured.path)
+    task = replace(other.spec.values[0], targets=(Target(name="level", unit="%"),))
+    other.spec = replace(other.spec, values=(task,))
+    with pytest.raises(ValueError, match=r"level in levels in .* and level in %"):
+        JoinedPack(measured, other)
+
+
+def test_a_pack_refuses_infinite_values(tmp_path: Path) -> None:
+    class Broken(Toy):
+        def read(self, item: int) -> list:
+            (made,) = super().read(item)
+            return [replace(made, columns={**made.columns, "level": float("inf") if item == 5 else 1.0})]
+
+    with pytest.raises(ValueError, match="level is inf: a value is a finite number"):
+        build(Broken(num=12, values=True), tmp_path / "pack", size=32, workers=1, quiet=True)
