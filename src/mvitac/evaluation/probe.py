@@ -95,7 +95,7 @@ def names_in(modality: str, pack: Pack) -> tuple[str, ...]:
 def answered(pack: Pack, task: AnyTask) -> np.ndarray:
     """bool [N]: which rows have a label, or a value of at least one target."""
     if isinstance(task, ValueTask):
-        return np.isfinite(pack.values(task)).any(axis=1)
+        return np.asarray(np.isfinite(pack.values(task)).any(axis=1))
     return labels_of(pack, task) >= 0
 
 
