@@ -186,6 +186,12 @@ class Run:
                 f"whole images of {self.augment.eval_size} px were stored at {stored_size} px:"
                 f" give --augment.whole {stored_size} or less, or pack the data at a larger --data.size"
             )
+        if spec.window.frames > 1 and (
+            self.augment.touch.independent_sensors or self.augment.vision.independent_sensors
+        ):
+            raise ValueError(
+                "independent_sensors would move the frames of a window apart: leave it out, or give frames 1"
+            )
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from mvitac.registry import LATER
 
@@ -50,6 +52,34 @@ AnyTask = Task | ValueTask
 
 
 @dataclass(frozen=True, kw_only=True)
+class Window:
+    """Which frames of a touch one row shows (``data/windows.py``)."""
+
+    frames: int = 1
+    stride: float = 1.0
+    """Distance of two frames, in units of the column ``order``."""
+    of: tuple[str, ...] = ("touch",)
+    """Modalities that have windows; the others show the current frame."""
+    order: str | None = None
+    """Column that orders the frames of a touch. None: frame, seq or time."""
+    short: Literal["repeat", "leave-out"] = "repeat"
+    """Rows with fewer earlier frames repeat their first one, or are left out."""
+    minus_first: bool = False
+    """Whether frames are stored as (frame - first frame of the touch) / 2 + 128."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= 64:
+            raise ValueError(f"frames {self.frames}: give 1 (single images) to 64")
+        if not 0 < self.stride < math.inf:
+            raise ValueError(f"stride {self.stride}: give a positive number of frames, or of units of --data.order")
+
+    @property
+    def active(self) -> bool:
+        """Whether images differ from single raw frames."""
+        return self.frames > 1 or self.minus_first
+
+
+@dataclass(frozen=True, kw_only=True)
 class DataSpec:
     """What methods, probes and reports need to know about a dataset."""
 
@@ -72,6 +102,8 @@ class DataSpec:
     """Whether touch is stored as (touch - background) / 2 + 128. Packs from before this field have False."""
     values: tuple[ValueTask, ...] = field(default=(), metadata=LATER)
     """Tasks whose answer is a number with a unit."""
+    window: Window = field(default=Window(), metadata=LATER)
+    """The frames that one row shows, stacked on channels."""
 
     def __post_init__(self) -> None:
         if not (self.vision_channels or self.touch_channels):
@@ -96,7 +128,12 @@ class DataSpec:
         return (*self.tasks, *self.values)
 
     def channels(self, modality: str) -> int:
-        return {"vision": self.vision_channels, "touch": self.touch_channels}[modality]
+        """Channels of an image as encoders get it: of all frames of a window together."""
+        return self.frames(modality) * {"vision": self.vision_channels, "touch": self.touch_channels}[modality]
+
+    def frames(self, modality: str) -> int:
+        """Frames of one image of ``modality``."""
+        return self.window.frames if modality in self.window.of else 1
 
     @property
     def modalities(self) -> tuple[str, ...]:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal
 
 from mvitac.data.build import build, check_request, stored_as
 from mvitac.data.jpeg import QUALITY
 from mvitac.data.pack import Pack, Store
 from mvitac.data.source import Source
-from mvitac.registry import Registered
+from mvitac.data.spec import Window
+from mvitac.data.windows import windowed
+from mvitac.registry import LATER, Registered
 from mvitac.system.files import cache_dir, check_place, digest
 
-KEEPING = ("size", "workers", "store", "quality")
-"""Options of every dataset that affect how images are stored, not which images they are."""
+WINDOW = ("num_frames", "stride", "frames_of", "order", "short", "minus_first")
+"""Options that say which frames a row shows. A pack stores every frame once, whatever they are."""
+KEEPING = ("size", "workers", "store", "quality", *WINDOW)
+"""Options of every dataset that affect how images are stored or shown, not which images they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +39,34 @@ class DatasetConfig(Registered, ABC):
     quality: int = QUALITY
     """JPEG quality, 1 to 100. At 95, pixels differ by 1 or 2 of 255 levels. Colours keep full resolution (4:4:4)."""
 
+    num_frames: int = field(default=1, metadata=LATER)
+    """Number of frames that a row shows: the current one and earlier ones of the same touch, stacked on channels."""
+    stride: float = field(default=1.0, metadata=LATER)
+    """Distance of these frames, in units of --data.order: frames, or seconds."""
+    frames_of: Literal["touch", "vision", "both"] = field(default="touch", metadata=LATER)
+    """Images that show several frames; the others show the current one."""
+    order: str | None = field(default=None, metadata=LATER)
+    """Column that orders the frames of a touch; default: frame, seq or time."""
+    short: Literal["repeat", "leave-out"] = field(default="repeat", metadata=LATER)
+    """What is done with rows near the start of a touch: repeat its first frame, or leave the row out."""
+    minus_first: bool = field(default=False, metadata=LATER)
+    """Show (frame - first frame of the touch) / 2 + 128 instead of the frame."""
+
     def __post_init__(self) -> None:
+        self.frame_window()
         check_request(self.size, self.workers, store=self.store, quality=self.quality)
+
+    def frame_window(self) -> Window:
+        """The frames that a row shows."""
+        of = ("vision", "touch") if self.frames_of == "both" else (self.frames_of,)
+        return Window(
+            frames=self.num_frames,
+            stride=self.stride,
+            of=of,
+            order=self.order,
+            short=self.short,
+            minus_first=self.minus_first,
+        )
 
     @property
     def without_effect(self) -> tuple[str, ...]:
@@ -48,10 +78,14 @@ class DatasetConfig(Registered, ABC):
         """Return the source of samples; ValueError if the data does not exist."""
 
     def open(self, *, quiet: bool = False) -> Pack:
-        """Return the pack of this dataset. It is built in the cache (``files.cache_dir``) if it does not exist.
+        """Return the pack of this dataset, with windows of frames if they are asked for.
 
-        If files of the dataset have changed, a new pack is built.
+        It is built in the cache (``files.cache_dir``) if it does not exist, and again if files of the dataset have changed.
         """
+        return windowed(self._frames(quiet), self.frame_window())
+
+    def _frames(self, quiet: bool) -> Pack:
+        """Return the pack of single frames."""
         source = self.source()
         kept = stored_as(self.store, self.quality)
         stamps = source.stamps()

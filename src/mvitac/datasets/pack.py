@@ -30,12 +30,12 @@ class PackConfig(DatasetConfig):
     def source(self) -> Source:
         raise ValueError(f"{self.path} is a pack already: use it with --data pack, there is nothing to pack")
 
-    def open(self, *, quiet: bool = False) -> Pack:
+    def _frames(self, quiet: bool) -> Pack:
         pack = Pack(self.path)
         if self.score_on == "val":
             if not len(pack.rows("val")):
                 raise ValueError(f"{self.path} has no split val to score on: leave out --data.score-on")
-            for name in {"split", *(task.split for task in pack.spec.tasks)}:
+            for name in {"split", *(task.split for task in pack.spec.all_tasks)}:
                 column = [{"test": "hidden", "val": "test"}.get(split, split) for split in pack.column(name)]
                 pack.table = pack.table.set_column(pack.table.schema.get_field_index(name), name, pa.array(column))
         return pack
@@ -67,7 +67,7 @@ class StreamConfig(DatasetConfig):
     def source(self) -> Source:
         raise ValueError(f"{self.url} holds a pack in shards: use it with --data stream, there is nothing to pack")
 
-    def open(self, *, quiet: bool = False) -> Pack:
+    def _frames(self, quiet: bool) -> Pack:
         from mvitac.data.streaming import StreamedPack, share_of
 
         cache = self.cache or cache_dir() / "shards"

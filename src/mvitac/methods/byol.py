@@ -56,7 +56,7 @@ class BYOL(Contrastive):
         self.config = config
         self.online, self.predictor = nn.ModuleDict(), nn.ModuleDict()
         for modality in spec.modalities:
-            trunk = build_trunk(encoder, spec.channels(modality))
+            trunk = build_trunk(encoder, spec.channels(modality), spec.frames(modality))
             self.online[modality] = Projected(trunk, Head(num_features(trunk), config.hidden, config.out, norm=True))
             self.predictor[modality] = Head(config.out, config.hidden, config.out, norm=True)
         self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.online.items()})

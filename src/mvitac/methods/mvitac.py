@@ -119,9 +119,9 @@ def possible_losses(spec: DataSpec) -> tuple[str, ...]:
 class Tower(nn.Module):
     """An encoder with two heads: images [B, C, H, W] to embeddings (z intra, z inter), in one pass of the trunk."""
 
-    def __init__(self, config: MViTacConfig, encoder: EncoderConfig, channels: int) -> None:
+    def __init__(self, config: MViTacConfig, encoder: EncoderConfig, channels: int, frames: int) -> None:
         super().__init__()
-        self.trunk = build_trunk(encoder, channels)
+        self.trunk = build_trunk(encoder, channels, frames)
 
         def head() -> Head:
             return Head(
@@ -148,7 +148,9 @@ class MViTac(Contrastive):
         super().__init__()
         self.config = config
         # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
-        self.query = nn.ModuleDict({m: Tower(config, encoder, spec.channels(m)) for m in spec.modalities})
+        self.query = nn.ModuleDict(
+            {m: Tower(config, encoder, spec.channels(m), spec.frames(m)) for m in spec.modalities}
+        )
         momentum = self.query if config.keys == "momentum" else {}
         running = config.key_norm == "running"
         self.key = nn.ModuleDict({m: Momentum(tower, running_norm=running) for m, tower in momentum.items()})

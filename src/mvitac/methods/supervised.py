@@ -60,7 +60,7 @@ class SupervisedConfig(LabelledConfig):
     name: ClassVar[str] = "supervised"
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
-        trunks = {m: build_trunk(encoder, spec.channels(m)) for m in self.modalities_of(spec)}
+        trunks = {m: build_trunk(encoder, spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
         width = sum(num_features(trunk) for trunk in trunks.values())
         return Supervised(trunks, {task: nn.Linear(width, num) for task, num in self.num_classes(spec).items()})
 

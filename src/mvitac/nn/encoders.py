@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import timm
+import torch
 from timm.models import register_model
 from timm.models.resnet import BasicBlock, ResNet
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.nn.small_conv import use_products
+from mvitac.registry import LATER
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
@@ -41,6 +43,10 @@ class EncoderConfig:
     """Initial weights: `imagenet` (downloaded by timm), `scratch` (random), or a file with the trunk's state dict
     (.safetensors, .pth)."""
 
+    temporal: Literal["stack", "mean", "attention"] = field(default="stack", metadata=LATER)
+    """How several frames of a window are read. stack: as channels of one image. mean: the trunk sees each frame, and their
+    features are averaged. attention: their weighted mean, with weights learned from the features and the frame's age."""
+
     def __post_init__(self) -> None:
         if not timm.is_model(self.trunk.split(".")[0]):
             near = difflib.get_close_matches(self.trunk.split(".")[0], timm.list_models(), n=3)
@@ -48,15 +54,43 @@ class EncoderConfig:
             raise ValueError(f"unknown trunk {self.trunk!r}: give the name of a timm model, e.g. resnet18{hint}")
 
 
-def build_trunk(config: EncoderConfig, channels: int) -> nn.Module:
+def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Module:
     """Create a trunk that maps images [B, ``channels``, H, W] to pooled features [B, D]; ``trunk.num_features`` is D.
 
-    With more than three channels the pretrained stem is kept: timm repeats and rescales its filters.
+    With more than three channels the pretrained stem is kept: timm repeats and rescales its filters. The channels are those
+    of all ``frames`` of a window together.
 
     Raises:
         ValueError: If the requested weights are not available. There is no silent fallback to random weights.
     """
-    return use_products(_from_timm(config, channels))
+    if frames == 1 or config.temporal == "stack":
+        return use_products(_from_timm(config, channels))
+    trunk = use_products(_from_timm(config, channels // frames))
+    return PerFrame(trunk, frames, attention=config.temporal == "attention")
+
+
+class PerFrame(nn.Module):
+    """A trunk that sees the F frames of a window one by one: [B, F C, H, W] to the mean of their features [B, D].
+
+    With ``attention`` the mean is weighted by a softmax over frames of a learned score: a linear function of the frame's
+    features plus a bias for its age. It starts as the plain mean.
+    """
+
+    def __init__(self, trunk: nn.Module, frames: int, *, attention: bool) -> None:
+        super().__init__()
+        self.trunk, self.frames = trunk, frames
+        self.num_features = num_features(trunk)
+        self.score = nn.Linear(self.num_features, 1, bias=False) if attention else None
+        if self.score is not None:
+            nn.init.zeros_(self.score.weight)
+            self.age = nn.Parameter(torch.zeros(frames))
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.trunk(images.unflatten(1, (self.frames, -1)).flatten(0, 1)).unflatten(0, (-1, self.frames))
+        if self.score is None:
+            return features.mean(1)
+        weights = (self.score(features).squeeze(2) + self.age).softmax(dim=1)
+        return (weights.unsqueeze(2) * features).sum(1)
 
 
 def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
@@ -127,7 +161,7 @@ def build_towers(config: EncoderConfig, spec: DataSpec, head: Callable[[int], nn
     """A ``Projected`` trunk and head per modality of ``spec``. ``head`` creates a head for D features."""
     towers = nn.ModuleDict()
     for modality in spec.modalities:
-        trunk = build_trunk(config, spec.channels(modality))
+        trunk = build_trunk(config, spec.channels(modality), spec.frames(modality))
         towers[modality] = Projected(trunk, head(num_features(trunk)))
     return towers
 

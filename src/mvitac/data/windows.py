@@ -1,0 +1,131 @@
+"""Windows: a row that shows several frames of its touch, the current one and earlier ones, stacked on channels.
+
+A pack stores every frame once. ``windowed`` opens it so that ``pack.images`` gives windows, found by index when they are
+read. A window never crosses the edge of a touch (column touch_group, else group). This module does not import torch.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+
+from mvitac.data.images import difference
+from mvitac.data.jpeg import Lazy
+from mvitac.data.pack import Images, Pack
+from mvitac.data.spec import Window
+from mvitac.registry import unknown
+from mvitac.system.files import digest
+
+ORDER = ("frame", "seq", "time")
+"""Columns that order the frames of a touch, by default the first that exists."""
+
+
+def windowed(pack: Pack, window: Window) -> Pack:
+    """Return ``pack`` with windows as images: channels 0 to 2 are the current frame, then come earlier ones.
+
+    Args:
+        pack: A pack on disk. It is not changed.
+        window: Number of frames, their distance, and what is done at the start of a touch.
+
+    Raises:
+        ValueError: If the pack has no column that orders its frames, two frames of a touch have the same place, or no
+            touch is as long as a window.
+    """
+    if not window.active:
+        return pack
+    if pack.format != Pack.format:
+        raise ValueError("frames: windows need the frames of a touch together: open a pack on disk, not shards")
+    for modality in window.of:
+        if modality not in pack.spec.modalities:
+            raise unknown("modality of windows", modality, pack.spec.modalities)
+    index, whole = _frames(pack, window)
+    made = copy.copy(pack)
+    made.spec = replace(pack.spec, window=window)
+    made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
+    first = _first_rows(pack, window) if window.minus_first else None
+    made.images = {m: Windows(pack.images[m], index, first) if m in window.of else pack.images[m] for m in pack.images}
+    if window.short == "leave-out":
+        for name in dict.fromkeys(("split", *(task.split for task in pack.spec.all_tasks))):
+            kept = [split if full else "hidden" for split, full in zip(pack.column(name), whole, strict=True)]
+            made.table = made.table.set_column(made.table.schema.get_field_index(name), name, pa.array(kept))
+    return made
+
+
+class Windows(Lazy):
+    """Images uint8 [N, S, S, F C]: the frames of ``index`` [N, F], minus the frame ``first`` [N] if it is given."""
+
+    def __init__(self, frames: Images, index: np.ndarray, first: np.ndarray | None) -> None:
+        num, height, width, channels = frames.shape
+        super().__init__((num, height, width, channels * index.shape[1]))
+        self.frames, self.index, self.first = frames, index, first
+
+    def _made(self, rows: np.ndarray) -> np.ndarray:
+        # Each frame is read once, also if it is in several of the windows.
+        asked = self.index[rows]
+        known = np.unique(asked if self.first is None else np.concatenate([asked, self.first[rows, None]], axis=1))
+        images = np.asarray(self.frames[known])
+        found = images[np.searchsorted(known, asked)]  # [n, F, S, S, C]
+        if self.first is not None:
+            rest = images[np.searchsorted(known, self.first[rows])]
+            found = np.stack([difference(found[:, f], rest) for f in range(found.shape[1])], axis=1)
+        num, frames, height, width, channels = found.shape
+        return found.transpose(0, 2, 3, 1, 4).reshape(num, height, width, frames * channels)
+
+
+def _frames(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Row numbers of each row's frames [N, F], newest first, and bool [N]: whether its touch is long enough for all."""
+    name, place = _places(pack, window)
+    back = window.stride * np.arange(window.frames)
+    index, whole = np.zeros((pack.num, window.frames), np.int64), np.zeros(pack.num, bool)
+    for group in range(int(pack.touch_groups.max()) + 1):
+        rows = pack.rows_of(group)
+        rows = rows[np.argsort(place[rows], kind="stable")]
+        times = place[rows]
+        if (same := np.diff(times) == 0).any():
+            touch = pack.column("touch_group" if "touch_group" in pack.table.column_names else "group")[rows[0]]
+            at = times[int(np.flatnonzero(same)[0])]
+            raise ValueError(
+                f"frames: two rows of touch {touch!r} have {name} {at:g}: name the column of the recording with"
+                " --touch-group when the data is packed, or another column with --data.order"
+            )
+        asked = times[:, None] - back  # the newest frame that is old enough, else the first
+        index[rows] = rows[np.maximum(np.searchsorted(times, asked + 1e-9, side="right") - 1, 0)]
+        whole[rows] = asked[:, -1] >= times[0] - 1e-9
+    if not whole.any():
+        raise ValueError(
+            f"frames {window.frames} at stride {window.stride:g} are longer than every touch of {pack.spec.name!r}: give"
+            " fewer frames or a smaller stride"
+        )
+    return index, whole
+
+
+def _places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
+    """Name and values [N] of the column that orders the frames."""
+    name = window.order or next((column for column in ORDER if column in pack.table.column_names), None)
+    if name is None:
+        raise ValueError(
+            f"frames: {pack.spec.name!r} has none of the columns {', '.join(ORDER)}, which say the order of its frames:"
+            " name the one that does with --data.order"
+        )
+    cells = pack.column(name)
+    try:
+        place = cells.astype(float)
+    except (TypeError, ValueError):
+        place = np.full(pack.num, np.nan)
+    if not np.isfinite(place).all():
+        row = int(np.flatnonzero(~np.isfinite(place))[0])
+        raise ValueError(
+            f"frames: column {name!r} is not a number in row {row}: give one in every row, or another order"
+        )
+    return name, place
+
+
+def _first_rows(pack: Pack, window: Window) -> np.ndarray:
+    """int64 [N]: the first row of each row's touch."""
+    _, place = _places(pack, window)
+    order = np.lexsort((place, pack.touch_groups))
+    _, start = np.unique(pack.touch_groups[order], return_index=True)
+    return order[start][pack.touch_groups]

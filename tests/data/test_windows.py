@@ -1,0 +1,166 @@
+"""Windows: several frames of a touch as one row, by index, never across its edge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Task, Window
+from mvitac.data.windows import windowed
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.model import load
+from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
+from mvitac.recipes import recipe
+from mvitac.registry import to_json
+from mvitac.training.loop import train
+from mvitac.transforms.random_views import Augment
+
+TOUCHES, LENGTH = 8, 6
+
+
+class Presses(Source):
+    """Touch t has six frames, in mixed order; frame f is gray level 10 + 20 t + 2 f. Frame 3 of touch 1 is missing."""
+
+    order: tuple[int, ...] = (3, 0, 5, 1, 4, 2)
+
+    def spec(self) -> DataSpec:
+        task = Task(name="late", classes=("early", "late"))
+        return DataSpec(
+            name="presses", vision_channels=3, touch_channels=3, tasks=(task,), group_by="object", licence="", source=""
+        )
+
+    def items(self) -> list[str]:
+        return [f"{t}-{f}" for f in self.order for t in range(TOUCHES) if (t, f) != (1, 3)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"presses": 1}
+
+    def read(self, item: int) -> list[Sample]:
+        name = self.items()[item]
+        touch, frame = map(int, name.split("-"))
+        image = np.full((16, 16, 3), 10 + 20 * touch + 2 * frame, np.uint8)
+        split = ("train", "train", "val", "test")[touch % 4]
+        columns = {"id": name, "group": f"o{touch}", "touch_group": f"t{touch}", "split": split, "frame": frame}
+        return [Sample(vision=image, touch=image, columns={**columns, "label_late": int(frame >= 3)})]
+
+
+@pytest.fixture(scope="module")
+def presses(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Presses(), tmp_path_factory.mktemp("presses") / "pack", size=16, workers=1, quiet=True)
+
+
+def shown(pack: Pack, touch: int, frame: int, modality: str = "touch") -> list[int]:
+    """The frame numbers that the row of this frame shows."""
+    (row,) = np.flatnonzero((pack.column("touch_group") == f"t{touch}") & (pack.column("frame") == frame))
+    levels = pack.images[modality][row][0, 0, ::3].astype(int)
+    return ((levels - 10 - 20 * touch) // 2).tolist()
+
+
+def test_a_window_shows_this_frame_and_earlier_ones_of_the_same_touch(presses: Pack) -> None:
+    pack = windowed(presses, Window(frames=3))
+    assert shown(pack, 2, 5) == [5, 4, 3]
+    assert shown(pack, 2, 1) == [1, 0, 0]  # the first repeats
+    assert shown(pack, 1, 5) == [5, 4, 2]  # frame 3 is missing: the one before it
+    assert shown(pack, 2, 5, "vision") == [5]
+    assert shown(windowed(presses, Window(frames=3, stride=2)), 4, 5) == [5, 3, 1]
+    assert pack.images["touch"].shape == (presses.num, 16, 16, 9)
+    assert pack.spec.channels("touch") == 9 and pack.spec.channels("vision") == 3
+
+
+def test_frames_are_found_by_their_place_not_by_their_row(presses: Pack) -> None:
+    rows = np.random.default_rng(0).permutation(presses.num)
+    pack = windowed(presses, Window(frames=2))
+    alone = [pack.images["touch"][int(row)] for row in rows]
+    assert np.array_equal(pack.images["touch"][rows], alone)
+
+
+def test_rows_at_the_start_can_be_left_out(presses: Pack) -> None:
+    pack = windowed(presses, Window(frames=3, short="leave-out"))
+    kept = pack.rows("train", "val", "test")
+    assert sorted(set(pack.column("frame")[kept].tolist())) == [2, 3, 4, 5]
+    assert len(windowed(presses, Window(frames=3)).rows("train", "val", "test")) == presses.num
+
+
+def test_the_first_frame_of_the_touch_can_be_subtracted(presses: Pack) -> None:
+    pack = windowed(presses, Window(frames=2, minus_first=True))
+    for row in range(presses.num):
+        frame = int(pack.column("frame")[row])
+        image = pack.images["touch"][row]
+        assert (image[..., :3] == 128 + frame).all()
+
+
+def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(presses: Pack) -> None:
+    digests = {windowed(presses, Window(frames=f, stride=s)).digest for f, s in ((1, 1), (2, 1), (3, 1), (3, 2))}
+    assert len(digests) == 4 and presses.digest in digests
+    assert windowed(presses, Window()) is presses
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": 7, "short": "leave-out"}, "longer than every touch"),
+        ({"frames": 3, "stride": 4.0}, "longer than every touch"),
+        ({"frames": 2, "order": "split"}, "not a number in row 0"),
+        ({"frames": 2, "order": "nothing"}, "unknown column"),
+        ({"frames": 2, "order": "label_late"}, "two rows of touch"),
+        ({"frames": 0}, "frames 0: give"),
+        ({"frames": 2, "stride": 0.0}, r"stride 0\.0: give"),
+    ],
+)
+def test_windows_that_cannot_be_made(presses: Pack, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        windowed(presses, Window(**options))
+
+
+def test_frames_without_an_order_are_refused(pack: Pack) -> None:
+    with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
+        windowed(pack, Window(frames=2))
+
+
+@pytest.mark.parametrize("temporal", ["stack", "mean", "attention"])
+def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, temporal: str) -> None:
+    data = PackConfig(path=presses.path, num_frames=2)
+    run = recipe("smoke", data)
+    run = replace(
+        run,
+        steps=2,
+        batch_size=8,
+        eval_every=0,
+        encoder=replace(run.encoder, temporal=temporal),
+        augment=Augment(size=16),
+    )
+    out = train(run, tmp_path / "run", quiet=True)
+    model = load(out)
+    assert model.spec.frames("touch") == 2 and model.spec.frames("vision") == 1
+    result = probe_runs([out], ProbeConfig(controls=False))
+    assert {record["modality"] for record in result["records"]} == {"touch", "vision", "both"}
+    assert not isinstance(model.encoders["vision"], PerFrame)
+    assert isinstance(model.encoders["touch"], PerFrame) == (temporal != "stack")
+
+
+def test_per_frame_features_are_averaged_and_attention_starts_as_the_mean() -> None:
+    config = EncoderConfig(trunk="mvitac_tiny", weights="scratch", temporal="attention")
+    trunk = build_trunk(config, 6, 2).eval()
+    assert isinstance(trunk, PerFrame)
+    images = torch.randn(3, 6, 32, 32)
+    apart = [trunk.trunk(part) for part in images.split(3, dim=1)]
+    assert torch.allclose(trunk(images), (apart[0] + apart[1]) / 2, atol=1e-6)
+    assert trunk.score is not None
+    torch.nn.init.normal_(trunk.score.weight)
+    assert not torch.allclose(trunk(images), (apart[0] + apart[1]) / 2, atol=1e-3)
+
+
+def test_runs_on_single_frames_keep_their_digest(presses: Pack) -> None:
+    plain = recipe("smoke", PackConfig(path=presses.path))
+    written = to_json(plain, for_digest=True)
+    assert "num_frames" not in written["data"] and "temporal" not in written["encoder"]
+    assert plain.digest() != replace(plain, data=PackConfig(path=presses.path, num_frames=2)).digest()
