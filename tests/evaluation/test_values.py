@@ -21,7 +21,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
-from mvitac.evaluation.scores import interval, paired_difference
+from mvitac.evaluation.scores import interval, paired_difference, pool
 from mvitac.evaluation.value_scores import mean_r2, score_values
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
@@ -225,3 +225,19 @@ def test_a_pack_refuses_infinite_values(tmp_path: Path) -> None:
 
     with pytest.raises(ValueError, match="level is inf: a value is a finite number"):
         build(Broken(num=12, values=True), tmp_path / "pack", size=32, workers=1, quiet=True)
+
+
+def test_folds_are_pooled_to_the_scores_of_all_groups_together() -> None:
+    y, guess, groups = drawn()
+    about = {"source": "m", "seed": 0, "task": "pose", "modality": "touch", "probe": "linear"}
+    folds = []
+    for half in (groups < 6, groups >= 6):
+        _, own = np.unique(groups[half], return_inverse=True)
+        folds.append([{**about, **score_values(y[half], guess[half], own, POSE)}])
+    (pooled,) = pool(folds)
+    whole = score_values(y, guess, groups, POSE)
+    for found, wanted in zip(pooled["targets"], whole["targets"], strict=True):
+        assert {k: found[k] for k in ("r2", "mae", "rmse")} == pytest.approx(
+            {k: wanted[k] for k in ("r2", "mae", "rmse")}
+        )
+    assert interval([pooled]) == pytest.approx(interval([{**about, **whole}]))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
 
-from mvitac.evaluation.value_scores import mean_r2
+from mvitac.evaluation.value_scores import mean_r2, pool_values
 
 NUM_DRAWS = 2000
 """Number of bootstrap draws of every interval."""
@@ -53,7 +53,7 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
 def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Pool the records of cross-validation folds, whose test groups differ, into records of all groups.
 
-    Keeps only what every fold has scored. Accuracy is over all rows. AUROC, F1 and balanced accuracy are means over the
+    Keeps only what every fold has scored. Accuracy, R2 and errors are over all rows. AUROC, F1 and balanced accuracy are means over the
     folds that have them, since the folds' probes were fitted separately.
     """
     keys = ("source", "seed", "task", "modality", "probe")
@@ -64,6 +64,9 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     pooled = []
     for parts in found.values():
         if len(parts) < len(folds):
+            continue
+        if "group_sums" in parts[0]:
+            pooled.append({**{key: parts[0][key] for key in keys}, **pool_values(parts)})
             continue
         sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
         means = {}

@@ -62,6 +62,36 @@ def score_values(y: np.ndarray, predicted: np.ndarray, groups: np.ndarray, targe
     }
 
 
+def pool_values(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Pool the records of cross-validation folds, whose test groups differ, into the scores of all groups together."""
+    sums = {
+        name: [[x for part in parts for x in part["group_sums"][name][t]] for t in range(len(parts[0]["targets"]))]
+        for name in SUMS
+    }
+    points = [[pair for part in parts for pair in part["points"][t]] for t in range(len(parts[0]["targets"]))]
+    targets = []
+    for t, target in enumerate(parts[0]["targets"]):
+        total = {name: float(np.sum(sums[name][t])) for name in SUMS}
+        true, guess = np.array(points[t], float).T
+        targets.append(
+            {
+                "name": target["name"],
+                "unit": target["unit"],
+                "r2": float(r_squared(total)),
+                "mae": total["error"] / total["n"],
+                "rmse": (total["squared_error"] / total["n"]) ** 0.5,
+                "ranges": error_by_range(true, guess - true),
+            }
+        )
+    return {
+        "r2": float(np.mean([target["r2"] for target in targets])),
+        "targets": targets,
+        "num_test": sum(part["num_test"] for part in parts),
+        "group_sums": sums,
+        "points": points,
+    }
+
+
 def r_squared(sums: dict[str, Any]) -> Any:
     """R2 from ``SUMS`` (numbers or arrays): 1 - squared error / squared deviation from the mean of the same rows."""
     spread = sums["squared_value"] - sums["value"] ** 2 / np.maximum(sums["n"], 1)

@@ -166,7 +166,7 @@ def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[st
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for line in lines:
         for task in line.cells:
-            values = [r["auroc"] for r in records[task, line.modality, line.source] if r["auroc"] is not None]
+            values = [r["auroc"] for r in records[task, line.modality, line.source] if r.get("auroc") is not None]
             if values and line.source != "majority":
                 spread = f" ({min(values):.2f}-{max(values):.2f})" if len(values) > 1 else ""
                 row = found.setdefault(tuple(_first_cells(line)), {})
