@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.utils.data import DataLoader
 
 import mvitac
 from mvitac.data.images import difference
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.features import pack_features
-from mvitac.model import Model
+from mvitac.methods.calandra import CalandraConfig
+from mvitac.model import Model, fresh
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
-from mvitac.transforms.random_views import plain_view
+from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD, plain_view
 from support.toy import toy_pack
 
 
 def trained(pack: Pack, out: Path) -> Path:
     return train(replace(recipe("smoke", PackConfig(path=pack.path)), steps=2), out, quiet=True)
+
+
+def batch(pack: Pack, num: int, modality: str = "touch") -> torch.Tensor:
+    """The first ``num`` images, uint8 [num, C, H, W]."""
+    return torch.from_numpy(np.array(pack.images[modality][:num])).permute(0, 3, 1, 2)
 
 
 @pytest.fixture(scope="module")
@@ -70,13 +80,205 @@ def test_whole_images_are_seen_at_their_own_size(model: Model, pack: Pack) -> No
     assert as_crops.weights_digest() != smaller.weights_digest()  # cached features of one are not the other's
 
 
-def test_embed_takes_arrays_tensors_and_pictures_alike(model: Model, pack: Pack) -> None:
+def kinds(array: np.ndarray, folder: Path) -> dict[str, Any]:
+    """One uint8 image [H, W, 3] in every form that ``embed`` takes."""
+    picture, tensor = Image.fromarray(array), torch.from_numpy(array.copy())
+    picture.save(folder / "image.png")
+    return {
+        "array": array,
+        "floats": array / 255,
+        "channels first": array.transpose(2, 0, 1),
+        "tensor": tensor.permute(2, 0, 1),
+        "tensor of floats": tensor.permute(2, 0, 1).float() / 255,
+        "tensor, channels last": tensor,
+        "PIL": picture,
+        "path": folder / "image.png",
+        "name": str(folder / "image.png"),
+    }
+
+
+def test_embed_takes_paths_arrays_tensors_and_pictures_alike(model: Model, pack: Pack, tmp_path: Path) -> None:
     array = pack.images["touch"][7]
-    expected = model.embed(touch=array)["touch"]
-    assert torch.equal(model.embed(touch=torch.from_numpy(array.copy()).permute(2, 0, 1))["touch"], expected)
-    assert torch.equal(model.embed(touch=Image.fromarray(array))["touch"], expected)
-    several = model.embed(touch=[Image.fromarray(array), array])["touch"]
-    torch.testing.assert_close(several, expected.expand(2, -1))  # a larger batch sums in another order
+    forms, expected = kinds(array, tmp_path), model.embed(touch=array)["touch"]
+    for name, image in forms.items():
+        assert torch.equal(model.embed(touch=image)["touch"], expected), name
+    several = model.embed(touch=list(forms.values()))["touch"]
+    torch.testing.assert_close(several, expected.expand(len(forms), -1))  # a larger batch sums in another order
+    stacked = np.array(pack.images["touch"][:3])
+    expected = model.embed(touch=stacked)["touch"]
+    for form in (torch.from_numpy(stacked), torch.from_numpy(stacked).permute(0, 3, 1, 2), stacked / 255):
+        assert torch.equal(model.embed(touch=form)["touch"], expected)
+    names = np.array([forms["name"]] * 2)  # as a column of a table
+    assert model.embed(touch=names)["touch"].shape == (2, 64)
+
+
+def test_floats_are_taken_as_levels_or_refused(artifact: Path, pack: Pack) -> None:
+    """Everywhere: floats in [0, 1] were taken for levels 0 to 255, which are all black."""
+    model, images = mvitac.load(artifact), batch(pack, 4)
+    scaled, normalised = images / 255, (images / 255 - 0.45) / 0.22
+    close = {"atol": 1e-4, "rtol": 1e-4}
+    expected = model.features("touch", images)
+    torch.testing.assert_close(model.features("touch", scaled), expected, **close)
+    torch.testing.assert_close(model(touch=scaled)["touch"].detach(), expected, **close)
+    torch.testing.assert_close(model.embed(touch=scaled)["touch"], expected, **close)
+    classes = model.predict(touch=images)
+    torch.testing.assert_close(model.predict(touch=scaled), classes, **close)
+    calls = (
+        lambda x: model.features("touch", x),
+        lambda x: model(touch=x),
+        lambda x: model.embed(touch=x),
+        lambda x: model.predict(touch=x),
+        lambda x: model.transform("touch")(x[0]),
+    )
+    for call in calls:
+        for wrong in (images.float(), normalised, torch.full_like(scaled, torch.nan)):
+            with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] or uint8, got .*float32 from"):
+                call(wrong)
+        with pytest.raises(ValueError, match=r"uint8.*float.*int64"):
+            call(images.long())
+
+
+def test_forward_gives_the_features_of_embed_with_gradients(model: Model, pack: Pack) -> None:
+    images = {m: batch(pack, 6, m) for m in ("vision", "touch")}
+    for shared in (False, True):
+        found, expected = model(**images, shared=shared), model.embed(**images, shared=shared)
+        assert list(found) == ["vision", "touch"]
+        for modality, features in found.items():
+            assert features.requires_grad and torch.equal(features, expected[modality])
+    generator = torch.Generator().manual_seed(0)
+    large = torch.randint(0, 256, (2, 3, 50, 80), dtype=torch.uint8, generator=generator)
+    expected = model.embed(touch=large)["touch"]  # other sizes are resized like raw images
+    assert (model(touch=large)["touch"] - expected).norm() < 0.01 * expected.norm()
+    squeezed = torch.nn.functional.interpolate(large.float(), (32, 32), mode="bilinear", antialias=True)
+    floats = (squeezed / 255).requires_grad_()
+    with torch.inference_mode():
+        model.embed(touch=large)  # leaves nothing behind that would refuse gradients
+    model(touch=floats)["touch"].sum().backward()
+    assert floats.grad is not None and floats.grad.abs().sum() > 0
+
+
+def test_a_step_of_fine_tuning_changes_the_trunk(run: Path, pack: Pack) -> None:
+    model = mvitac.load(run)
+    assert not any(module.training for module in model.modules())
+    head = torch.nn.Linear(64, 3)
+    optimiser = torch.optim.SGD([*model.encoders["touch"].parameters(), *head.parameters()], lr=0.05)
+    images = batch(pack, 24)
+    labels = torch.from_numpy(pack.column("label_pattern")[:24].astype(int))
+    before, losses = model.weights_digest(), []
+    for _ in range(2):
+        loss = torch.nn.functional.cross_entropy(head(model(touch=images)["touch"]), labels)
+        optimiser.zero_grad()
+        loss.backward()
+        assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in model.encoders["touch"].parameters())
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[1] < losses[0] and model.weights_digest() != before
+    model.train()
+    with pytest.raises(ValueError, match=r"call model.eval\(\) first"):
+        model.embed(touch=images)
+
+
+def test_wrong_calls_say_what_is_right(model: Model, pack: Pack) -> None:
+    images = batch(pack, 2)
+    for call, says in [
+        (lambda: model(images), r"images need a name: model\(vision=images\) or model\(touch=images\)"),
+        (lambda: model(), "no images given: give vision"),
+        (lambda: model(touch=images[0]), r"expected a tensor \[B, 3, H, W\]"),
+        (lambda: model(touch=images.permute(0, 2, 3, 1)), r"got torch.uint8 \[2, 32, 32, 3\]"),
+        (lambda: model(touch=pack.images["touch"][:2]), r"got memmap \(`embed` takes any image\)"),
+        (lambda: model.trunk("smell"), "no smell encoder: it has vision, touch"),
+        (lambda: model.transform("smell"), "no smell encoder: it has vision, touch"),
+        (lambda: model.transform("touch", background=images[0]), "not trained on difference images"),
+        (lambda: model.embed(touch="nowhere.png"), "nowhere.png does not exist"),
+        (lambda: model.embed(touch=b"image"), "expected one image or several, got bytes"),
+        (lambda: model.embed(touch=[]), "no images given"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            call()
+
+
+class Touches(torch.utils.data.Dataset):  # at module level, so that a worker that is a new process can unpickle it
+    def __init__(self, images: np.ndarray, transform: Any) -> None:
+        self.images, self.transform = images, transform
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, item: int) -> torch.Tensor:
+        return self.transform(Image.fromarray(self.images[item]))
+
+
+def test_transform_prepares_images_in_a_data_loader(model: Model) -> None:
+    images = np.random.default_rng(1).integers(0, 256, (5, 40, 60, 3), dtype=np.uint8)
+    expected = model.embed(touch=images)["touch"]
+    loader = DataLoader(Touches(images, model.transform("touch")), batch_size=5, num_workers=1)
+    (loaded,) = loader
+    assert loaded.shape == (5, 3, 32, 32) and loaded.dtype == torch.uint8
+    assert torch.equal(model(touch=loaded)["touch"], expected)
+    normalised = pickle.loads(pickle.dumps(model.transform("touch", normalize=True)))
+    inputs = torch.stack([normalised(image) for image in images])
+    assert torch.equal(model.trunk("touch")(inputs.contiguous(memory_format=torch.channels_last)), expected)
+
+
+def test_transform_subtracts_a_background(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    free, press = np.random.default_rng(3).integers(0, 255, (2, 80, 100, 3), dtype=np.uint8)
+    monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))
+    found = model(touch=model.transform("touch", background=free)(press)[None])["touch"]
+    assert torch.equal(found, model.embed(touch=press, background=free)["touch"])
+
+
+def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
+    import timm
+
+    run = recipe("smoke", PackConfig(path=pack.path))
+    run = replace(run, encoder=replace(run.encoder, trunk="resnet10t"), augment=replace(run.augment, whole=24))
+    model = fresh(run, pack.spec, 32)
+    before = [type(layer) for layer in model.modules()]
+    trunk = model.trunk("touch")
+    config = timm.data.resolve_model_data_config(trunk)
+    assert (config["input_size"], config["mean"], config["std"]) == ((3, 24, 24), IMAGENET_MEAN, IMAGENET_STD)
+    assert trunk.num_features == 512 and trunk.pretrained_cfg["num_classes"] == 0
+    assert {type(layer) for layer in trunk.modules()} == {type(m) for m in timm.create_model("resnet10t").modules()} - {
+        torch.nn.Linear
+    } | {torch.nn.Identity}
+    timm.models.save_for_hf(trunk, str(tmp_path), safe_serialization=True)
+    again = timm.create_model(f"local-dir:{tmp_path}", pretrained=True).eval()
+    images = pack.images["touch"][:2]
+    inputs = torch.stack([model.transform("touch", normalize=True)(image) for image in images])
+    torch.testing.assert_close(again(inputs), model.embed(touch=images)["touch"])
+    assert timm.data.resolve_model_data_config(again)["input_size"] == config["input_size"]
+    next(trunk.parameters()).data.zero_()  # a copy
+    assert [type(layer) for layer in model.modules()] == before
+    torch.testing.assert_close(again(inputs), model.embed(touch=images)["touch"])
+
+
+def test_timms_own_transform_is_the_models(model: Model) -> None:
+    """Where images are stored at the size that the encoder sees: timm resizes once, mvitac to both sizes."""
+    import timm
+
+    config = timm.data.resolve_model_data_config(model.trunk("vision"))
+    image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (50, 70, 3), dtype=np.uint8))
+    theirs = timm.data.create_transform(**config, is_training=False)(image)
+    torch.testing.assert_close(theirs, model.transform("vision", normalize=True)(image))
+
+
+def test_trunk_of_two_sensors_has_six_channels(tmp_path: Path) -> None:
+    pack = toy_pack(tmp_path / "p", touch_channels=6, num=12)
+    model = fresh(recipe("smoke", PackConfig(path=pack.path)), pack.spec, 32)
+    cfg = model.trunk("touch").pretrained_cfg
+    assert cfg["input_size"] == (6, 32, 32) and cfg["mean"] == IMAGENET_MEAN * 2 and len(cfg["std"]) == 6
+    streams = replace(model.run, method=CalandraConfig())
+    with pytest.raises(ValueError, match="no single timm model but a Streams"):
+        fresh(streams, pack.spec, 32).trunk("touch")
+
+
+def test_models_can_be_copied_and_pickled(artifact: Path, pack: Pack) -> None:
+    """scikit-learn and ``torch.multiprocessing`` do."""
+    model = mvitac.load(artifact)
+    expected = model.predict(touch=pack.images["touch"][:3])
+    for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
+        assert repr(twin) == repr(model)
+        torch.testing.assert_close(twin.predict(touch=pack.images["touch"][:3]), expected)
 
 
 def test_embed_resizes_as_the_pack_does(model: Model) -> None:

@@ -1,14 +1,23 @@
-"""The tutorials run: every cell of every page, in order, in an empty folder; their notebooks hold the same cells."""
+"""The tutorials run: every cell of every page, in order, in an empty folder; their notebooks hold the same cells.
+
+So does the how-to page docs/encoders.md, on the files that a tutorial leaves.
+"""
 
 from __future__ import annotations
 
+import csv
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jupytext
+import numpy as np
 import pytest
+from PIL import Image
+
+from mvitac.data.pack import Pack
 
 PAGES = sorted(p for p in (Path(__file__).parents[1] / "docs/tutorials").glob("*.md") if p.name != "index.md")
 
@@ -47,6 +56,32 @@ def test_notebook_is_the_page(page: Path) -> None:
     notebook = page.with_suffix(".ipynb")
     assert cells(notebook) == cells(page), "write it anew: make notebooks"
     assert not any(cell.get("outputs") for cell in jupytext.read(notebook).cells)
+
+
+def test_encoders_page_runs(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the folder that "Your own sensor" leaves."""
+    monkeypatch.chdir(tmp_path)
+    Path("artifacts").mkdir()
+    Path("artifacts/mine").symlink_to(artifact)
+    Path("my_sensor").mkdir()
+    with open("my_sensor/pairs.csv", "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["vision", "touch", "feel", "object"])
+        for row in range(72):
+            names = {m: f"{m}_{row:04}.png" for m in ("vision", "touch")}
+            for modality, name in names.items():
+                Image.fromarray(pack.images[modality][row]).save(f"my_sensor/{name}")
+            table.writerow([*names.values(), pack.labels("bright")[row], pack.column("group")[row]])
+    names: dict[str, Any] = {"__name__": "encoders"}
+    page = Path(__file__).parents[1] / "docs/encoders.md"
+    code = [source for kind, source in cells(page) if kind == "code"]
+    assert len(code) == 4  # one of each section
+    for source in code:
+        exec(compile(source, page.name, "exec"), names)
+    assert names["features"]["touch"].shape == (72, 64) and names["scores"].mean() > 0.75  # chance is .5
+    assert np.allclose(
+        names["theirs"](Image.open(names["touches"][0])), names["prepare"](names["touches"][0]), atol=1e-5
+    )
 
 
 if __name__ == "__main__":

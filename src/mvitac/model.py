@@ -1,7 +1,8 @@
-"""The trained model: frozen encoders, heads into the shared space, and the preprocessing of raw images.
+"""The trained model: encoders, heads into the shared space, and the preprocessing of raw images.
 
     model = mvitac.load("runs/demo/seed0")
     features = model.embed(vision=photos, touch=presses)      # {"vision": [N, 512], "touch": [N, 512]}
+    features = model(touch=batch)["touch"]                    # with gradients, for fine-tuning
 
 Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the shared space, K classes.
 """
@@ -9,39 +10,37 @@ Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import safetensors
 import safetensors.torch
 import torch
-from PIL import Image
 from torch import Tensor, nn
 
-from mvitac.data.images import difference, fit
 from mvitac.data.notebook import table
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Method
-from mvitac.nn.encoders import SCRATCH, num_features
+from mvitac.nn.encoders import SCRATCH, num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe
+from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import brief, digest, write_atomic
-from mvitac.transforms.random_views import plain_view
+from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
+from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 FORMAT = "mvitac-model"
-ImageInput = np.ndarray | Tensor | Image.Image | Sequence[Any]
-"""One image or several, as ``Model.embed`` accepts them."""
 EMBED_BATCH = 256
 """Images that ``Model.embed`` passes through an encoder at once."""
 
 
 class Model(nn.Module):
     """The networks of a method that are kept after pre-training, in eval mode, with the preprocessing of their images.
+
+    ``embed`` and ``predict`` take raw images of any kind and compute no gradients. ``forward`` takes tensors and computes
+    gradients, so the model can be trained further like any torch module.
 
     Args:
         method: The method, trained or not.
@@ -79,13 +78,96 @@ class Model(nn.Module):
         text = f"<p>{escape(repr(self))}</p>{table(rows, ('input', 'features'))}"
         return text + (table(probes, ("probe", "classes")) if probes else "")
 
-    @torch.no_grad()
-    def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
-        """Pooled features of images from a pack.
+    def forward(
+        self, *unnamed: Tensor, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False
+    ) -> dict[str, Tensor]:
+        """Features of batches of images, with gradients, for fine-tuning.
+
+        The features are those of ``embed``. After loading, the model is in eval mode: BatchNorm keeps its statistics.
+        ``train()`` changes that, as for any torch module.
+
+        Args:
+            unnamed: Not allowed: images need the name of their modality.
+            vision: Camera images [B, C, H, W], uint8 or float in [0, 1], e.g. a batch of ``transform("vision")``.
+            touch: Tactile images, likewise. For models trained on difference images: the differences.
+            shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
+
+        Returns:
+            modality -> [B, D], or [B, E] with ``shared``.
+
+        Raises:
+            ValueError: If images do not fit the model.
+        """
+        if unnamed:
+            raise ValueError(f"images need a name: {' or '.join(f'model({m}=images)' for m in self.encoders)}")
+        result = {}
+        for modality, images in self._named(vision, touch).items():
+            check_images(images, self.spec.channels(modality), modality)
+            features = self._encode(modality, resized(images, self.stored), shared)
+            result[modality] = self._project(modality, features) if shared else features
+        return result
+
+    def _named(self, vision: Any, touch: Any) -> dict[str, Any]:
+        """modality -> what was given for it."""
+        given = {m: v for m, v in (("vision", vision), ("touch", touch)) if v is not None}
+        if not given:
+            raise ValueError("no images given: give vision=..., touch=..., or both")
+        for modality in given:
+            self.check_modality(modality)
+        return given
+
+    def check_modality(self, modality: str) -> None:
+        """Raise ValueError unless the model has an encoder for ``modality``."""
+        if modality not in self.encoders:
+            raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
+
+    def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
+        view = encoder_input(images, self.run.augment.size if for_heads else self.run.augment.eval_size)
+        return self.encoders[modality](view).float()
+
+    def _project(self, modality: str, features: Tensor) -> Tensor:
+        if modality not in self.projectors:
+            raise ValueError(f"this model has no shared space for {modality}: its method is {self.run.method.name!r}")
+        return nn.functional.normalize(self.projectors[modality](features), dim=1)
+
+    def transform(self, modality: str, *, normalize: bool = False, background: ImageInput | None = None) -> Preprocess:
+        """The preprocessing of one image as a function, e.g. for the dataset of a ``DataLoader``.
 
         Args:
             modality: vision or touch.
-            images: uint8 [B, C, H, W], as a pack stores them.
+            normalize: Return the normalised input of ``trunk`` instead of the images that ``forward`` takes.
+            background: For models trained on difference images: the sensor without contact, one image, to subtract.
+
+        Returns:
+            A function from an image (path, PIL image, array, tensor) to uint8 [C, stored, stored], or with ``normalize``
+            to fp32 [C, S, S]. It can be pickled.
+        """
+        self.check_modality(modality)
+        self._check_background(modality, background)
+        channels, size = self.spec.channels(modality), self.run.augment.eval_size if normalize else None
+        free = None if background is None else to_array(background, channels, "background")
+        return Preprocess(modality, channels, self.stored, size, free)
+
+    def trunk(self, modality: str) -> nn.Module:
+        """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
+
+        Its ``pretrained_cfg`` has the input size, mean and std that ``timm.data.resolve_model_data_config`` reads.
+
+        Raises:
+            ValueError: If the model has no such encoder, or it is not a single timm model.
+        """
+        self.check_modality(modality)
+        channels, size = self.spec.channels(modality), self.run.augment.eval_size
+        mean, std = (values * (channels // 3) for values in (IMAGENET_MEAN, IMAGENET_STD))
+        return timm_trunk(self.encoders[modality], self.run.encoder.trunk, (channels, size, size), mean, std)
+
+    @torch.no_grad()
+    def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
+        """Pooled features of images from a pack, without gradients.
+
+        Args:
+            modality: vision or touch.
+            images: uint8 [B, C, H, W], as a pack stores them, or floats in [0, 1].
             for_heads: Compute the features that ``project`` and ``classify`` take. They see images at the size of the
                 training views (``Augment.size``), while probes see them at ``Augment.whole``.
             bf16: Compute in bf16.
@@ -93,16 +175,14 @@ class Model(nn.Module):
         Returns:
             [B, D], fp32.
         """
-        view = plain_view(images, self.run.augment.size if for_heads else self.run.augment.eval_size)
+        check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
-            return self.encoders[modality](view).float()
+            return self._encode(modality, images, for_heads)
 
     @torch.no_grad()
     def project(self, modality: str, features: Tensor) -> Tensor:
         """Map ``features(..., for_heads=True)`` [B, D] into the shared space [B, E]; L2-normalised."""
-        if modality not in self.projectors:
-            raise ValueError(f"this model has no shared space for {modality}: its method is {self.run.method.name!r}")
-        return nn.functional.normalize(self.projectors[modality](features), dim=1)
+        return self._project(modality, features)
 
     @torch.no_grad()
     def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
@@ -125,10 +205,11 @@ class Model(nn.Module):
         background: ImageInput | None = None,
         shared: bool = False,
     ) -> dict[str, Tensor]:
-        """Embed raw images.
+        """Embed raw images, without gradients and in batches: memory does not grow with their number.
 
-        Images are uint8 arrays [H, W, C] or [N, H, W, C], uint8 tensors [C, H, W] or [N, C, H, W], PIL images, or a list of
-        these. They may have any size: they are resized like the training images.
+        An image is a path, a PIL image, an array [H, W, C] or a tensor [C, H, W] or [H, W, C]. Arrays and tensors are
+        uint8 or float in [0, 1], RGB. Several images are a list of these, an array [N, H, W, C], or a tensor [N, C, H, W]
+        or [N, H, W, C]. They may have any size: they are resized like the training images.
 
         Args:
             vision: Camera images.
@@ -141,34 +222,32 @@ class Model(nn.Module):
             modality -> [N, D], or [N, E] with ``shared``.
 
         Raises:
-            ValueError: If images do not fit the model.
+            ValueError: If images do not fit the model, or the model is in training mode.
 
         Example:
             >>> model.embed(touch=np.zeros((4, 240, 320, 3), np.uint8))["touch"].shape  # doctest: +SKIP
             torch.Size([4, 512])
         """
-        given = {m: v for m, v in (("vision", vision), ("touch", touch)) if v is not None}
-        if not given:
-            raise ValueError("embed: give vision=..., touch=..., or both")
-        if background is not None and (touch is None or not self.spec.difference):
-            why = "there is no touch" if touch is None else "this model was not trained on difference images of touch"
+        if self.training:
+            raise ValueError("the model is in training mode, which would change BatchNorm: call model.eval() first")
+        given = self._named(vision, touch)
+        self._check_background("touch" if touch is not None else "vision", background)
+        return {m: self._embed(m, v, background if m == "touch" else None, shared) for m, v in given.items()}
+
+    def _embed(self, modality: str, value: ImageInput, background: ImageInput | None, shared: bool) -> Tensor:
+        """Embeddings [N, D or E] of one modality."""
+        prepare = self.transform(modality)
+        chunks = []
+        for batch in prepare.batches(value, background, EMBED_BATCH):
+            features = self.features(modality, batch.to(next(self.parameters()).device), for_heads=shared)
+            chunks.append(self.project(modality, features) if shared else features)
+        return torch.cat(chunks)
+
+    def _check_background(self, modality: str, background: ImageInput | None) -> None:
+        if background is not None and (modality != "touch" or not self.spec.difference):
+            untrained = "this model was not trained on difference images of touch"
+            why = untrained if modality == "touch" else "there is no touch"
             raise ValueError(f"background cannot be used, {why}: leave it out")
-        device = next(self.parameters()).device
-        result = {}
-        for modality, value in given.items():
-            if modality not in self.encoders:
-                raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
-            arrays = to_arrays(value, self.spec.channels(modality), modality)
-            if modality == "touch" and background is not None:
-                arrays = subtracted(arrays, to_arrays(background, self.spec.channels("touch"), "background"))
-            chunks = []
-            for i in range(0, len(arrays), EMBED_BATCH):
-                batch = np.stack([fit(a, self.stored) for a in arrays[i : i + EMBED_BATCH]])
-                images = torch.from_numpy(batch).permute(0, 3, 1, 2).to(device)
-                features = self.features(modality, images, for_heads=shared)
-                chunks.append(self.project(modality, features) if shared else features)
-            result[modality] = torch.cat(chunks)
-        return result
 
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None
@@ -220,17 +299,6 @@ class Model(nn.Module):
         write_atomic(path, lambda file: file.write(data))
 
 
-def safetensors_digest(tensors: dict[str, Tensor]) -> str:
-    """sha256 of names, shapes, types and values."""
-    import hashlib
-
-    total = hashlib.sha256()
-    for name in sorted(tensors):
-        total.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}\n".encode())
-        total.update(tensors[name].reshape(-1).view(torch.uint8).numpy().tobytes())
-    return total.hexdigest()
-
-
 def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
     """The model of ``run`` before training, initialised from its seed. Used as a control, and to load weights into."""
     torch.manual_seed(run.seed)
@@ -248,12 +316,7 @@ def load(path: str | Path) -> Model:
     if not file.is_file():
         hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
         raise ValueError(f"no trained model at {file}{hint}")
-    try:
-        with safetensors.safe_open(file, framework="pt") as opened:
-            header = opened.metadata() or {}
-            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - not a dict
-    except Exception as error:  # safetensors raises several types for damaged files
-        raise ValueError(f"{file} cannot be read as safetensors ({brief(error)}): copy it again or re-train") from None
+    header, tensors = read_safetensors(file)
     if header.get("format") != FORMAT:
         raise ValueError(f"{file} was not written by mvitac: its header lacks format={FORMAT}")
     if safetensors_digest(tensors) != header.get("digest"):
@@ -281,53 +344,6 @@ def load(path: str | Path) -> Model:
     return model
 
 
-def check_tensors(file: Path, expected: dict[str, Tensor], found: dict[str, Any]) -> None:
-    """Raise ValueError if the tensors ``found`` in ``file`` do not have the ``expected`` names and shapes."""
-    for name in sorted(expected.keys() ^ found.keys()):
-        where = "is missing" if name in expected else "does not belong"
-        raise ValueError(f"{file} holds other weights than its run describes: tensor {name!r} {where}")
-    for name, tensor in expected.items():
-        if tensor.shape != found[name].shape:
-            shapes = f"{tuple(found[name].shape)}, expected {tuple(tensor.shape)}"
-            raise ValueError(f"{file} holds other weights than its run describes: {name!r} is {shapes}")
-
-
 def precision_of(run: Run, record: dict[str, Any]) -> str:
     """The precision that a recorded run was computed in, with ``auto`` resolved. Older records have no such entry."""
     return record.get("precision", run.precision)
-
-
-def to_arrays(value: ImageInput, channels: int, what: str) -> list[np.ndarray]:
-    """Convert any input of ``Model.embed`` to uint8 arrays [H, W, channels]. ``what`` names it in errors."""
-    if isinstance(value, Image.Image):
-        value = [value]
-    if isinstance(value, (np.ndarray, Tensor)):
-        value = list(value) if value.ndim == 4 else [value]  # other shapes are refused below
-    if isinstance(value, (str, bytes, dict)) or not isinstance(value, Iterable):
-        raise ValueError(f"{what}: expected uint8 images with {channels} channels, got {type(value).__name__}")
-    arrays = []
-    for image in value:
-        if isinstance(image, Image.Image):
-            image = np.asarray(image.convert("RGB"))
-        elif isinstance(image, Tensor):
-            image = image.permute(1, 2, 0).cpu().numpy() if image.ndim == 3 else image.cpu().numpy()
-        if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3:
-            shown = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise ValueError(f"{what}: expected uint8 images with {channels} channels, got {shown}")
-        if 0 in image.shape[:2]:
-            raise ValueError(f"{what}: got an image of shape {image.shape}, which has no pixels")
-        if image.shape[2] != channels:
-            raise ValueError(f"{what}: this model takes {channels} channels, got an image of shape {image.shape}")
-        arrays.append(image)
-    if not arrays:
-        raise ValueError(f"{what}: no images given")
-    return arrays
-
-
-def subtracted(touch: list[np.ndarray], background: list[np.ndarray]) -> list[np.ndarray]:
-    """Difference images of ``touch``: each minus its own ``background``, or all minus a single one."""
-    if len(background) not in (1, len(touch)):
-        raise ValueError(
-            f"background: got {len(background)} images for {len(touch)} of touch: give one, or one for each"
-        )
-    return [difference(image, background[i % len(background)]) for i, image in enumerate(touch)]

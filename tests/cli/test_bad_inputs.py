@@ -42,7 +42,8 @@ from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.evaluation import probe as probe_module
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.model import Model, safetensors_digest
+from mvitac.model import Model
+from mvitac.nn.weights import safetensors_digest
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.system.files import digest, write_atomic

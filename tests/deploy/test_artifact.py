@@ -19,6 +19,7 @@ import torch
 
 import mvitac
 from mvitac.cli.main import main
+from mvitac.data.images import difference
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
@@ -28,7 +29,6 @@ from mvitac.deploy.search import check_pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import split_rows
-from mvitac.model import subtracted
 from mvitac.system.files import digest_file
 
 
@@ -145,7 +145,7 @@ def test_predict_subtracts_the_background(copy: Path, pack: Pack) -> None:
     model = mvitac.load(copy)
     model.spec = replace(model.spec, difference=True)
     press, free = pack.images["touch"][3], pack.images["touch"][4]
-    expected = model.predict(touch=subtracted([press], [free]))["pattern"]
+    expected = model.predict(touch=difference(press, free))["pattern"]
     assert torch.equal(model.predict(touch=press, background=free)["pattern"], expected)
     assert not torch.equal(model.predict(touch=press)["pattern"], expected)
 

@@ -12,11 +12,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mvitac.model import Model
-from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
+from mvitac.transforms.preprocess import check_range, encoder_input, resized
 
 STATE = "observation.state"
 
@@ -26,9 +25,6 @@ class ObservationEncoder(nn.Module):
 
     A model of difference images (``model.spec.difference``) takes touch as (touch - background) / 2 + one half.
     """
-
-    mean: Tensor
-    std: Tensor
 
     def __init__(self, model: Model, keys: Mapping[str, str], *, state: int = 0, tune: bool = False) -> None:
         """
@@ -55,8 +51,6 @@ class ObservationEncoder(nn.Module):
                 )
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.keys})
         self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.eval_size, state, tune
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         self._checked: set[str] = set()
         self.encoders.requires_grad_(tune)
         self.encoders.eval()
@@ -82,7 +76,7 @@ class ObservationEncoder(nn.Module):
                     )
                 self._check_range(name, image)
                 lead = image.shape[:-3]
-                views.append(self._view(image.flatten(0, -4)))
+                views.append(encoder_input(resized(image.flatten(0, -4), self.stored), self.size))
             with torch.set_grad_enabled(self.tune and torch.is_grad_enabled()):
                 found.append(self.encoders[modality](torch.cat(views, dim=1)).float())
         features = torch.cat(found, dim=1).unflatten(0, lead)
@@ -102,18 +96,7 @@ class ObservationEncoder(nn.Module):
         """Check the first images of a key only: each check makes a GPU wait."""
         if name in self._checked:
             return
-        low, high = (float(x) for x in image.aminmax())
-        if image.dtype != torch.uint8 and not (low >= -1e-3 and high <= 1 + 1e-3):
-            raise ValueError(
-                f"{name}: expected floats in [0, 1] or uint8, got {image.dtype} from {low:.3g} to {high:.3g}: the encoder"
-                " normalises images itself, give them as they come from the camera"
-            )
+        if image.dtype != torch.uint8:
+            low, high = image.aminmax()
+            check_range(float(low), float(high), image.dtype, name)
         self._checked.add(name)
-
-    def _view(self, image: Tensor) -> Tensor:
-        """Normalised [N, 3, size, size], resized in two steps as in training."""
-        x = image.float() / 255 if image.dtype == torch.uint8 else image.float()
-        for side in (self.stored, self.size):
-            if x.shape[-2:] != (side, side):
-                x = F.interpolate(x, (side, side), mode="bilinear", antialias=True)
-        return (x - self.mean) / self.std

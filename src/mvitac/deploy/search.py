@@ -24,11 +24,12 @@ import pyarrow.parquet as pq
 import torch
 
 from mvitac.data.pack import Pack, has_difference
-from mvitac.model import ImageInput, Model, load
+from mvitac.model import Model, load
 from mvitac.registry import unknown
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.progress import work
+from mvitac.transforms.preprocess import ImageInput
 
 FORMAT, FORMAT_VERSION = "mvitac-index", 1
 BLOCK = 1 << 16

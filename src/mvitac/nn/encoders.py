@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,12 +11,12 @@ from typing import Any, Literal
 
 import timm
 import torch
-from timm.models import register_model
+from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.nn.small_conv import use_products
+from mvitac.nn.small_conv import use_convolutions, use_products
 from mvitac.registry import LATER
 from mvitac.system.files import brief
 
@@ -120,6 +121,42 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
             f"ImageNet weights for {config.trunk} could not be loaded ({brief(error)}): check the network,"
             " give --encoder.weights FILE, or start from random weights with --encoder.weights scratch"
         ) from None
+
+
+def timm_trunk(
+    encoder: nn.Module, name: str, input_size: tuple[int, int, int], mean: tuple[float, ...], std: tuple[float, ...]
+) -> nn.Module:
+    """A copy of an encoder from ``build_trunk`` as timm would have made it, with a ``pretrained_cfg`` of these values.
+
+    Args:
+        encoder: The encoder.
+        name: Name of its timm model.
+        input_size: Channels, height and width of its images.
+        mean: Mean of each channel.
+        std: Standard deviation of each channel.
+
+    Raises:
+        ValueError: If ``encoder`` is not a single timm model.
+    """
+    if not hasattr(encoder, "forward_features"):
+        raise ValueError(f"this encoder is no single timm model but a {type(encoder).__name__}: use model.encoders")
+    trunk = use_convolutions(copy.deepcopy(encoder))
+    known: dict[str, Any] = getattr(encoder, "pretrained_cfg", None) or {}
+    kept = {key: known[key] for key in ("first_conv", "classifier", "fixed_input_size") if key in known}
+    # timm resizes as `Model.transform` does when images are stored at the size that the encoder sees.
+    resize: dict[str, Any] = {"interpolation": "bilinear", "crop_pct": 1.0, "crop_mode": "squash"}
+    cfg = PretrainedCfg(
+        architecture=name.split(".")[0],
+        tag="mvitac",
+        input_size=input_size,
+        mean=mean,
+        std=std,
+        num_classes=0,
+        **resize,
+        **kept,
+    ).to_dict()
+    trunk.pretrained_cfg = trunk.default_cfg = cfg  # type: ignore[assignment]
+    return trunk
 
 
 class Head(nn.Sequential):

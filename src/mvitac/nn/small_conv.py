@@ -47,6 +47,14 @@ def use_products(trunk: nn.Module) -> nn.Module:
     return trunk
 
 
+def use_convolutions(trunk: nn.Module) -> nn.Module:
+    """``trunk``, the work of ``use_products`` undone."""
+    for conv in trunk.modules():
+        if type(conv) is SmallMapConv2d:
+            conv.__class__ = nn.Conv2d
+    return trunk
+
+
 @lru_cache
 def _rows(height: int, width: int, stride: int) -> list[tuple[int, int, slice, slice]]:
     """Every (pixel out, row of the kernel, its columns over the map, the pixels in under them)."""

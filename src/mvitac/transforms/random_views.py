@@ -220,11 +220,11 @@ def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Ten
     The antialiased filter is the same as on the CPU. On a GPU it uses fp16, in which pixels are exact and the weights cause
     errors below 0.1 level.
     """
-    device, side = images.device, images.shape[-1]
+    device = images.device
     top, left, height, width = drawn.boxes.to(device, torch.float32, non_blocking=True).unbind(1)
     exact = torch.float16 if device.type == "cuda" else torch.float32
-    rows = _resampling(top, height, side, size).to(exact)[:, None]
-    columns = _resampling(left, width, side, size)
+    rows = _resampling(top, height, images.shape[-2], size).to(exact)[:, None]
+    columns = _resampling(left, width, images.shape[-1], size)
     flip = drawn.flip.to(device, non_blocking=True)[:, None, None]
     columns = torch.where(flip, columns.flip(1), columns).to(exact)[:, None]
     with torch.autocast(device.type, enabled=False):
@@ -247,6 +247,7 @@ def _resampling(start: Tensor, length: Tensor, side: int, size: int) -> Float[Te
 
 
 @lru_cache
+@torch.inference_mode(False)  # tensors made in inference mode would refuse gradients later
 def _normalisation(device: torch.device) -> tuple[Tensor, Tensor]:
     """Factor and offset [3] that normalise levels 0-255 by ImageNet's mean and standard deviation."""
     mean, std = (torch.tensor(v, dtype=torch.float64) for v in (IMAGENET_MEAN, IMAGENET_STD))
@@ -306,9 +307,15 @@ def _noisy(view: Float[Tensor, "B C S S"], noise: float, generator: torch.Genera
 
 def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B C S S"]:
     """Whole images resized to ``size`` and normalised, without randomness, for probes and predictions."""
-    num, _, side, _ = images.shape
-    whole = torch.tensor([[0, 0, side, side]]).expand(num, 4)
+    num, _, height, width = images.shape
+    whole = torch.tensor([[0, 0, height, width]]).expand(num, 4)
     never = torch.zeros(num, dtype=torch.bool)
     # On CPUs not the compiled version: there are few images, or the network takes longer, so numba need not be loaded.
     implementation = _one_by_one if images.device.type == "cpu" else _batched
     return implementation(images, Drawn(whole, never, never, torch.ones(num, 5)), size, torch.float32)
+
+
+def normalise(images: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
+    """Normalise levels in [0, 1] by ImageNet's mean and standard deviation. Returns channels-last."""
+    scale, shift = (t.repeat(images.shape[1] // 3).view(-1, 1, 1) for t in _normalisation(images.device))
+    return torch.addcmul(shift, images, scale * 255).contiguous(memory_format=torch.channels_last)

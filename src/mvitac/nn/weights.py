@@ -1,0 +1,46 @@
+"""Named tensors in safetensors files: read, digest, compare with what a network needs."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import torch
+from torch import Tensor
+
+from mvitac.system.files import brief
+
+
+def read_safetensors(file: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Header and tensors of ``file``.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
+    try:
+        with safetensors.safe_open(file, framework="pt") as opened:
+            return opened.metadata() or {}, {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except Exception as error:  # safetensors raises several types for damaged files
+        raise ValueError(f"{file} cannot be read as safetensors ({brief(error)}): copy it again or re-train") from None
+
+
+def safetensors_digest(tensors: dict[str, Tensor]) -> str:
+    """sha256 of names, shapes, types and values."""
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}\n".encode())
+        total.update(tensors[name].reshape(-1).view(torch.uint8).numpy().tobytes())
+    return total.hexdigest()
+
+
+def check_tensors(file: Path, expected: dict[str, Tensor], found: dict[str, Any]) -> None:
+    """Raise ValueError if the tensors ``found`` in ``file`` do not have the ``expected`` names and shapes."""
+    for name in sorted(expected.keys() ^ found.keys()):
+        where = "is missing" if name in expected else "does not belong"
+        raise ValueError(f"{file} holds other weights than its run describes: tensor {name!r} {where}")
+    for name, tensor in expected.items():
+        if tensor.shape != found[name].shape:
+            shapes = f"{tuple(found[name].shape)}, expected {tuple(tensor.shape)}"
+            raise ValueError(f"{file} holds other weights than its run describes: {name!r} is {shapes}")

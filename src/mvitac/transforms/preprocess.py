@@ -1,0 +1,155 @@
+"""From raw images of any kind to the input of an encoder, without randomness.
+
+An image is first resized to ``stored``, the side of the training pack's images, and then to the side that the encoder
+sees. Shapes: B images, C channels, H x W pixels, S the side that the encoder sees.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from mvitac.data.images import decode, difference, fit
+from mvitac.transforms.random_views import normalise, plain_view
+
+ImageInput = str | Path | np.ndarray | Tensor | Image.Image | Sequence[Any]
+"""One image or several, as ``Model.embed`` accepts them."""
+TOLERANCE = 1e-3
+"""By which floats may lie outside [0, 1], as rounding and resizing leave them."""
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """The preprocessing of ``Model.embed`` for one image, e.g. as the transform of a dataset. It can be pickled.
+
+    Made by ``Model.transform``.
+    """
+
+    modality: str
+    channels: int
+    stored: int
+    """Side in pixels of the images in the training pack."""
+    size: int | None = None
+    """Side of normalised images for the trunk. None: uint8 at ``stored`` pixels, for ``Model.forward``."""
+    background: np.ndarray | None = None
+    """The touch sensor without contact, uint8 [H, W, C], to subtract."""
+
+    def __call__(self, image: ImageInput) -> Tensor:
+        """One image (a path, PIL image, array or tensor) to uint8 [C, stored, stored], or fp32 [C, size, size]."""
+        pixels = torch.from_numpy(self._stored(image, self.background)).permute(2, 0, 1).contiguous()
+        return pixels if self.size is None else plain_view(pixels[None], self.size)[0].contiguous()
+
+    def batches(self, images: ImageInput, background: ImageInput | None, num: int) -> Iterator[Tensor]:
+        """Batches uint8 [<= num, C, stored, stored] of one image or several, read as they are needed.
+
+        ``background`` is one image, or one for each of ``images``.
+        """
+        given, free = single_images(images, self.modality), [None]
+        if background is not None:
+            free = [to_array(x, self.channels, "background") for x in single_images(background, "background")]
+        if len(free) not in (1, len(given)):
+            raise ValueError(f"background: got {len(free)} images for {len(given)} of touch: give one, or one for each")
+        for start in range(0, len(given), num):
+            rows = range(start, min(start + num, len(given)))
+            batch = np.stack([self._stored(given[i], free[i % len(free)]) for i in rows])
+            yield torch.from_numpy(batch).permute(0, 3, 1, 2)
+
+    def _stored(self, image: Any, background: np.ndarray | None) -> np.ndarray:
+        """One image of any kind as a new uint8 array [stored, stored, channels], as a pack would store it."""
+        array = to_array(image, self.channels, self.modality)
+        return np.array(fit(array if background is None else difference(array, background), self.stored))
+
+
+def single_images(value: ImageInput, what: str) -> list[Any]:
+    """The images in any input of ``Model.embed``, as they are. ``what`` names it in errors."""
+    if isinstance(value, (str, os.PathLike, Image.Image)):
+        return [value]
+    if isinstance(value, (np.ndarray, Tensor)) and value.ndim not in (1, 4):
+        return [value]
+    if isinstance(value, (bytes, dict)) or not isinstance(value, Iterable):
+        raise ValueError(f"{what}: expected one image or several, got {type(value).__name__}")
+    if not (images := list(value)):
+        raise ValueError(f"{what}: no images given")
+    return images
+
+
+def to_array(image: Any, channels: int, what: str) -> np.ndarray:
+    """One image of any kind as uint8 [H, W, channels].
+
+    Raises:
+        ValueError: If it is no such image. ``what`` names it in the message.
+    """
+    first = isinstance(image, Tensor)  # channels are first in tensors and last in arrays, where both would fit
+    if isinstance(image, (str, os.PathLike)):
+        image = decode(Path(image))
+    if isinstance(image, Image.Image):
+        image = np.asarray(image.convert("RGB"))
+    if isinstance(image, Tensor):
+        image = (image.float() if image.is_floating_point() else image).detach().cpu().numpy()
+    known = isinstance(image, np.ndarray) and (image.dtype == np.uint8 or np.issubdtype(image.dtype, np.floating))
+    if not known or image.ndim != 3:
+        shown = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"{what}: expected uint8 images, or floats in [0, 1], with {channels} channels, got {shown}")
+    if 0 in image.shape:
+        raise ValueError(f"{what}: got an image of shape {image.shape}, which has no pixels")
+    if channels not in (image.shape[0], image.shape[2]):
+        raise ValueError(f"{what}: this model takes {channels} channels, got an image of shape {image.shape}")
+    if image.shape[0] == channels and (first or image.shape[2] != channels):
+        image = image.transpose(1, 2, 0)
+    if image.dtype == np.uint8:
+        return image
+    check_range(float(image.min()), float(image.max()), image.dtype, what)
+    return (image.clip(0, 1) * 255).round().astype(np.uint8)
+
+
+def check_range(low: float, high: float, dtype: Any, what: str) -> None:
+    """Raise ValueError if floats from ``low`` to ``high`` are no levels in [0, 1]."""
+    if not (low >= -TOLERANCE and high <= 1 + TOLERANCE):
+        raise ValueError(
+            f"{what}: expected floats in [0, 1] or uint8, got {dtype} from {low:.3g} to {high:.3g}: the model normalises"
+            " images itself, give them as they come from the camera (levels 0 to 255 as uint8)"
+        )
+
+
+def check_images(images: Tensor, channels: int, what: str) -> None:
+    """Raise ValueError unless ``images`` is [B, channels, H, W], uint8 or float in [0, 1]."""
+    known = isinstance(images, Tensor) and (images.dtype == torch.uint8 or images.is_floating_point())
+    if not known or images.ndim != 4 or images.shape[1] != channels or not images.numel():
+        shown = f"{images.dtype} {list(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
+        raise ValueError(
+            f"{what}: expected a tensor [B, {channels}, H, W], uint8 or float in [0, 1], got {shown}"
+            " (`embed` takes any image)"
+        )
+    if images.dtype != torch.uint8:
+        low, high = images.detach().aminmax()
+        check_range(float(low), float(high), images.dtype, what)
+
+
+def resized(images: Tensor, side: int) -> Tensor:
+    """Resize [B, C, H, W] to [B, C, side, side], ignoring the aspect ratio; uint8 stays uint8."""
+    if images.shape[-2:] == (side, side):
+        return images
+    whole = images.dtype == torch.uint8
+    # torch's uint8 kernel, for CPUs only, gives Pillow's pixels (0.3 % differ by one level).
+    levels = images.contiguous(memory_format=torch.channels_last) if whole and images.is_cpu else images.float()
+    levels = F.interpolate(levels, (side, side), mode="bilinear", antialias=True)
+    return levels.round().to(torch.uint8) if whole and not images.is_cpu else levels
+
+
+def encoder_input(images: Tensor, size: int) -> Tensor:
+    """Images [B, C, H, W], uint8 or float in [0, 1], as normalised fp32 [B, C, size, size].
+
+    Gradients flow to float images.
+    """
+    if images.dtype == torch.uint8:
+        return plain_view(images, size)
+    return normalise(resized(images.float(), size))
