@@ -32,8 +32,8 @@ from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, e
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 FORMAT = "mvitac-model"
-EMBED_BATCH = 256
-"""Images that ``Model.embed`` passes through an encoder at once."""
+EMBED_BATCH = 64
+"""Images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px."""
 
 
 class Model(nn.Module):

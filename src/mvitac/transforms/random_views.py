@@ -247,7 +247,6 @@ def _resampling(start: Tensor, length: Tensor, side: int, size: int) -> Float[Te
 
 
 @lru_cache
-@torch.inference_mode(False)  # tensors made in inference mode would refuse gradients later
 def _normalisation(device: torch.device) -> tuple[Tensor, Tensor]:
     """Factor and offset [3] that normalise levels 0-255 by ImageNet's mean and standard deviation."""
     mean, std = (torch.tensor(v, dtype=torch.float64) for v in (IMAGENET_MEAN, IMAGENET_STD))
