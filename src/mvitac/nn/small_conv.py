@@ -51,7 +51,7 @@ def use_convolutions(trunk: nn.Module) -> nn.Module:
     """``trunk``, the work of ``use_products`` undone."""
     for conv in trunk.modules():
         if type(conv) is SmallMapConv2d:
-            conv.__class__ = nn.Conv2d
+            conv.__class__ = nn.Conv2d  # type: ignore[assignment]
     return trunk
 
 
