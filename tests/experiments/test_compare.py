@@ -258,7 +258,7 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
     assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"].mean
     tex = (out / "table.tex").read_text()
-    assert tex.count(r"\\") == len(lines) + 1 and "[57.6]" in tex
+    assert tex.count(r"\\") == len(lines) + 1 and "(57.6)" in tex
     assert json.loads((out / "result.json").read_text())["rows"] == ["MViTac", "colder", "supervised, touch"]
 
 

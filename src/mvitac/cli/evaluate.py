@@ -37,7 +37,8 @@ class _ProbeOptions:
     """Also use 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and report the
     gain of a split that leaks groups."""
     json: Path | None = None
-    """Also write everything that is printed, and more, to this file."""
+    """Also write everything that is printed, and more, to this file. Without it, all but the results of --stress is
+    in probe.json in the folder of each run."""
 
 
 def probe(argv: list[str]) -> None:
@@ -88,8 +89,8 @@ class _ReportOptions:
     out: Path | None = None
     """Folder of the page (default: report inside the run's folder; runs/report for several runs)."""
     probe: Path | None = None
-    """File that `mvitac probe RUN... --json FILE` wrote; without it the runs are probed now. The probe.json in a run's
-    folder has no controls and does not serve."""
+    """Scores of these runs, as `mvitac probe RUN... --json FILE` wrote them. Default: the probe.json that `mvitac probe
+    RUN...` left in the first run's folder; if that is missing or incomplete, the runs are probed now."""
     quiet: bool = False
     """No progress."""
 
