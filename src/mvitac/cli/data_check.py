@@ -6,19 +6,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse, selectors, short
+from mvitac.cli.options import check_json, console, parse, save_json, selectors, short
 from mvitac.data.checks.contact_sheet import draw
 from mvitac.data.checks.examine import examine_pack, examine_source
 from mvitac.data.checks.finding import exit_code
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
-from mvitac.system.files import check_place, write_atomic, write_json
+from mvitac.system.files import check_place, write_atomic
 
 _COLOURS = {"ok": "green", "look": "yellow", "broken": "bold red", "not checkable": "dim"}
 _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step.
@@ -31,7 +30,7 @@ _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copi
 @dataclass(frozen=True, kw_only=True)
 class _Options:
     json: Path | None = None
-    """Also write every finding to this file."""
+    """Also write every finding to this file; - = stdout, and the table to stderr."""
     sheet: Path | None = None
     """Also draw the suspicious rows into this PNG."""
 
@@ -92,11 +91,10 @@ def _report(what: str, findings: Sequence[Any], strips: Any, options: _Options) 
     for finding in findings:
         text = finding.evidence + (f"\n-> {finding.advice}" if finding.advice else "")
         table.add_row(Text(finding.verdict, style=_COLOURS[finding.verdict]), finding.item, text)
-    Console(markup=False).print(table)
-    if options.json:
-        write_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
-        print(f"written: {options.json}")
+    say = console(options.json)
+    say.print(table)
+    save_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
     if options.sheet:
         write_atomic(options.sheet, lambda file: draw(file, strips))
-        print(f"written: {options.sheet}")
+        say.print(f"written: {options.sheet}", soft_wrap=True)
     return code

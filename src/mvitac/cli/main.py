@@ -84,7 +84,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except (ValueError, OSError, MemoryError) as error:
-        print(f"mvitac: error: {one_line(error)}", file=sys.stderr)
+        text = one_line(error)
+        if arguments[0] == "data":  # here the options of a dataset are --path, not --data.path as for pretrain
+            text = text.replace("--data.", "--")
+        print(f"mvitac: error: {text}", file=sys.stderr)
         return 2
     except Exception as error:
         if type(error).__name__ == "Interrupted":

@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse
+from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import load
 from mvitac.deploy.search import Index, build, check_pack, describe, embeddings
-from mvitac.system.files import brief, check_place, write_atomic, write_json
+from mvitac.system.files import brief, check_place, write_atomic
 from mvitac.system.progress import shown
 
 _SIDE = 160
@@ -109,7 +109,7 @@ class _FindOptions:
     k: int = 5
     """How many to find."""
     json: Path | None = None
-    """Also write what was found to this file."""
+    """Also write what was found to this file; - = stdout, and the table to stderr."""
     picture: Path | None = None
     """Also draw the query and what was found into this PNG (needs the indexed pack at its old path)."""
 
@@ -141,9 +141,8 @@ def find(argv: list[str]) -> None:
     for one in found:
         labels = (one["labels"].get(task, "") for task in index.meta["classes"])
         table.add_row(f"{one['cosine']:.3f}", one["id"], one["group"], *labels)
-    Console(markup=False).print(table)
-    if options.json:
-        write_json(options.json, {"from": options.source, "to": options.target, "found": found})
+    console(options.json).print(table)
+    save_json(options.json, {"from": options.source, "to": options.target, "found": found})
     if options.picture:
         _draw(options.picture, query, index, options.target, [one["row"] for one in found])
 
