@@ -178,3 +178,30 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     before = weights.stat().st_mtime_ns
     assert main(command) == 0
     assert weights.stat().st_mtime_ns == before
+
+
+def test_completion_in_bash(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from mvitac.cli import completion
+
+    some = ("data info", "data pack", "find")  # the options of all commands take ten seconds
+    monkeypatch.setattr(completion, "COMMANDS", {name: COMMANDS[name] for name in some})
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "script"
+    script.write_text(capsys.readouterr().out)
+    tried = """
+    try() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _mvitac; echo "${COMPREPLY[@]}"; }
+    complete -p mvitac
+    try mvitac fi
+    try mvitac data ""
+    try mvitac data pack --data fol
+    try mvitac data pack --data folder --touch-
+    try mvitac find --jso
+    try mvitac find picture
+    """
+    shell = ["bash", "-c", f"source {script}\n{tried}"]
+    shown = subprocess.run(shell, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert shown[0] == "complete -o default -F _mvitac mvitac"
+    assert shown[1:] == ["find", "info pack", "folder", "--touch-group", "--json", ""]
+    assert main(["completion", "fish"]) == 2

@@ -1,5 +1,6 @@
 """``mvitac data check``: what is wrong with a dataset."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -44,8 +45,8 @@ class _PackOptions(_Options):
 @dataclass(frozen=True, kw_only=True)
 class _SourceOptions(_Options):
     data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
-    num: int = 0
-    """Number of items to read, evenly spread over the source; 0 = all."""
+    items: int = 0
+    """Number of items to read, evenly spread over the source; 0 = all. (0.1.0 called it --num, which still works.)"""
     thumbnail: int = 64
     """Side in pixels to which images are reduced for the examination."""
     quiet: bool = False
@@ -61,15 +62,18 @@ def check(argv: list[str]) -> int:
         return _report(str(options.pack), *examine_pack(options.pack), options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
-    options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
+    rest = short(rest)
+    if not hasattr(usual.data, "num"):  # of a simulator --num is the size of the data
+        rest = [re.sub(r"^--num(?==|$)", "--items", word) for word in rest]
+    options = parse(_SourceOptions, rest, f"data check {name}", default=usual, description=_MANUAL)
     _check_places(options)
-    if options.num < 0:
-        raise ValueError(f"--num {options.num}: give the number of items to read, 0 for all")
+    if options.items < 0:
+        raise ValueError(f"--items {options.items}: give the number of items to read, 0 for all")
     data: Any = options.data
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     findings, strips = examine_source(
-        source, num=options.num, size=options.thumbnail, workers=data.workers, quiet=options.quiet
+        source, num=options.items, size=options.thumbnail, workers=data.workers, quiet=options.quiet
     )
     return _report(name, findings, strips, options)
 

@@ -35,6 +35,7 @@ how good the features are.
   embed PACK           embeddings of every row, as .npz or .parquet
   index PACK           make a pack searchable
   find IMAGE           the nearest known touches to a picture, and back
+  completion bash      a script for completion by TAB in bash and zsh
 
 First steps:
   mvitac demo                                        # no data needed
@@ -64,6 +65,7 @@ COMMANDS = {
     "embed": "search:embed",
     "index": "search:index",
     "find": "search:find",
+    "completion": "completion:completion",
 }
 """Command -> module of this package:function, imported when called."""
 
