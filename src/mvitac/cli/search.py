@@ -1,9 +1,12 @@
-"""``mvitac embed``, ``index`` and ``find``: embeddings of whole packs, and the nearest of them."""
+"""``mvitac embed``, ``index`` and ``find``: embeddings of whole packs, and the nearest of them.
+
+What needs torch is imported after the options are parsed, so that --help is quick.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -16,10 +19,11 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.pack import Pack
-from mvitac.deploy.artifact import load
-from mvitac.deploy.search import Index, build, check_pack, describe, embeddings
 from mvitac.system.files import brief, check_place, write_atomic
 from mvitac.system.progress import shown
+
+if TYPE_CHECKING:
+    from mvitac.deploy.search import Index
 
 _SIDE = 160
 """Pixels: side of one picture in the sheet of what was found."""
@@ -46,6 +50,9 @@ class _EmbedOptions(_Embedding):
 def embed(argv: list[str]) -> None:
     """mvitac embed PACK --model M --out FILE.npz|FILE.parquet"""
     options = parse(_EmbedOptions, argv, "embed")
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.search import check_pack, describe, embeddings
+
     if options.out.suffix not in (".npz", ".parquet"):
         raise ValueError(f"--out {options.out}: give a name that ends in .npz or .parquet")
     check_place(options.out)
@@ -85,6 +92,9 @@ class _IndexOptions(_Embedding):
 def index(argv: list[str]) -> None:
     """mvitac index PACK --model M --out DIR"""
     options = parse(_IndexOptions, argv, "index")
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.search import build
+
     with shown(Console(stderr=True)):
         made = build(load(options.model), Pack(options.pack), options.out, options.splits)
     shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
@@ -117,6 +127,8 @@ class _FindOptions:
 def find(argv: list[str]) -> None:
     """mvitac find IMAGE --in INDEX [--from touch] [--to vision] [--json FILE]"""
     options = parse(_FindOptions, argv, "find")
+    from mvitac.deploy.search import Index
+
     if not options.image:
         raise ValueError("name the picture to search for: mvitac find IMAGE --in INDEX")
     check_json(options.json)
@@ -159,7 +171,7 @@ def _picture(files: Sequence[Path]) -> np.ndarray:
     return np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
 
 
-def _draw(out: Path, query: np.ndarray, index: Index, target: str, rows: Sequence[int]) -> None:
+def _draw(out: Path, query: np.ndarray, index: "Index", target: str, rows: Sequence[int]) -> None:
     """A PNG of the query and the ``target`` images in ``rows`` of the indexed pack, side by side."""
     pack = Pack(index.meta["pack"], verify=False)
     if pack.digest != index.meta["pack_digest"]:
