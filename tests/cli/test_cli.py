@@ -179,7 +179,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     summary = json.loads((tmp_path / "demo" / "summary.json").read_text())
     for modality in ("touch", "vision", "both"):
         cell = summary["category"][modality]["mvitac"]
-        assert set(cell) == {"mean", "low", "high", "seeds"} and cell["seeds"] == [0, 1]
+        assert set(cell) == {"mean", "low", "high", "seeds", "groups"} and cell["seeds"] == [0, 1]
         assert cell["low"] <= cell["mean"] <= cell["high"]
     trained = json.loads((tmp_path / "demo" / "seed0" / "run.json").read_text())["run"]
     assert trained["recipe"] == "quick" and trained["method"]["keys"] == "end-to-end"
