@@ -218,3 +218,12 @@ def test_completion_in_bash(
     assert shown[0] == "complete -o default -F _mvitac mvitac"
     assert shown[1:] == ["find", "info pack", "folder", "--touch-group", "--json", ""]
     assert main(["completion", "fish"]) == 2
+
+
+def test_data_check_of_simulated_data_has_options(capsys: pytest.CaptureFixture[str]) -> None:
+    """Where --num is the size of the data, the items to read are --items; elsewhere the old name --num is the same."""
+    with pytest.raises(SystemExit, match="0"):
+        main(["data", "check", "--data", "materials", "--help"])
+    assert "--num INT" in (shown := capsys.readouterr().out) and "--items INT" in shown
+    assert main(["data", "check", "--data", "folder", "--num", "-1"]) == 2
+    assert "--items -1" in capsys.readouterr().err
