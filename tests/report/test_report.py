@@ -141,8 +141,9 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
     for row in filter(None, rows):
         task = row[0].split(" (")[0] if len(row) == 1 else task  # category (24 test instances)
         shown[task, row[0]] = [unescape(value).replace("\xa0", " ") for value in row[1:]]
-    assert set(result["summary"]) == {"category", "soft", "rough"}
-    for task, found in result["summary"].items():
+    assert {"category", "soft", "rough"} <= set(result["summary"])
+    for task in ("category", "soft", "rough"):
+        found = result["summary"][task]
         sources = {source for cells in found.values() for source in cells}
         assert sources == {"mvitac", "untrained", "pixels", "border", "majority"}
         for source in sources:
@@ -327,7 +328,7 @@ def test_retrieval_has_one_number_for_one_thing() -> None:
 def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
     """(task, modality, source) -> score and interval as text."""
     cells: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    for r in records:
+    for r in (r for r in records if "group_correct" in r):  # of tasks with classes
         cells.setdefault((r["task"], r["modality"], r["source"]), []).append(r)
     assert len(cells) == 3 * (3 * 3 + 1 + 1)
     found = {cell: [100 * value for value in interval(records)] for cell, records in cells.items()}

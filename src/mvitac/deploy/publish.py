@@ -83,7 +83,11 @@ def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, 
     """The probes' ``records`` with those of the controls, as printed by ``mvitac probe``, JSON-ready."""
     own = {"source": model.run.method.name, "seed": model.run.seed}
     stored = stored_result([run], pack)
-    controls = [r for r in stored["records"] if "run" not in r] if stored else _controls(model, pack, records)
+    tasks = {record["task"] for record in records}  # a task with values has no probe that is published
+    if stored:
+        controls = [r for r in stored["records"] if "run" not in r and r["task"] in tasks]
+    else:
+        controls = _controls(model, pack, records)
     return {
         "data": pack.spec.name,
         "group_by": pack.spec.group_by,

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mvitac.evaluation.scores import by_cell, least_p, percent, resampled, with_interval
+from mvitac.evaluation.scores import by_cell, least_p, num_groups_of, percent, resampled, with_interval
 from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Cell, Line, lines_of, stresses_of
 from mvitac.registry import from_json
@@ -93,7 +93,7 @@ def _gap(cell: Cell | None) -> str:
 
 def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     """Paragraphs about data, budget, statistics, and everything that limits the comparison."""
-    least = least_p(max((len(record["group_sizes"]) for record in result["records"]), default=1))
+    least = least_p(max((num_groups_of(record) for record in result["records"]), default=1))
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"

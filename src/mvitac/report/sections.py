@@ -110,7 +110,7 @@ def probe(study: Study) -> str:
     scores = ("accuracy", "balanced_accuracy", "macro_f1", "auroc")
     rows = [
         [r["source"], "" if r["seed"] is None else str(r["seed"]), r["task"], r["modality"], r["probe"]]
-        + ["" if r[k] is None else percent(r[k]) for k in scores]
+        + ["" if r.get(k) is None else percent(r[k]) for k in scores]  # a task with values has none
         for r in records
     ]
     columns = ("", "seed", "task", "features", "probe", "accuracy", "balanced", "macro F1", "AUROC")
