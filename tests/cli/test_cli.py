@@ -24,6 +24,19 @@ def test_help_imports_nothing_heavy() -> None:
         assert f"'{heavy}'" not in out
 
 
+def test_help_of_commands_that_only_use_models_imports_no_torch() -> None:
+    code = """
+import sys
+from mvitac.cli.main import main
+for command in (["data", "info"], ["embed"], ["index"], ["find"], ["explore"], ["live"]):
+    try: main([*command, "--help"])
+    except SystemExit: pass
+    print(command, "torch" in sys.modules)
+"""
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.count("] False") == 6 and "] True" not in shown
+
+
 def test_importing_the_package_imports_no_torch() -> None:
     code = "import sys, mvitac; print('torch' in sys.modules, 'numpy' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
@@ -166,7 +179,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     summary = json.loads((tmp_path / "demo" / "summary.json").read_text())
     for modality in ("touch", "vision", "both"):
         cell = summary["category"][modality]["mvitac"]
-        assert set(cell) == {"mean", "low", "high", "seeds"} and cell["seeds"] == [0, 1]
+        assert set(cell) == {"mean", "low", "high", "seeds", "groups"} and cell["seeds"] == [0, 1]
         assert cell["low"] <= cell["mean"] <= cell["high"]
     trained = json.loads((tmp_path / "demo" / "seed0" / "run.json").read_text())["run"]
     assert trained["recipe"] == "quick" and trained["method"]["keys"] == "end-to-end"
@@ -178,3 +191,39 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     before = weights.stat().st_mtime_ns
     assert main(command) == 0
     assert weights.stat().st_mtime_ns == before
+
+
+def test_completion_in_bash(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from mvitac.cli import completion
+
+    some = ("data info", "data pack", "find")  # the options of all commands take ten seconds
+    monkeypatch.setattr(completion, "COMMANDS", {name: COMMANDS[name] for name in some})
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "script"
+    script.write_text(capsys.readouterr().out)
+    tried = """
+    try() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _mvitac; echo "${COMPREPLY[@]}"; }
+    complete -p mvitac
+    try mvitac fi
+    try mvitac data ""
+    try mvitac data pack --data fol
+    try mvitac data pack --data folder --touch-
+    try mvitac find --jso
+    try mvitac find picture
+    """
+    shell = ["bash", "-c", f"source {script}\n{tried}"]
+    shown = subprocess.run(shell, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert shown[0] == "complete -o default -F _mvitac mvitac"
+    assert shown[1:] == ["find", "info pack", "folder", "--touch-group", "--json", ""]
+    assert main(["completion", "fish"]) == 2
+
+
+def test_data_check_of_simulated_data_has_options(capsys: pytest.CaptureFixture[str]) -> None:
+    """Where --num is the size of the data, the items to read are --items; elsewhere the old name --num is the same."""
+    with pytest.raises(SystemExit, match="0"):
+        main(["data", "check", "--data", "materials", "--help"])
+    assert "--num INT" in (shown := capsys.readouterr().out) and "--items INT" in shown
+    assert main(["data", "check", "--data", "folder", "--num", "-1"]) == 2
+    assert "--items -1" in capsys.readouterr().err

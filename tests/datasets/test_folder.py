@@ -698,3 +698,55 @@ def test_real_sets_read_whole(tmp_path: Path, name: str) -> None:
     groups = {split: set(pack.column("group")[pack.rows(split)]) for split in ("train", "val", "test")}
     assert not groups["test"] & (groups["train"] | groups["val"])
     assert all(images.reshape(len(images), -1).std(1).min() > 1 for images in pack.images.values())
+
+
+def test_paths_as_other_computers_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Backslashes and ~ give the same pack; a file that has exactly this name comes first."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    rows = make_rows(tmp_path)
+    Image.new("RGB", (20, 16), (1, 2, 3)).save(tmp_path / "vision\\00.png")
+    odd = [{**row, "vision": row["vision"].replace("/", "\\"), "left": f"~/{row['left']}"} for row in rows]
+    plain, read = (
+        packed(config(write(table, tmp_path / f"{name}.csv")), tmp_path / name)
+        for name, table in (("plain", rows), ("odd", odd))
+    )
+    assert np.array_equal(plain.images["vision"][1:], read.images["vision"][1:])
+    assert np.array_equal(plain.images["touch"], read.images["touch"])
+    assert (read.images["vision"][0] == (1, 2, 3)).all()
+    lost = write([{**row, "vision": "C:\\pictures\\1.png"} for row in rows], tmp_path / "lost.csv")
+    with pytest.raises(ValueError, match=r"row 1 vision C:.*; C:\\\.\.\. is on another computer\)"):
+        config(lost).source()
+
+
+def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytest.CaptureFixture[str]) -> None:
+    """And name an option as the command at hand writes it."""
+    file = write(rows, tmp_path / "m.csv")
+    words = ["data", "pack", "--data", "folder", "--path", str(file), "--size", "16", "--quiet", "--labels", "material"]
+    assert main([*words, "--out", str(tmp_path / "grouped"), "--group", "object"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "groups: 8, one per object, of 3 rows each." in shown and "No --group" not in shown
+    assert main([*words, "--out", str(tmp_path / "forgotten")]) == 0
+    for packed_now in (True, False):
+        shown = " ".join(capsys.readouterr().out.split())
+        assert "groups: 24, one per row, of 1 row each. A split takes whole groups, and intervals resample" in shown
+        assert "intervals too narrow. In that case pack again with --group COLUMN (this table has stiffness," in shown
+        assert "object, seq" in shown and "(this table has material" not in shown
+        if packed_now:
+            assert main(["data", "info", str(tmp_path / "forgotten")]) == 0
+    assert main(["data", "info", str(tmp_path / "grouped"), "--json", "-"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["groups"] == 8 and "one per object" in said.err
+    named = write([{"camera": row["vision"], "label": row["material"]} for row in rows], tmp_path / "named.csv")
+    for command, prefix in (("data pack", "--"), ("data check", "--"), ("pretrain", "--data.")):
+        words = [*command.split(), "--data", "folder", f"{prefix}path", str(named)]
+        assert main([*words, *(["--out", str(tmp_path / "no")] if command != "data check" else [])]) == 2
+        assert f"name the image columns, {prefix}vision COLUMN {prefix}touch COLUMN" in capsys.readouterr().err
+
+
+def test_a_home_folder_in_an_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No shell expands it after =."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main(["data", "pack", "--data", "folder", "--path=~/none.csv", "--out", str(tmp_path / "p")]) == 2
+    assert f"{tmp_path}/none.csv does not exist" in capsys.readouterr().err

@@ -225,7 +225,7 @@ def gappy(root: Path) -> Table:
 
 def test_a_row_may_lack_a_modality(tmp_path: Path) -> None:
     file = table(tmp_path / "m.csv", gappy(tmp_path))
-    with pytest.raises(ValueError, match=r"row 2 has no vision path: .*allow_missing"):
+    with pytest.raises(ValueError, match=r"row 2 has no vision path: .*allow-missing"):
         packed(file, tmp_path / "no", labels=("label",), group="object")
     pack = packed(file, tmp_path / "pack", labels=("label",), group="object", allow_missing=True)
     numbers = pack.column("id").astype(int) - 1
@@ -254,7 +254,7 @@ def test_gaps_that_make_no_sense(tmp_path: Path, cells: dict[str, str], says: st
 def test_a_modality_that_is_nowhere(tmp_path: Path) -> None:
     rows = [{**row, "vision": ""} for row in gappy(tmp_path) if row["left"]]
     file = table(tmp_path / "m.csv", rows)
-    with pytest.raises(ValueError, match=r"vision is empty in every row: leave it out by vision=''"):
+    with pytest.raises(ValueError, match=r"vision is empty in every row: leave it out by --data.vision ''"):
         packed(file, tmp_path / "p", labels=("label",), group="object", allow_missing=True)
 
 
@@ -349,7 +349,7 @@ def test_a_sensor_column_of_another_name(tmp_path: Path) -> None:
         ({"difference": True, "background": ("nowhere",)}, "unknown column 'nowhere'"),
         (
             {"difference": True},
-            r"no column 'background': difference images need background columns, or no_contact rows",
+            r"no column 'background': difference images need background columns, or --data.no-contact",
         ),
         ({"difference": True, "no_contact": ("phase=none",)}, r"no row meets phase=none for its sensor 'digit'"),
         ({"difference": True, "no_contact": ("seq=none",)}, r"unknown column 'seq'"),

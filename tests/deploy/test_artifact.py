@@ -100,7 +100,7 @@ def test_publish_command_and_card(smoke_run: Path, tmp_path: Path, capsys: pytes
     assert "pattern" in capsys.readouterr().out
     text = (out / "README.md").read_text()
     assert text.startswith("---\nlibrary_name: mvitac")
-    assert "columns, rows, checks" in text and "majority %" in text and "tests/support/toy.py" in text
+    assert "columns, rows, checks" in text and "| majority |" in text and "tests/support/toy.py" in text
     assert main(["publish", str(smoke_run), str(out)]) == 2
     assert "already exists" in capsys.readouterr().err
 

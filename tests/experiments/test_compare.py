@@ -35,7 +35,7 @@ from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.evaluation.scores import interval, paired_difference
 from mvitac.experiments import collect, jobs
-from mvitac.experiments.collect import cost, gather, lay_out, leaks, pairs_of
+from mvitac.experiments.collect import cost, forecast, gather, lay_out, leaks, pairs_of
 from mvitac.experiments.cross_validation import lay_out_folds
 from mvitac.experiments.jobs import do, do_all, seconds_of
 from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
@@ -258,8 +258,16 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
     found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
     assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"].mean
     tex = (out / "table.tex").read_text()
-    assert tex.count(r"\\") == len(lines) + 1 and "[57.6]" in tex
+    assert tex.count(r"\\") == len(lines) + 1 and "(57.6)" in tex
     assert json.loads((out / "result.json").read_text())["rows"] == ["MViTac", "colder", "supervised, touch"]
+
+
+def test_the_forecast_counts_images(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """64 pairs a run; of a pair MViTac reads two views of two modalities, supervised touch one of one."""
+    work = lay_out(small(pack), pack, tmp_path / "out", ProbeConfig())
+    assert forecast(work)[-1] == "6 runs left"
+    monkeypatch.setattr(collect, "pairs_per_second", lambda run, pack: 8.0)
+    assert "6 runs left, about 36 s of training" in forecast(work, measure=True)[-1]  # 4 x 64 / 8 + 2 x 64 / 8 / 4
 
 
 def test_finished_runs_are_not_done_again(done: tuple[Path, dict], pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -660,12 +668,16 @@ def test_the_command_from_dry_run_to_tables(pack: Pack, tmp_path: Path, capsys: 
     plan = write_plan(tmp_path / "plan.json", 2, 1, 2)
     words = command(pack, plan, tmp_path / "out")
     assert main([*words, "--dry-run"]) == 0
-    assert "2 rows x 1 seeds = 2 runs" in capsys.readouterr().out and not (tmp_path / "out").exists()
+    shown = capsys.readouterr().out
+    assert "2 rows x 1 seeds = 2 runs" in shown and not (tmp_path / "out").exists()
+    assert re.search(r"2 runs left, about \d+ s .*by the first steps of tau 0, seed 0, measured now", shown)
     assert main([*words, "--tables-only"]) == 2
     assert "no run of" in capsys.readouterr().err
     assert main([*words, "--set", "steps=1", "--seeds", "1"]) == 0
     shown = capsys.readouterr().out
     assert "[2/2] tau 1, seed 0" in shown and "| tau 0 | touch |" in shown
+    assert main([*words, "--set", "steps=1", "--seeds", "2", "--dry-run"]) == 0
+    assert re.search(r"2 runs left, about \d+ s .*by the finished runs", capsys.readouterr().out)
     assert main([*words, "--set", "steps=1", "--tables-only"]) == 0
     assert "all runs are finished" in capsys.readouterr().out
     assert main([*words, "--set", "steps=1", "--tables-only", "--rows", "tau 0"]) == 0

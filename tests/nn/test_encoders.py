@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
+import socket
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 import safetensors.torch
 import timm
 import torch
+from huggingface_hub import constants
 
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk
 
@@ -39,6 +45,28 @@ def test_six_channels_keep_the_pretrained_stem(weights: Path) -> None:
 def test_imagenet_offline_says_what_to_do() -> None:
     with pytest.raises(ValueError, match=r"--encoder\.weights FILE.*scratch"):
         build_trunk(EncoderConfig(trunk="resnet18.tv_in1k"), 3)
+
+
+def test_a_hub_that_does_not_answer_is_asked_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its client would try ten times, for 50 seconds."""
+    with socket.create_server(("127.0.0.1", 0)) as hub:
+        address = f"http://127.0.0.1:{hub.getsockname()[1]}"
+        monkeypatch.setattr(constants, "ENDPOINT", address)
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+        calls: list[Any] = []
+
+        def hang_up() -> None:
+            with contextlib.suppress(OSError):  # closed at the end of the test
+                while True:
+                    calls.append(hub.accept())
+                    calls[-1][0].close()
+
+        threading.Thread(target=hang_up, daemon=True).start()
+        file = re.escape(f"download {address}/timm/resnet18.tv_in1k/resolve/main/model.safetensors elsewhere")
+        with pytest.raises(ValueError, match=rf"{file} and give --encoder\.weights FILE; or .*scratch$"):
+            build_trunk(EncoderConfig(trunk="resnet18.tv_in1k"), 3)
+        assert len(calls) == 1
 
 
 def test_foreign_file_is_refused(tmp_path: Path, weights: Path) -> None:

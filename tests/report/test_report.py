@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,15 +25,21 @@ from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.scores import interval, summarise
+from mvitac.deploy.publish import publish
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
+from mvitac.evaluation.scores import cell_text, columns_of, interval, summarise
+from mvitac.experiments.plan import Plan, Row
+from mvitac.experiments.table import lines_of
+from mvitac.experiments.table_formats import latex, markdown
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.recipes import recipe
+from mvitac.registry import to_json
 from mvitac.report import figures
 from mvitac.report.galleries import nearest_groups
 from mvitac.report.report import wall_seconds, write_report
-from mvitac.report.tables import cell, columns_of, retrieval_rows
+from mvitac.report.tables import retrieval_rows
 from mvitac.run import Run
+from mvitac.system.files import write_json
 from mvitac.training.loop import train
 
 
@@ -106,14 +115,14 @@ def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pack = build(MaterialsConfig(num=240, touches=1, size=16).source(), folder / "pack", size=16, quiet=True)
     runs = [train(smoke(pack, seed=seed), folder / f"run{seed}", quiet=True) for seed in (0, 1)]
     assert main(["probe", *map(str, runs), "--json", str(folder / "probe.json")]) == 0
-    assert main(["report", *map(str, runs), "--probe", str(folder / "probe.json"), "--out", str(folder / "out")]) == 0
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["report", *map(str, runs), "--out", str(folder / "out")]) == 0
+    assert f"scores: {runs[0] / 'probe.json'}" in said.getvalue()
     return folder
 
 
 @pytest.fixture(scope="session")
 def result(materials: Path) -> dict[str, Any]:
-    import json
-
     return json.loads((materials / "probe.json").read_text())
 
 
@@ -130,14 +139,15 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
     shown: dict[tuple[str, str], list[str]] = {}
     task = ""
     for row in filter(None, rows):
-        task = row[0] if len(row) == 1 else task
+        task = row[0].split(" (")[0] if len(row) == 1 else task  # category (24 test instances)
         shown[task, row[0]] = [unescape(value).replace("\xa0", " ") for value in row[1:]]
-    assert set(result["summary"]) == {"category", "soft", "rough"}
-    for task, found in result["summary"].items():
+    assert {"category", "soft", "rough"} <= set(result["summary"])
+    for task in ("category", "soft", "rough"):
+        found = result["summary"][task]
         sources = {source for cells in found.values() for source in cells}
         assert sources == {"mvitac", "untrained", "pixels", "border", "majority"}
         for source in sources:
-            assert shown[task, source] == [cell(found, source, m) for m in columns_of(found)]
+            assert shown[task, source] == [cell_text(found, source, m) for m in columns_of(found)]
 
 
 def test_verdict_and_figures_carry_the_numbers(materials: Path, result: dict[str, Any]) -> None:
@@ -270,7 +280,7 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     assert len(page.all("img")) == 2 * 8 * 6  # the gallery of the second run; the first one has none
     linear, nearest = (summarise(result["records"], kind)["kind"]["both"] for kind in ("linear", "knn"))
     assert f"with supervised, mvitac {100 * nearest['mvitac']['mean']:.1f}" in page.text
-    assert cell({"both": linear}, "mvitac", "both") in page.text.replace("\xa0", " ")
+    assert cell_text({"both": linear}, "mvitac", "both") in page.text.replace("\xa0", " ")
     assert not page.all("script")
     alone = Page(write_report([first], tmp_path / "alone", quiet=True).read_text())
     assert "Not scored: no method here has a space that both modalities share." in alone.text
@@ -313,6 +323,92 @@ def test_retrieval_has_one_number_for_one_thing() -> None:
     mean = interval([{**record, **counts}])[0]
     assert retrieval_rows([{**record, **counts}])[0][3] == f"{100 * mean:.1f}"
     assert f"{100 * record['R@5']:.1f}" != f"{100 * mean:.1f}"  # what this is about
+
+
+def texts_of(records: Sequence[dict[str, Any]]) -> dict[tuple[str, ...], str]:
+    """(task, modality, source) -> score and interval as text."""
+    cells: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for r in (r for r in records if "group_correct" in r):  # of tasks with classes
+        cells.setdefault((r["task"], r["modality"], r["source"]), []).append(r)
+    assert len(cells) == 3 * (3 * 3 + 1 + 1)
+    found = {cell: [100 * value for value in interval(records)] for cell, records in cells.items()}
+    return {cell: f"{mean:.1f} [{low:.1f}, {high:.1f}]" for cell, (mean, low, high) in found.items()}
+
+
+def test_report_and_comparison_give_one_text_for_one_score(materials: Path, result: dict[str, Any]) -> None:
+    plan = Plan(name="one", rows=(Row(label="mvitac"),), reference="mvitac", recipe="smoke")
+    kept = {"left_out": {}, "failed": {}, "unfinished": [], "leaks": "", "cost": [], "commit": None, "device": "cpu"}
+    whole = {**result, **kept, "plan": to_json(plan), "rows": ["mvitac"]}
+    page, lines = Page((materials / "out" / "report.html").read_text()).text, lines_of(whole)
+    tex = latex(whole, lines).replace(r"\textbf{", "").replace("}", "")
+    for cell, text in texts_of(result["records"]).items():
+        for shown in (page.replace("\xa0", " "), markdown(whole, lines), tex):
+            assert text in shown, cell
+        assert f">{text.split()[0]}<" in (materials / "out" / "report.html").read_text()  # beside a bar
+
+
+def test_probe_and_card_give_one_text_for_one_score(
+    materials: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, card = materials / "run0", tmp_path / "card"
+    assert main(["probe", str(run), "--json", str(tmp_path / "probe.json")]) == 0
+    printed = capsys.readouterr().out
+    assert main(["publish", str(run), str(card)]) == 0
+    shown = (printed, capsys.readouterr().out, (card / "README.md").read_text())
+    (run / "probe.json").unlink()
+    again = (publish(run, tmp_path / "again") / "README.md").read_text()  # with controls of its own
+    assert again == shown[2]
+    for cell, text in texts_of(json.loads((tmp_path / "probe.json").read_text())["records"]).items():
+        assert all(text in each for each in shown), cell
+
+
+def test_an_interval_does_not_depend_on_the_order_of_seeds() -> None:
+    counts = [[2 * s * s + i * (s + 1) % 3 for i in range(7)] for s in range(3)]
+    records = [{"seed": s, "group_sizes": [20] * 7, "group_correct": counts[s]} for s in range(3)]
+    assert interval(records) == interval(records[::-1]) == interval(records[1:] + records[:1])
+
+
+@dataclass(frozen=True)
+class OneTested(Noise):
+    """All but one group to learn from."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        return [replace(sample, columns={**sample.columns, "split": "test" if item // 2 == 2 else "train"})]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"one": 1}
+
+
+def test_one_test_group_proves_nothing(tmp_path: Path) -> None:
+    run, _ = noise(tmp_path, OneTested())
+    page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
+    assert "it takes 11 test things with both modalities" in page.text
+    assert "1 test thing, so no interval" in page.text and "% [0.0, 100.0]" in page.text
+    assert "rank 1 of 1" not in page.text and "Retrieval gallery" not in page.text and not page.all("img")
+    card = (publish(run, tmp_path / "card") / "README.md").read_text()
+    assert "(1 test thing, so no interval)" in card and re.search(r"\| untrained \| \S+ \[0\.0, 100\.0\] \|", card)
+
+
+def test_only_a_complete_result_of_the_same_weights_is_used_again(materials: Path, result: dict[str, Any]) -> None:
+    runs, pack = [materials / "run0", materials / "run1"], Pack(materials / "pack")
+    file = runs[0] / "probe.json"
+    write_json(file, result)
+    assert stored_result(runs, pack) == result
+    assert stored_result(runs[::-1], pack) == result and stored_result(runs[:1], pack) is None
+    asked = result["asked"]
+    for change in (
+        {"asked": {**asked, "controls": False}},
+        {"asked": {**asked, "tasks": ["soft"]}},
+        {"asked": {**asked, "probes": ["knn"]}},
+        {"models": ["0" * 64, result["models"][0]]},
+        {"pack": "0" * 64},
+        {"records": "damaged"},
+    ):
+        write_json(file, {**result, **change})
+        assert stored_result(runs, pack) is None
+    write_json(file, {key: result[key] for key in ("data", "pack", "records", "retrieval")})  # as 0.1.0 wrote it
+    assert stored_result(runs, pack) is None
 
 
 def test_wall_time_adds_up_the_logged_speeds(materials: Path) -> None:

@@ -46,7 +46,8 @@ class _Options:
     stress: bool
     """Also score 1 % and 10 % of the labels, noisy test images, a modality missing at test time, and a leaking split."""
     dry_run: bool = False
-    """Print the plan, what is finished and what is left, and stop."""
+    """Print the plan, what is finished, what is left and how long it will take, and stop. The time is measured on a few
+    steps of one run where none is finished."""
     tables_only: bool = False
     """Make the tables of what is finished and train nothing."""
     slurm: str | None = None
@@ -88,7 +89,7 @@ def compare(argv: list[str]) -> None:
         check_place(options.out / "plan.json")
     works = lay_out_folds(plan, options.out, config, options.device)
     work = together(works)
-    print("\n".join(forecast(work)), flush=True)
+    print("\n".join(forecast(work, measure=options.dry_run)), flush=True)
     if options.dry_run:
         return
     write_json(options.out / "plan.json", to_json(plan))

@@ -1,16 +1,16 @@
 """``mvitac data ...``: simulate, pack and shard data, and look at what is in a pack."""
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
-from mvitac.cli.options import asks_help, check_json, parse, selectors, short
+from mvitac.cli.options import asks_help, check_json, console, parse, save_json, selectors, short
 from mvitac.data.build import build
 from mvitac.data.pack import SPLITS, Pack
 from mvitac.data.sharding import write_shards
@@ -19,7 +19,10 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.lerobot.writer import write_lerobot
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.registry import default, unknown
-from mvitac.system.files import check_place, write_atomic, write_json
+from mvitac.system.files import check_place, write_atomic
+
+OWN_COLUMNS = ("id", "group", "touch_group", "split", "sensor")
+"""Columns that packing adds to a table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +82,34 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
     if lost := pack.meta["damaged"]:
         first = ": ".join(lost[0])
         print(f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {first}')
+    console(None).print(_groups(pack))
     for note in pack.spec.notes:
         print(f"note: {note}")
+
+
+def _groups(pack: Pack) -> str:
+    """What a group of the pack is and what that does to splits and intervals."""
+    by, sizes = pack.spec.group_by, list(Counter(pack.column("group").tolist()).values())
+    few, many = min(sizes), max(sizes)
+    rows = f"{few} row{'s' * (few > 1)}" if few == many else f"{few} to {many} rows"
+    text = (
+        f"groups: {len(sizes)}, one per {by}, of {rows} each. A split takes whole groups, and intervals resample them"
+    )
+    if by != "row" or many > 1:
+        return f"{text}."
+    own = [*OWN_COLUMNS, *(task.name for task in pack.spec.tasks)]
+    table = pack.table.drop_columns([name for name in own if name in pack.table.column_names])
+    repeated = [name for name in table.column_names if 1 < len(table.column(name).unique()) <= pack.num / 2]
+    repeated = [name for name in repeated if not name.startswith(("label_", "has_", "crc_", "bytes_"))]
+    return (
+        f"{text}.\nNo --group was given, so every row is a group of its own. If rows show the same object or recording,"
+        " train and test then share it: scores are too high and intervals too narrow. In that case pack again with"
+        f" --group COLUMN{f' (this table has {_some(repeated)})' if repeated else ''}."
+    )
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:6]) + ", ..." * (len(names) > 6)
 
 
 @dataclass(frozen=True)
@@ -149,7 +178,7 @@ class _InfoOptions:
     pack: Positional[Path]
     """Folder of the pack."""
     json: Path | None = None
-    """Also write what is printed to this file."""
+    """Also write what is printed to this file; - = stdout, and the table to stderr."""
 
 
 def info(argv: list[str]) -> None:
@@ -157,23 +186,24 @@ def info(argv: list[str]) -> None:
     options = parse(_InfoOptions, argv, "data info")
     check_json(options.json)
     pack = Pack(options.pack)
-    found = _describe(pack)
-    if options.json:
-        write_json(options.json, found)
+    found, say = _describe(pack), console(options.json)
     stored = "" if pack.store == "raw" else f", JPEG of quality {pack.meta['quality']}"
     title = f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px{stored}"
     table = Table(title=title, title_justify="left")
-    for column in ("split", "rows", f"{pack.spec.group_by}s", *(f"{t.name}: majority" for t in pack.spec.tasks)):
+    groups = "groups" if pack.spec.group_by == "row" else f"{pack.spec.group_by}s"
+    for column in ("split", "rows", groups, *(f"{t.name}: majority" for t in pack.spec.tasks)):
         table.add_column(column)
     for name, split in found["splits"].items():
         cells = [f"{m['class']} {100 * m['share']:.1f} %" if m else "" for m in split["majority"].values()]
         table.add_row(name, str(split["rows"]), str(split["groups"]), *cells)
-    Console(markup=False).print(table)
+    say.print(table)
     if lacking := ", ".join(f"{num} rows without {m}" for m, num in found["rows_without"].items()):
-        print(f"{lacking}; {found['whole_pairs']} whole pairs")
-    print(f"source {pack.spec.source}; licence {pack.spec.licence}")
+        say.print(f"{lacking}; {found['whole_pairs']} whole pairs")
+    say.print(_groups(pack))
+    say.print(f"source {pack.spec.source}; licence {pack.spec.licence}")
     for note in pack.spec.notes:
-        print(f"note: {note}")
+        say.print(f"note: {note}")
+    save_json(options.json, found)
 
 
 def _describe(pack: Pack) -> dict[str, Any]:
@@ -192,6 +222,7 @@ def _describe(pack: Pack) -> dict[str, Any]:
         "size": pack.size,
         "store": pack.store,
         "group_by": pack.spec.group_by,
+        "groups": len(np.unique(pack.column("group"))),
         "splits": splits,
         "rows_without": {m: int((~there).sum()) for m, there in has.items() if not there.all()},
         "whole_pairs": int(np.logical_and.reduce(list(has.values())).sum()),

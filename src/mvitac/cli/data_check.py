@@ -1,24 +1,24 @@
 """``mvitac data check``: what is wrong with a dataset."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse, selectors, short
+from mvitac.cli.options import check_json, console, parse, save_json, selectors, short
 from mvitac.data.checks.contact_sheet import draw
 from mvitac.data.checks.examine import examine_pack, examine_source
 from mvitac.data.checks.finding import exit_code
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
-from mvitac.system.files import check_place, write_atomic, write_json
+from mvitac.system.files import check_place, write_atomic
 
 _COLOURS = {"ok": "green", "look": "yellow", "broken": "bold red", "not checkable": "dim"}
 _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step.
@@ -31,7 +31,7 @@ _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copi
 @dataclass(frozen=True, kw_only=True)
 class _Options:
     json: Path | None = None
-    """Also write every finding to this file."""
+    """Also write every finding to this file; - = stdout, and the table to stderr."""
     sheet: Path | None = None
     """Also draw the suspicious rows into this PNG."""
 
@@ -45,8 +45,8 @@ class _PackOptions(_Options):
 @dataclass(frozen=True, kw_only=True)
 class _SourceOptions(_Options):
     data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
-    num: int = 0
-    """Number of items to read, evenly spread over the source; 0 = all."""
+    items: int = 0
+    """Number of items to read, evenly spread over the source; 0 = all. (0.1.0 called it --num, which still works.)"""
     thumbnail: int = 64
     """Side in pixels to which images are reduced for the examination."""
     quiet: bool = False
@@ -62,15 +62,18 @@ def check(argv: list[str]) -> int:
         return _report(str(options.pack), *examine_pack(options.pack), options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
-    options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
+    rest = short(rest)
+    if not hasattr(usual.data, "num"):  # of a simulator --num is the size of the data
+        rest = [re.sub(r"^--num(?==|$)", "--items", word) for word in rest]
+    options = parse(_SourceOptions, rest, f"data check {name}", default=usual, description=_MANUAL)
     _check_places(options)
-    if options.num < 0:
-        raise ValueError(f"--num {options.num}: give the number of items to read, 0 for all")
+    if options.items < 0:
+        raise ValueError(f"--items {options.items}: give the number of items to read, 0 for all")
     data: Any = options.data
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     findings, strips = examine_source(
-        source, num=options.num, size=options.thumbnail, workers=data.workers, quiet=options.quiet
+        source, num=options.items, size=options.thumbnail, workers=data.workers, quiet=options.quiet
     )
     return _report(name, findings, strips, options)
 
@@ -92,11 +95,10 @@ def _report(what: str, findings: Sequence[Any], strips: Any, options: _Options) 
     for finding in findings:
         text = finding.evidence + (f"\n-> {finding.advice}" if finding.advice else "")
         table.add_row(Text(finding.verdict, style=_COLOURS[finding.verdict]), finding.item, text)
-    Console(markup=False).print(table)
-    if options.json:
-        write_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
-        print(f"written: {options.json}")
+    say = console(options.json)
+    say.print(table)
+    save_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
     if options.sheet:
         write_atomic(options.sheet, lambda file: draw(file, strips))
-        print(f"written: {options.sheet}")
+        say.print(f"written: {options.sheet}", soft_wrap=True)
     return code

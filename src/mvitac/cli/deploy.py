@@ -12,10 +12,11 @@ from tyro.conf import Positional
 from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
-from mvitac.deploy.artifact import load, read
+from mvitac.deploy.artifact import load, read_manifest
 from mvitac.deploy.publish import own_data, with_readouts
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
+from mvitac.report.tables import print_summary
 from mvitac.system.progress import shown
 
 
@@ -40,13 +41,8 @@ def publish(argv: list[str]) -> None:
     options = parse(_PublishOptions, argv, "publish")
     with shown(Console(stderr=True)):
         out = write_artifact(options.run, options.out, Pack(options.on) if options.on else None)
-    table = Table(title=f"{out}: accuracy of its probes", title_justify="left")
-    for column in ("task", "from", "accuracy %", "majority %"):
-        table.add_column(column)
-    for readout in read(out).readouts.values():
-        q = readout.question
-        table.add_row(q.task, q.modality, f"{100 * q.accuracy:.1f}", f"{100 * q.majority:.1f}")
-    Console(markup=False).print(table)
+    print_summary(read_manifest(out)["scores"], Console(markup=False))
+    print(f"written: {out}")
     if options.push:
         print(f"pushed: {push_artifact(out, options.push, private=options.private)}")
 

@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse
+from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, chosen, probe_runs
@@ -17,7 +17,7 @@ from mvitac.evaluation.scores import summarise
 from mvitac.model import load
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_summary
-from mvitac.system.files import read_json, write_json
+from mvitac.system.files import read_json
 from mvitac.system.progress import shown, work
 
 
@@ -37,7 +37,8 @@ class _ProbeOptions:
     """Also use 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and report the
     gain of a split that leaks groups."""
     json: Path | None = None
-    """Also write everything that is printed, and more, to this file."""
+    """Also write everything that is printed, and more, to this file; - = stdout, and the tables to stderr. Without
+    it, all but the results of --stress is in probe.json in the folder of each run."""
 
 
 def probe(argv: list[str]) -> None:
@@ -51,18 +52,16 @@ def probe(argv: list[str]) -> None:
         pack = JoinedPack(Pack(options.learn_on), pack)
     with shown(Console(stderr=True)):
         result = probe_runs(options.runs, options.config, pack)
-    console, stressed = Console(markup=False), _stress(options, pack, result) if options.stress else []
+    say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
     for kind in options.config.probes:
-        print_summary({**result, "summary": summarise(result["records"], kind)}, console, probe=kind)
+        print_summary({**result, "summary": summarise(result["records"], kind)}, say, probe=kind)
     majority = [r for r in result["records"] if r["source"] == "majority"]
     for kind in STRESSES:
         if mine := [r for r in stressed if r["probe"] == kind]:
-            print_summary({**result, "summary": summarise(mine + majority, kind)}, console, probe=kind)
-    print_retrieval(result, console)
+            print_summary({**result, "summary": summarise(mine + majority, kind)}, say, probe=kind)
+    print_retrieval(result, say)
     result["records"] += stressed
-    if options.json:
-        write_json(options.json, result)
-        print(f"written: {options.json}")
+    save_json(options.json, result)
 
 
 def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -> list[dict[str, Any]]:
@@ -88,8 +87,8 @@ class _ReportOptions:
     out: Path | None = None
     """Folder of the page (default: report inside the run's folder; runs/report for several runs)."""
     probe: Path | None = None
-    """File that `mvitac probe RUN... --json FILE` wrote; without it the runs are probed now. The probe.json in a run's
-    folder has no controls and does not serve."""
+    """Scores of these runs, as `mvitac probe RUN... --json FILE` wrote them. Default: the probe.json that `mvitac probe
+    RUN...` left in the first run's folder; if that is missing or incomplete, the runs are probed now."""
     quiet: bool = False
     """No progress."""
 

@@ -9,8 +9,6 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
-from mvitac.deploy.artifact import load
-from mvitac.deploy.publish import own_data
 from mvitac.system.progress import shown, work
 
 if TYPE_CHECKING:
@@ -55,6 +53,8 @@ def explore(argv: list[str]) -> None:
 
 def _page(options: _Options) -> "gradio.Blocks":
     """The page, after the features of every run were computed."""
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.publish import own_data
     from mvitac.report.explorer import page
     from mvitac.report.explorer_data import ExplorerData
 

@@ -35,6 +35,7 @@ how good the features are.
   embed PACK           embeddings of every row, as .npz or .parquet
   index PACK           make a pack searchable
   find IMAGE           the nearest known touches to a picture, and back
+  completion bash      a script for completion by TAB in bash and zsh
 
 First steps:
   mvitac demo                                        # no data needed
@@ -64,6 +65,7 @@ COMMANDS = {
     "embed": "search:embed",
     "index": "search:index",
     "find": "search:find",
+    "completion": "completion:completion",
 }
 """Command -> module of this package:function, imported when called."""
 
@@ -84,7 +86,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except (ValueError, OSError, MemoryError) as error:
-        print(f"mvitac: error: {one_line(error)}", file=sys.stderr)
+        text = one_line(error)
+        if arguments[0] == "data":  # here the options of a dataset are --path, not --data.path as for pretrain
+            text = text.replace("--data.", "--")
+        print(f"mvitac: error: {text}", file=sys.stderr)
         return 2
     except Exception as error:
         if type(error).__name__ == "Interrupted":

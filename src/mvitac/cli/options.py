@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import inspect
 import io
+import json
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -11,6 +12,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+STDOUT = Path("-")
+"""The --json FILE that means stdout."""
 
 
 def parse(
@@ -30,6 +33,7 @@ def parse(
     argv = [
         re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", w) for w in argv
     ]  # 0.1.0's name
+    argv = [re.sub(r"^(--[\w.-]+=)(~.*)", lambda m: m[1] + os.path.expanduser(m[2]), w) for w in argv]  # no shell does
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
     if default is not None:
         options["default"] = default
@@ -105,10 +109,28 @@ def check_json(path: Path | None) -> None:
     """ValueError if the file of a ``--json`` option cannot be written; called before the work begins."""
     from mvitac.system.files import check_place
 
-    if path:
+    if path and path != STDOUT:
         check_place(path)
         if path.is_dir():
             raise ValueError(f"--json {path} is a folder: give another place, the name of a file")
+
+
+def console(json_file: Path | None) -> Any:
+    """Where a command prints: stdout, or stderr if its JSON goes to stdout."""
+    from rich.console import Console
+
+    return Console(markup=False, highlight=False, stderr=json_file == STDOUT)
+
+
+def save_json(path: Path | None, value: Any) -> None:
+    """Write ``value`` to the file of a ``--json`` option, if it was given, and say so."""
+    from mvitac.system.files import write_json
+
+    if path == STDOUT:
+        print(json.dumps(value, indent=1, allow_nan=False))
+    elif path:
+        write_json(path, value)
+        print(f"written: {path}")
 
 
 def _one_line(text: str, prog: str) -> str:

@@ -1,9 +1,12 @@
-"""``mvitac embed``, ``index`` and ``find``: embeddings of whole packs, and the nearest of them."""
+"""``mvitac embed``, ``index`` and ``find``: embeddings of whole packs, and the nearest of them.
+
+What needs torch is imported after the options are parsed, so that --help is quick.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -14,12 +17,13 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, parse
+from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.pack import Pack
-from mvitac.deploy.artifact import load
-from mvitac.deploy.search import Index, build, check_pack, describe, embeddings
-from mvitac.system.files import brief, check_place, write_atomic, write_json
+from mvitac.system.files import brief, check_place, write_atomic
 from mvitac.system.progress import shown
+
+if TYPE_CHECKING:
+    from mvitac.deploy.search import Index
 
 _SIDE = 160
 """Pixels: side of one picture in the sheet of what was found."""
@@ -46,6 +50,9 @@ class _EmbedOptions(_Embedding):
 def embed(argv: list[str]) -> None:
     """mvitac embed PACK --model M --out FILE.npz|FILE.parquet"""
     options = parse(_EmbedOptions, argv, "embed")
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.search import check_pack, describe, embeddings
+
     if options.out.suffix not in (".npz", ".parquet"):
         raise ValueError(f"--out {options.out}: give a name that ends in .npz or .parquet")
     check_place(options.out)
@@ -85,6 +92,9 @@ class _IndexOptions(_Embedding):
 def index(argv: list[str]) -> None:
     """mvitac index PACK --model M --out DIR"""
     options = parse(_IndexOptions, argv, "index")
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.search import build
+
     with shown(Console(stderr=True)):
         made = build(load(options.model), Pack(options.pack), options.out, options.splits)
     shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
@@ -109,7 +119,7 @@ class _FindOptions:
     k: int = 5
     """How many to find."""
     json: Path | None = None
-    """Also write what was found to this file."""
+    """Also write what was found to this file; - = stdout, and the table to stderr."""
     picture: Path | None = None
     """Also draw the query and what was found into this PNG (needs the indexed pack at its old path)."""
 
@@ -117,6 +127,8 @@ class _FindOptions:
 def find(argv: list[str]) -> None:
     """mvitac find IMAGE --in INDEX [--from touch] [--to vision] [--json FILE]"""
     options = parse(_FindOptions, argv, "find")
+    from mvitac.deploy.search import Index
+
     if not options.image:
         raise ValueError("name the picture to search for: mvitac find IMAGE --in INDEX")
     check_json(options.json)
@@ -141,9 +153,8 @@ def find(argv: list[str]) -> None:
     for one in found:
         labels = (one["labels"].get(task, "") for task in index.meta["classes"])
         table.add_row(f"{one['cosine']:.3f}", one["id"], one["group"], *labels)
-    Console(markup=False).print(table)
-    if options.json:
-        write_json(options.json, {"from": options.source, "to": options.target, "found": found})
+    console(options.json).print(table)
+    save_json(options.json, {"from": options.source, "to": options.target, "found": found})
     if options.picture:
         _draw(options.picture, query, index, options.target, [one["row"] for one in found])
 
@@ -160,7 +171,7 @@ def _picture(files: Sequence[Path]) -> np.ndarray:
     return np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
 
 
-def _draw(out: Path, query: np.ndarray, index: Index, target: str, rows: Sequence[int]) -> None:
+def _draw(out: Path, query: np.ndarray, index: "Index", target: str, rows: Sequence[int]) -> None:
     """A PNG of the query and the ``target`` images in ``rows`` of the indexed pack, side by side."""
     pack = Pack(index.meta["pack"], verify=False)
     if pack.digest != index.meta["pack_digest"]:

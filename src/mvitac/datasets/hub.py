@@ -52,7 +52,7 @@ class HubConfig(RowsConfig):
         if any(sides) and nameless and not self.split and "split" not in names:
             raise ValueError(
                 f"{self.path}: the name of {nameless[0]} says no split, others do: begin it with train-, validation- or"
-                " test-, remove it, or split=by-group assigns all rows to splits"
+                " test-, remove it, or --data.split by-group assigns all rows to splits"
             )
         for column, places in found.items():
             if len(places) < len(rows):

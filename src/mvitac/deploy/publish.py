@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,13 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import Task
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.evaluation.classifiers import fit_linear, spread_out
+from mvitac.evaluation.controls import Records, controls_of
+from mvitac.evaluation.evaluate import stored_result
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import split_rows
-from mvitac.evaluation.scores import score
+from mvitac.evaluation.probe import score_rows, split_rows
+from mvitac.evaluation.scores import cell_text, columns_of, resampled, sources_of, summarise, tested_on
 from mvitac.model import Model, load
+from mvitac.nn.encoders import SCRATCH, build_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
 from mvitac.registry import to_json
 from mvitac.run import load_run
@@ -32,41 +36,80 @@ def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
 
     A task without labelled rows in train and test has none: a probe that cannot be scored is not published.
     """
-    readouts = {}
+    return {readout.question.name: readout for readout, _ in _fit_all(model, pack)}
+
+
+def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]]]:
+    """Every linear probe with its record (``evaluation.scores``)."""
+    found = []
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
     sources = [*modalities, *(["both"] if len(modalities) == 2 else [])]
     with work("fitting probes", len(pack.spec.tasks) * len(sources), "probes") as advance:
         for task, source in product(pack.spec.tasks, sources):
-            readout = _fit_readout(model, pack, task, source, modalities if source == "both" else [source])
-            if readout:
-                readouts[readout.question.name] = readout
+            fitted = _fit_readout(model, pack, task, source, modalities if source == "both" else [source])
+            found += [fitted] if fitted else []
             advance()
-    return readouts
+    return found
 
 
-def _fit_readout(model: Model, pack: Pack, task: Task, source: str, modalities: list[str]) -> LinearProbe | None:
-    """The linear probe of one task on the features of ``modalities``; None without labelled rows in train and test."""
+def _fit_readout(
+    model: Model, pack: Pack, task: Task, source: str, modalities: list[str]
+) -> tuple[LinearProbe, dict[str, Any]] | None:
+    """One task's linear probe on features of ``modalities``, and its record; None without rows in train and test."""
     try:
         rows = split_rows(pack, task, source)
     except ValueError:
         return None
     labels = pack.column(f"label_{task.name}").astype(int)
-    everything = np.concatenate([rows.train, rows.val, rows.test])
-    groups = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
-    seen = labels[np.concatenate([rows.train, rows.val])]
+    seen = labels[rows.fitted]
     common = int(np.bincount(seen).argmax())
-    x = np.concatenate([features(model, pack, m, everything) for m in modalities], axis=1)
+    x = np.concatenate([features(model, pack, m, rows.all) for m in modalities], axis=1)
     learn, choose, test = np.split(x, np.cumsum([len(rows.train), len(rows.val)]))
+    known = {"task": task.name, "modality": source, "probe": "linear"}
     given: dict[str, Any] = {"task": task.name, "modality": source, "classes": task.classes}
     given |= {"majority": float((labels[rows.test] == common).mean()), "num_test": len(rows.test)}
     if len(set(labels[rows.train])) < 2:
         label = int(labels[rows.train][0])
-        accuracy = float((labels[rows.test] == label).mean())
-        return constant(ProbeInfo(**given, accuracy=accuracy), label, x.shape[1])
+        guess = np.eye(len(task.classes))[np.full(len(rows.test), label)]
+        record = score_rows(pack, task, rows.test, guess)
+        return constant(ProbeInfo(**given, accuracy=record["accuracy"]), label, x.shape[1]), {**known, **record}
     fitted, _ = fit_linear(learn, labels[rows.train], choose, labels[rows.val])
-    guess = spread_out(fitted(test), np.unique(seen), len(task.classes))
-    accuracy = score(labels[rows.test], guess, groups, len(task.classes))["accuracy"]
-    return from_logistic(ProbeInfo(**given, accuracy=accuracy), fitted.model, fitted.mean, fitted.std)
+    record = score_rows(pack, task, rows.test, spread_out(fitted(test), np.unique(seen), len(task.classes)))
+    question = ProbeInfo(**given, accuracy=record["accuracy"])
+    return from_logistic(question, fitted.model, fitted.mean, fitted.std), {**known, **record}
+
+
+def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, Any]:
+    """The probes' ``records`` with those of the controls, as printed by ``mvitac probe``, JSON-ready."""
+    own = {"source": model.run.method.name, "seed": model.run.seed}
+    stored = stored_result([run], pack)
+    tasks = {record["task"] for record in records}  # a task with values has no probe that is published
+    if stored:
+        controls = [r for r in stored["records"] if "run" not in r and r["task"] in tasks]
+    else:
+        controls = _controls(model, pack, records)
+    return {
+        "data": pack.spec.name,
+        "group_by": pack.spec.group_by,
+        "notes": list(pack.spec.notes),
+        "summary": summarise([*({**own, **record} for record in records), *controls]),
+    }
+
+
+def _controls(model: Model, pack: Pack, records: Records) -> Records:
+    """The controls of the (task, modality) of ``records``. Without its weights, the ImageNet trunk is left out."""
+    run, controls = model.run, []
+    try:
+        build_trunk(run.encoder, 3)
+    except ValueError:
+        run = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
+    sources: dict[tuple[str, ...], list[Task]] = {}
+    for task in pack.spec.tasks:
+        sources.setdefault(tuple(r["modality"] for r in records if r["task"] == task.name), []).append(task)
+    for modalities, tasks in sources.items():
+        if modalities:
+            controls += controls_of([run], pack, tasks, modalities, ["linear"], None, [model.spec])[0]
+    return controls
 
 
 def own_data(model: Model, instead: str) -> Pack:
@@ -104,13 +147,15 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
     model = load(run)
     _, record = load_run(run)
     pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
-    model = with_readouts(model, pack)
+    fitted = _fit_all(model, pack)
+    model.readouts = {readout.question.name: readout for readout, _ in fitted}
+    scores = _scores(run, model, pack, [record for _, record in fitted])
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         _write_weights(model, partial)
         write_json(partial / "run.json", record)
-        manifest = _describe(model, pack)
+        manifest = {**_describe(model, pack), "scores": scores}
         write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
         write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})
@@ -166,13 +211,14 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
         "The configuration, library versions and commit are in run.json.",
         "",
     ]
-    return "\n".join([*header, *_about(model, learned["name"], data["name"]), *_usage(manifest["preprocessing"]), *end])
+    about = _about(model, learned["name"], data["name"], manifest["scores"])
+    return "\n".join([*header, *about, *_usage(manifest["preprocessing"]), *end])
 
 
-def _about(model: Model, learned: str, data: str) -> list[str]:
+def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> list[str]:
     """The part of the model card on the model: what it is, an example, scores, classes."""
     run = model.run
-    lines = [
+    return [
         f"# {run.method.name} on {learned}",
         "",
         f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}),"
@@ -187,15 +233,30 @@ def _about(model: Model, learned: str, data: str) -> list[str]:
         "",
         "## Scores",
         "",
-        "Accuracy on rows of groups that neither encoders nor probes saw; majority is always the most frequent class.",
+        *_score_tables(scores),
+        "## Classes",
         "",
-        "| task | from | accuracy % | majority % | test rows |",
-        "|---|---|---:|---:|---:|",
+        *(f"- {task}: {', '.join(c)}" for task, c in model.classes.items()),
+        "",
     ]
-    for readout in model.readouts.values():
-        q = readout.question
-        lines.append(f"| {q.task} | {q.modality} | {100 * q.accuracy:.1f} | {100 * q.majority:.1f} | {q.num_test} |")
-    return [*lines, "", "## Classes", "", *(f"- {task}: {', '.join(c)}" for task, c in model.classes.items()), ""]
+
+
+def _score_tables(scores: dict[str, Any]) -> list[str]:
+    """A Markdown table per task: accuracy with its interval, next to the controls."""
+    if not scores["summary"]:
+        return ["No task has labelled rows in train and test.", ""]
+    by = scores["group_by"]
+    lines = [
+        f"Accuracy in percent of linear probes, on {by}s that neither encoders nor probes saw. The rows below the first are"
+        f" controls. 95 % intervals: {resampled(by, 1)}.",
+        "",
+    ]
+    for name, task in scores["summary"].items():
+        columns = columns_of(task)
+        lines += [f"| {name} ({tested_on(task, by)}) | {' | '.join(columns)} |", "|---" + "|---:" * len(columns) + "|"]
+        lines += [f"| {s} | {' | '.join(cell_text(task, s, m) for m in columns)} |" for s in sources_of(task)]
+        lines.append("")
+    return [*lines, *(line for note in scores["notes"] for line in (f"Note: {note}.", ""))]
 
 
 def _usage(given: dict[str, Any]) -> list[str]:

@@ -16,9 +16,9 @@ from mvitac.evaluation.probe import PROBES, Probe, cross_modal, probe_model, pro
 from mvitac.evaluation.scores import summarise
 from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
-from mvitac.registry import to_json, unknown
+from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import load_run
-from mvitac.system.files import check_place, digest, write_json
+from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
 
@@ -51,7 +51,7 @@ class ProbeConfig:
 
 
 def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None) -> dict[str, Any]:
-    """Probe finished runs and their controls, and write each run's own scores to its probe.json.
+    """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
     Example:
         >>> result = probe_runs([Path("runs/first")], ProbeConfig(probes=("linear", "knn")))
@@ -63,7 +63,8 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         pack: Other data to probe on. Default: the data the runs were trained on.
 
     Returns:
-        A dict with "data", "pack", "group_by", "notes", "classes", "records", "retrieval" and "summary".
+        A dict with "data", "pack", "group_by", "notes", "classes", "records", "retrieval", "summary", "asked" (the
+        config) and "models" (digests of the weights).
 
     Raises:
         ValueError: If a path is no run, a run is given twice, or the runs and the data do not fit together.
@@ -100,9 +101,11 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         controls, found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
         records += controls
         retrieval += found
-    return {
+    result = {
         "data": pack.spec.name,
         "pack": pack.digest,
+        "asked": to_json(session),
+        "models": _digests(paths),
         "group_by": pack.spec.group_by,
         "notes": list(pack.spec.notes),
         "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
@@ -111,6 +114,30 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         "retrieval": retrieval,
         "summary": summarise(records, session.probes[0]),
     }
+    for path in paths:
+        write_json(path / "probe.json", result)
+    return result
+
+
+def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
+    """The result in the probe.json of the first run, if it has linear probes of exactly these runs on ``pack``.
+
+    None if that file is missing or damaged, is about other runs, weights or data, or lacks tasks, modalities or controls.
+    """
+    try:
+        result = read_json(paths[0] / "probe.json", "a probe result")
+        asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
+        scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
+        same = result["pack"] == pack.digest and result["models"] == _digests(paths)
+    except (ValueError, KeyError, TypeError):  # 0.1.0 wrote the scores of the run alone
+        return None
+    whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
+    return result if same and whole and scored == {path.resolve() for path in paths} else None
+
+
+def _digests(paths: Sequence[Path]) -> list[str]:
+    """Digests of the weights of finished runs, sorted."""
+    return sorted(digest_file(path / "model.safetensors") for path in paths)
 
 
 def _check_paths(paths: Sequence[Path]) -> None:
@@ -150,14 +177,12 @@ def _probe_run(
     modalities: Sequence[str],
     session: ProbeConfig,
 ) -> tuple[Records, Records]:
-    """Probe and retrieval records of one run, also written to its probe.json."""
+    """Probe and retrieval records of one run."""
     own = {"source": source, "seed": model.run.seed, "run": str(path)}
     records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
     for record in records:
         record["source"] += END_TO_END if record["probe"] == "own" else ""
     found = [{**own, **r} for r in cross_modal(model, pack)]
-    kept = {"data": pack.spec.name, "pack": pack.digest, "records": records, "retrieval": found}
-    write_json(path / "probe.json", kept)
     return records, found
 
 

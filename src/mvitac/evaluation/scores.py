@@ -96,6 +96,7 @@ def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
     Returns:
         Mean, lower end and upper end, in 0 .. 1.
     """
+    records = _by_seed(records)
     num_groups = num_groups_of(records[0])
     mean = float(np.mean([mean_of(record) for record in records]))
     if num_groups < 2:
@@ -137,6 +138,7 @@ def paired_difference(
         Mean difference, lower and upper end of its 95 % interval, and the two-sided p: twice the fraction of draws on
         the other side of zero, at least ``least_p``. With a single group p is 1.
     """
+    ours, theirs = _by_seed(ours), _by_seed(theirs)
     num_groups = num_groups_of(ours[0])
     assert len({_rows_of(record) for record in (*ours, *theirs)}) == 1, "scored on different test rows"
     means = [float(np.mean([mean_of(record) for record in found])) for found in (ours, theirs)]
@@ -162,6 +164,11 @@ def _rows_of(record: dict[str, Any]) -> str:
 def least_p(num_groups: int) -> float:
     """Smallest p of ``paired_difference``: limited by a sign test over the groups and by the number of draws."""
     return max(2 / (NUM_DRAWS + 1), 2.0 ** (1 - num_groups))
+
+
+def _by_seed(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """``records`` ordered by seed, because the draws depend on the order."""
+    return sorted(records, key=lambda record: -1 if record.get("seed") is None else record["seed"])
 
 
 def _drawn_groups(num: int, rng: np.random.Generator) -> np.ndarray:
@@ -213,11 +220,60 @@ def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[di
 
 
 def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
-    """Accuracy as task -> modality -> method or control -> mean, low, high and seeds (``by_cell``, ``interval``)."""
+    """Accuracy as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``)."""
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
         mean, low, high = interval(found)
         seeds = [record["seed"] for record in found if record["seed"] is not None]
-        cell = {"mean": mean, "low": low, "high": high, "seeds": seeds}
+        groups = num_groups_of(found[0])
+        cell = {"mean": mean, "low": low, "high": high, "seeds": seeds, "groups": groups}
         summary.setdefault(task, {}).setdefault(modality, {})[source] = cell
     return summary
+
+
+# -- as text ----------------------------------------------------------------------------------------------------------
+
+MODALITY_ORDER = ("none", "touch", "vision", "both")
+
+
+def percent(value: float) -> str:
+    """A score in 0 .. 1 as text in percent, with one decimal. Every page, table, figure and card uses this."""
+    return f"{100 * value:.1f}"
+
+
+def with_interval(mean: float, low: float, high: float) -> str:
+    """A score and its 95 % interval, such as '57.6 [55.1, 60.2]'."""
+    return f"{percent(mean)} [{percent(low)}, {percent(high)}]"
+
+
+def resampled(group_by: str, num_seeds: int) -> str:
+    """What the 95 % intervals of ``num_seeds`` runs cover."""
+    if num_seeds > 1:
+        return f"bootstrap over test {group_by}s and seeds"
+    return f"bootstrap over test {group_by}s; one seed, so they leave out the variation between seeds"
+
+
+def tested_on(task: dict[str, Any], group_by: str) -> str:
+    """The test groups of one task's summary, such as '24 test instances'; one group allows no interval."""
+    num = max(cell["groups"] for cells in task.values() for cell in cells.values())
+    return f"{num} test {group_by}s" if num > 1 else f"1 test {group_by}, so no interval"
+
+
+def columns_of(task: dict[str, Any]) -> list[str]:
+    """The modalities of one task's summary in reading order, without "none" (majority and the like)."""
+    return [m for m in MODALITY_ORDER if m in task and m != "none"]
+
+
+def sources_of(task: dict[str, Any]) -> list[str]:
+    """Methods in order of appearance, then controls from the strongest idea to the weakest."""
+    last = ("imagenet", "untrained", "pixels", "border")
+    found = list(dict.fromkeys(source for modality in task.values() for source in modality))
+    fixed = list(task.get("none", {}))
+    own = [s for s in found if s not in last and s not in fixed]
+    return [*own, *(s for s in last if s in found), *sorted(fixed, key=lambda s: s == "majority")]
+
+
+def cell_text(task: dict[str, Any], source: str, modality: str) -> str:
+    """The score of one source, or '' if it has none. Controls without features appear in every column."""
+    value = task.get(modality, {}).get(source) or task.get("none", {}).get(source)
+    return with_interval(value["mean"], value["low"], value["high"]) if value else ""

@@ -24,7 +24,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
-from mvitac.experiments.jobs import Job, Work, seconds_of
+from mvitac.experiments.jobs import Job, Work, pairs_per_second, seconds_of
 from mvitac.experiments.plan import Plan, Row, slug
 from mvitac.model import precision_of
 from mvitac.nn.encoders import SCRATCH
@@ -32,6 +32,7 @@ from mvitac.registry import to_json
 from mvitac.run import Run, load_run
 from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.files import digest, read_json, write_json
+from mvitac.system.progress import duration
 from mvitac.system.provenance import provenance
 from mvitac.training.sampler import training_rows
 from mvitac.training.setup import check_same
@@ -220,16 +221,20 @@ def pairs_of(run: Run, views: int, pack: Pack) -> str:
     return "two rows of a touch" if other and several else "one row"
 
 
-def forecast(work: Work) -> list[str]:
-    """Lines that describe the plan: runs, steps, pairs, what is finished, and the time left if any run is finished."""
+def forecast(work: Work, *, measure: bool = False) -> list[str]:
+    """Lines that describe the plan: runs, steps, pairs, what is finished, and the time left.
+
+    The time comes from finished runs. Without any, ``measure`` trains a few steps of one run and keeps nothing of them.
+    """
     rows = {label: next(job for job in work.jobs if job.label == label) for label in _labels(work.jobs)}
     num = len({job.fold for job in work.jobs})
     folds = f" x {num} folds" if num > 1 else ""
     lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
-    known = [seconds_of(job.out) for job in work.jobs if job.done and not job.failure]
+    images = {}
     for label, job in rows.items():
         num = len(training_rows(job.run, work.pack))
         steps = job.run.num_steps(num)
+        images[label] = steps * job.run.batch_size * _images_per_pair(job.run, work.pack)
         mine = [j for j in work.jobs if j.label == label]
         lines.append(
             f"  {label}: {job.run.method.name}, {steps} steps x {job.run.batch_size} pairs of {num} rows,"
@@ -240,12 +245,34 @@ def forecast(work: Work) -> list[str]:
     for asked, run in {job.run.precision: job.run for job in todo}.items():
         device = pick_device(run.device)
         lines.append(f"on this machine: {describe_precision(asked, pick_precision(asked, device), device)}")
-    left = len(todo)
-    if known and left:
-        hours = left * statistics.median(known) / 3600
-        lines.append(f"{left} runs left, about {hours:.1f} h of training one after another (median of finished runs)")
-    elif left:
-        lines.append(f"{left} runs left; run one for a forecast of the time")
-    else:
-        lines.append("all runs are finished")
-    return lines
+    return [*lines, _time_left(work, todo, images, measure)]
+
+
+def _images_per_pair(run: Run, pack: Pack) -> int:
+    """Views of all modalities that a step reads for one pair."""
+    method = run.method.build(pack.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+    return method.views * len(method.encoders())
+
+
+def _time_left(work: Work, todo: Sequence[Job], images: dict[str, int], measure: bool) -> str:
+    """How many runs are left, and the time of their training. ``images``: row -> images that one run sees."""
+    if not todo:
+        return "all runs are finished"
+    speeds: dict[str, list[float]] = {}  # row -> images per second of its finished runs
+    for job in work.jobs:
+        if job.done and not job.failure and (seconds := seconds_of(job.out)):
+            speeds.setdefault(job.label, []).append(images[job.label] / seconds)
+    told = "by the finished runs; a row without one is assumed to take as long per image as the others"
+    if not speeds and measure:
+        job = next((job for job in todo if job.run.data == work.plan.data), todo[0])
+        pack = work.pack if job.run.data == work.plan.data else job.run.data.open(quiet=True)
+        speeds[job.label] = [pairs_per_second(job.run, pack) * _images_per_pair(job.run, pack)]
+        told = f"by the first steps of {job.name}, measured now; other rows are assumed to take as long per image"
+    if not speeds:
+        return f"{len(todo)} runs left"
+    usual = statistics.fmean(1 / speed for found in speeds.values() for speed in found)
+    paces = {label: statistics.fmean(1 / speed for speed in found) for label, found in speeds.items()}
+    seconds = sum(images[job.label] * paces.get(job.label, usual) for job in todo)
+    return (
+        f"{len(todo)} runs left, about {duration(seconds)} of training one after another ({told}); scoring comes on top"
+    )

@@ -30,7 +30,7 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     Args:
         run: The run of the first seed.
         out: Folder for the runs (seed0, seed1, ...), probe.json (all scores), summary.json (task -> modality -> method or
-            control -> mean, low, high, seeds) and report/.
+            control -> mean, low, high, seeds, groups) and report/.
         num_seeds: Number of seeds.
         console: Where progress is printed.
 

@@ -7,6 +7,7 @@ failed.json. A run that fails otherwise is reported, and the next call tries it 
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -25,6 +26,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.robustness import stress
 from mvitac.experiments.plan import Plan
 from mvitac.model import load
+from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.system.device import pick_device
@@ -306,6 +308,25 @@ def submit(work: Work, options: str) -> str:
     executor.update_parameters(name=f"mvitac-{work.plan.name}", **parameters)
     handles = executor.map_array(do, todo)
     return f"{len(handles)} runs submitted as {handles[0].job_id.split('_')[0]}"
+
+
+class _Measured(Exception):
+    """Pairs per second."""
+
+
+def pairs_per_second(run: Run, pack: Pack) -> float:
+    """Speed of the first steps of ``run`` after its start-up, trained from random weights in a temporary folder."""
+
+    def stop(step: int, values: dict[str, float]) -> None:
+        raise _Measured(values["pairs_per_s"])
+
+    run = replace(run, eval_every=0, encoder=replace(run.encoder, weights=SCRATCH))
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            train(run, Path(folder) / "run", quiet=True, loggers=(stop,), pack=pack)
+        except _Measured as measured:
+            return max(0.05, measured.args[0])  # logged with one decimal
+    raise AssertionError("a run logs its first steps")
 
 
 def seconds_of(path: Path) -> float:

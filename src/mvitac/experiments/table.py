@@ -8,10 +8,9 @@ from typing import Any
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
 from mvitac.evaluation.robustness import STRESSES
-from mvitac.evaluation.scores import by_cell, interval, paired_difference
+from mvitac.evaluation.scores import MODALITY_ORDER, by_cell, interval, paired_difference
 from mvitac.experiments.plan import Plan
 from mvitac.registry import from_json
-from mvitac.report.tables import MODALITY_ORDER
 
 
 @dataclass(frozen=True)

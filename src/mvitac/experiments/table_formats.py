@@ -9,12 +9,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mvitac.evaluation.scores import by_cell, least_p
+from mvitac.evaluation.scores import by_cell, least_p, num_groups_of, percent, resampled, with_interval
 from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Cell, Line, lines_of, stresses_of
 from mvitac.registry import from_json
 from mvitac.report.figures import Dot, comparison, to_png
-from mvitac.report.tables import PROBE_NAMES, RETRIEVAL, percent, retrieval_rows
+from mvitac.report.tables import PROBE_NAMES, RETRIEVAL, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
 
@@ -74,14 +74,14 @@ def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
         row = _first_cells(line)
         for task in tasks:
             cell = line.cells.get(task)
-            score = percent(cell.mean, cell.low, cell.high) if cell else ""
+            score = with_interval(cell.mean, cell.low, cell.high) if cell else ""
             row += [score, *([_printed(cell)] if shown else []), _gap(cell)]
         rows.append(row)
     return _pipes(heads, rows)
 
 
 def _printed(cell: Cell | None) -> str:
-    return "" if cell is None or cell.printed is None else f"{100 * cell.printed:.1f}"
+    return "" if cell is None or cell.printed is None else percent(cell.printed)
 
 
 def _gap(cell: Cell | None) -> str:
@@ -93,14 +93,14 @@ def _gap(cell: Cell | None) -> str:
 
 def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     """Paragraphs about data, budget, statistics, and everything that limits the comparison."""
-    least = least_p(max((len(record["group_sizes"]) for record in result["records"]), default=1))
+    least = least_p(max((num_groups_of(record) for record in result["records"]), default=1))
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
         f" {_budget(result)}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
         f" {_made(result)}.",
-        f"95 % intervals and p: bootstrap over test {result['group_by']}s and seeds. p is of the difference to"
-        f" {plan.reference} on the same test rows, {least:.3f} at the least, not corrected for the number of rows."
+        f"95 % intervals and p: {resampled(result['group_by'], seeds)}. p is of the difference to {plan.reference} on the"
+        f" same test rows, {least:.3f} at the least, not corrected for the number of rows."
         " Controls are in italics.",
     ]
     if plan.folds:
@@ -161,21 +161,21 @@ def _papers(result: dict[str, Any], plan: Plan) -> bool:
 
 
 def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
-    """AUROC of tasks with two classes: mean over seeds (and folds), lowest and highest."""
+    """AUROC of tasks with two classes in percent: mean over seeds (and folds), lowest and highest."""
     records = by_cell(result["records"], plan.probes[0])
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for line in lines:
         for task in line.cells:
             values = [r["auroc"] for r in records[task, line.modality, line.source] if r.get("auroc") is not None]
             if values and line.source != "majority":
-                spread = f" ({min(values):.2f}-{max(values):.2f})" if len(values) > 1 else ""
+                spread = f" ({percent(min(values))}-{percent(max(values))})" if len(values) > 1 else ""
                 row = found.setdefault(tuple(_first_cells(line)), {})
-                row[task] = f"{sum(values) / len(values):.2f}{spread}"
+                row[task] = f"{percent(sum(values) / len(values))}{spread}"
     if not found:
         return []
     tasks = list(dict.fromkeys(task for row in found.values() for task in row))
     rows = [[*first, *(row.get(task, "") for task in tasks)] for first, row in found.items()]
-    return _pipes(["AUROC", "modality", *tasks], rows)
+    return _pipes(["AUROC %", "modality", *tasks], rows)
 
 
 def _retrieval(result: dict[str, Any]) -> list[str]:
@@ -203,7 +203,7 @@ NAMES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "no
 
 
 def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """A booktabs table in the paper's layout: method, modality, accuracy per task, the paper's number in brackets."""
+    """A booktabs table in the paper's layout: method, modality, accuracy per task, the paper's in parentheses."""
     plan = _plan(result)
     tasks = _tasks(lines)
     text = [
@@ -219,7 +219,7 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
         text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if plan.printed_on:
-        note += f"; in brackets: printed in the paper on {plan.printed_on}"
+        note += f"; in parentheses: printed in the paper on {plan.printed_on}"
     notes = [note, *(f"% Note: {note}." for note in _notes(result))]
     if result["leaks"]:
         notes.append(f"% LEAK: {result['leaks']}.")
@@ -227,15 +227,15 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
 
 
 def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
-    """Accuracy and half of its interval; the best method of a modality is bold."""
+    """Accuracy and its interval; the best method of a modality is bold."""
     cell = line.cells.get(task)
     if cell is None:
         return ""
     best = max(x.cells[task].mean for x in lines if x.modality == line.modality and task in x.cells)
-    number = f"{100 * cell.mean:.1f}"
+    number, _, ends = with_interval(cell.mean, cell.low, cell.high).partition(" ")
     number = rf"\textbf{{{number}}}" if not line.control and cell.mean == best else number
-    paper = f" [{100 * cell.printed:.1f}]" if cell.printed is not None else ""
-    return f"{number} $\\pm$ {50 * (cell.high - cell.low):.1f}{paper}"
+    paper = f" ({percent(cell.printed)})" if cell.printed is not None else ""
+    return f"{number} {ends}{paper}"
 
 
 def _tex(text: str) -> str:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import timm
 import torch
+from huggingface_hub import constants, get_session, try_to_load_from_cache
 from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
 from torch import Tensor, nn
@@ -21,6 +22,8 @@ from mvitac.registry import LATER
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
+_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
+"""Names of timm's files on the hub."""
 
 
 @register_model
@@ -114,12 +117,23 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
             )
         except Exception as error:  # torch, safetensors and timm raise different types for an unsuitable file
             raise ValueError(f"{config.weights} does not hold weights for {config.trunk}: {brief(error)}") from None
+    return _with_imagenet(config.trunk, arguments)
+
+
+def _with_imagenet(trunk: str, arguments: dict[str, Any]) -> nn.Module:
+    """The trunk with timm's weights. The hub is asked once before, because its client tries again for 50 seconds."""
+    known = timm.get_pretrained_cfg(trunk)
+    hub = known.hf_hub_id if known else None
+    url = f"{constants.ENDPOINT}/{hub}/resolve/main/{_WEIGHTS[0]}"
     try:
-        return timm.create_model(config.trunk, pretrained=True, **arguments)
+        if hub and not any(isinstance(try_to_load_from_cache(hub, name), str) for name in _WEIGHTS):
+            get_session().head(url, timeout=10)
+        return timm.create_model(trunk, pretrained=True, **arguments)
     except Exception as error:
+        file = f"download {url} elsewhere and " if hub else ""
         raise ValueError(
-            f"ImageNet weights for {config.trunk} could not be loaded ({brief(error)}): check the network,"
-            " give --encoder.weights FILE, or start from random weights with --encoder.weights scratch"
+            f"ImageNet weights for {trunk} could not be loaded ({brief(error)}): check the network; or {file}give"
+            " --encoder.weights FILE; or start from random weights with --encoder.weights scratch"
         ) from None
 
 

@@ -25,6 +25,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
+from mvitac.evaluation.scores import percent
 from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, colour
 
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
@@ -106,7 +107,7 @@ def bars(
         for low, high in spans:  # not through the names of the groups
             axes.plot([100 * value] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
         handles.append(Line2D([], [], **look))
-        labels.append(f"{shorten(name, 28)} {100 * value:.1f}")
+        labels.append(f"{shorten(name, 28)} {percent(value)}")
     if handles:
         _below(figure, handles, labels, 3)
     return figure
@@ -121,7 +122,7 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, float], hue: str)
     look: dict[str, Any] = {"va": "center", "fontsize": 9, "color": colour("ink"), "textcoords": "offset points"}
     look["fontweight"] = "normal" if source in CONTROL_GREYS else "bold"
     look["bbox"] = {"facecolor": colour("card"), "edgecolor": "none", "pad": 0.5}  # no line runs through the value
-    axes.annotate(f"{mean:.1f}", (high, y), xytext=(5, 0), **look)
+    axes.annotate(percent(cell["mean"]), (high, y), xytext=(5, 0), **look)
 
 
 @dataclass(frozen=True)

@@ -111,8 +111,8 @@ def gallery(study: Study) -> str:
     """Random queries in both directions with the five groups found first, each marked by a word and a colour."""
     run = next((run for run in study.runs if len(run.model.projectors) == 2), None)
     split, rows = study.rows()
-    if run is None or split != "test":
-        return ""
+    if run is None or split != "test" or not study.result["retrieval"]:
+        return ""  # without a score, as of a single test group, a gallery proves nothing
     z = shared_space(run.model, study.pack, rows)
     names = study.pack.column("group")[rows].astype(str)
     groups = torch.from_numpy(np.unique(names, return_inverse=True)[1])

@@ -15,8 +15,9 @@ from rich.console import Console
 
 from mvitac import __version__
 from mvitac.data.pack import Pack
-from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs
+from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
 from mvitac.evaluation.probe import cross_modal, split_rows
+from mvitac.evaluation.scores import percent, resampled, summarise, with_interval
 from mvitac.model import load, precision_of
 from mvitac.registry import to_json
 from mvitac.report import galleries, tables
@@ -41,8 +42,8 @@ def write_report(
     Args:
         paths: Folders of the runs.
         out: Folder to write to.
-        result: What ``probe_runs`` returned for these runs. Default: probe here, with logistic regression, all tasks
-            and all controls.
+        result: What ``probe_runs`` returned for these runs. Default: the probe.json in the first run's folder if it is
+            complete (``stored_result``), else probe here, with logistic regression, all tasks and all controls.
         pack: Data to show instead of the runs' own.
         quiet: Print no progress.
 
@@ -52,11 +53,15 @@ def write_report(
     Raises:
         ValueError: If a run is not finished, or ``result`` is about other runs or data.
     """
-    runs = open_runs([Path(path) for path in paths])
+    paths = [Path(path) for path in paths]
+    runs = open_runs(paths)
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
         raise ValueError("these runs were trained on different data: write one report per dataset")
     pack = pack or runs[0].run.data.open(quiet=quiet)
-    if result is None:
+    if result is None and (result := stored_result(paths, pack)):
+        if not quiet:
+            print(f"scores: {paths[0] / 'probe.json'}")
+    elif result is None:
         with shown(Console(stderr=True), quiet=quiet):
             result = _probe(runs, pack)
     elif not isinstance(result, dict) or {"pack", "records", "retrieval", "summary", "classes"} - set(result):
@@ -66,6 +71,8 @@ def write_report(
             "the probe result is about other data than these runs: make it again with `mvitac probe --json`"
         )
     _check_scored(runs, result)
+    if result["records"]:  # a file's own summary may be of another version, with other intervals
+        result = {**result, "summary": summarise(result["records"], result["records"][0]["probe"])}
     runs = _as_scored(runs, result)
     with shown(Console(stderr=True), quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
@@ -159,7 +166,7 @@ def _page(study: Study) -> str:
     notes = "".join(f" Note: {note}." for note in spec.notes)
     foot = page.paragraph(
         f"Data: {spec.name}, from {spec.source}; licence {spec.licence}.{notes}"
-        f" 95 % intervals: {tables.resampled(spec.group_by, len({r.run.seed for r in study.runs}))}."
+        f" 95 % intervals: {resampled(spec.group_by, len({r.run.seed for r in study.runs}))}."
         f" Written by mvitac {__version__}; this page makes no network request."
     )
     return page.html_page(title, _head(study, title), [section for section in drawn if section[2]], foot)
@@ -191,18 +198,18 @@ def verdicts(study: Study) -> list[str]:
     for task in list(study.result["summary"])[:1]:
         modality, own, controls = evidence.headline(study, task)
         names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk"}
-        beside = [f"{names.get(name, name)} {100 * cell['mean']:.1f}" for name, cell in controls.items()]
+        beside = [f"{names.get(name, name)} {percent(cell['mean'])}" for name, cell in controls.items()]
         methods = study.result["summary"][task][modality]
-        others = [f"{s} {100 * methods[s]['mean']:.1f}" for s in study.sources[1:] if s in methods]
+        others = [f"{s} {percent(methods[s]['mean'])}" for s in study.sources[1:] if s in methods]
         by = f" with {study.sources[0]}" if others else ""
         clauses.append(
-            ", ".join([f"{WORDS[modality]} reaches {100 * own['mean']:.1f} % on {task}{by}", *others, *beside])
+            ", ".join([f"{WORDS[modality]} reaches {percent(own['mean'])} % on {task}{by}", *others, *beside])
         )
     found = tables.by_direction(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
     if found:
         clauses.append(
             f"a touch finds its {study.pack.spec.group_by} among the first five by camera in"
-            f" {100 * tables.recall(found, 'R@5'):.1f} % (chance {100 * tables.recall(found, 'chance R@5'):.1f})"
+            f" {percent(tables.recall(found, 'R@5'))} % (chance {percent(tables.recall(found, 'chance R@5'))})"
         )
     return clauses
 
@@ -214,7 +221,8 @@ def _tile(study: Study, task: str) -> str:
     found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
     verdict = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
     verdict = verdict if controls else ""
-    numbers = f"{100 * own['mean']:.1f}<small> % [{100 * own['low']:.1f}, {100 * own['high']:.1f}]</small>"
+    number, _, ends = with_interval(own["mean"], own["low"], own["high"]).partition(" ")
+    numbers = f"{number}<small> % {ends}</small>"
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
     what = f"<h3>{escape(task)} <small>{escape(WORDS[modality] + by)}</small></h3>"
     return f'<div class="card tile">{what}<div class="big">{numbers}</div>{verdict}</div>'

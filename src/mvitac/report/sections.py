@@ -13,7 +13,16 @@ from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.probe import MIN_GALLERY
-from mvitac.evaluation.scores import interval, summarise
+from mvitac.evaluation.scores import (
+    MODALITY_ORDER,
+    cell_text,
+    columns_of,
+    interval,
+    percent,
+    sources_of,
+    summarise,
+    tested_on,
+)
 from mvitac.model import Model
 from mvitac.report import figures, html, tables
 from mvitac.report.figures import Line
@@ -89,8 +98,8 @@ def probe(study: Study) -> str:
     names: list[str] = [tables.PROBE_NAMES.get(kind) or kind for kind in kinds]
     drawn = []
     for task, found in summary.items():
-        order = tables.sources_of(found)
-        groups = {m: {s: found[m][s] for s in order if s in found[m]} for m in tables.columns_of(found)}
+        order = sources_of(found)
+        groups = {m: {s: found[m][s] for s in order if s in found[m]} for m in columns_of(found)}
         lines = {name: cell["mean"] for name, cell in found.get("none", {}).items()}
         drawing = figures.bars(task, groups, lines, "accuracy %, mean and 95 % interval")
         alt = f"Probe accuracy on {task}; the numbers are in the table below"
@@ -101,7 +110,7 @@ def probe(study: Study) -> str:
     scores = ("accuracy", "balanced_accuracy", "macro_f1", "auroc")
     rows = [
         [r["source"], "" if r["seed"] is None else str(r["seed"]), r["task"], r["modality"], r["probe"]]
-        + ["" if r[k] is None else f"{100 * r[k]:.1f}" for k in scores]
+        + ["" if r.get(k) is None else percent(r[k]) for k in scores]  # a task with values has none
         for r in records
     ]
     columns = ("", "seed", "task", "features", "probe", "accuracy", "balanced", "macro F1", "AUROC")
@@ -113,11 +122,14 @@ def probe(study: Study) -> str:
 
 
 def _scores(study: Study, summary: dict[str, Any], probe: str) -> str:
-    columns = [m for m in tables.MODALITY_ORDER if any(m in tables.columns_of(found) for found in summary.values())]
+    columns = [m for m in MODALITY_ORDER if any(m in columns_of(found) for found in summary.values())]
     rows, muted = [], set()
     for task, found in summary.items():
-        order = tables.sources_of(found)
-        rows += [[task], *([s, *(tables.cell(found, s, m) for m in columns)] for s in order)]
+        order = sources_of(found)
+        rows += [
+            [f"{task} ({tested_on(found, study.pack.spec.group_by)})"],
+            *([s, *(cell_text(found, s, m) for m in columns)] for s in order),
+        ]
         muted |= set(order) - set(study.sources)
     return html.table(["accuracy %", *columns], rows, muted=muted, label=f"accuracy by {probe}")
 
@@ -289,11 +301,11 @@ def confusions(study: Study) -> str:
 def headline(study: Study, task: str) -> tuple[str, dict[str, float], dict[str, dict[str, float]]]:
     """The modality to show (both, else the best), the first method's score on it, and those of the controls."""
     found, source = study.result["summary"][task], study.sources[0]
-    have = [m for m in tables.columns_of(found) if source in found[m]]
+    have = [m for m in columns_of(found) if source in found[m]]
     modality = "both" if "both" in have else max(have, key=lambda m: found[m][source]["mean"])
     beside = {**found.get("none", {}), **found[modality]}
     return (
         modality,
         found[modality][source],
-        {s: beside[s] for s in tables.sources_of(found) if s in beside and s not in study.sources},
+        {s: beside[s] for s in sources_of(found) if s in beside and s not in study.sources},
     )

@@ -8,44 +8,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mvitac.evaluation.scores import interval
+from mvitac.evaluation.scores import cell_text, columns_of, interval, percent, resampled, sources_of, tested_on
 
-MODALITY_ORDER = ("none", "touch", "vision", "both")
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
 """Columns of a retrieval table, in percent."""
-
-
-def columns_of(task: dict[str, Any]) -> list[str]:
-    """The modalities of one task's summary in reading order, without "none" (majority and the like)."""
-    return [m for m in MODALITY_ORDER if m in task and m != "none"]
-
-
-def sources_of(task: dict[str, Any]) -> list[str]:
-    """Methods in order of appearance, then controls from the strongest idea to the weakest."""
-    last = ("imagenet", "untrained", "pixels", "border")
-    found = list(dict.fromkeys(source for modality in task.values() for source in modality))
-    fixed = list(task.get("none", {}))
-    own = [s for s in found if s not in last and s not in fixed]
-    return [*own, *(s for s in last if s in found), *sorted(fixed, key=lambda s: s == "majority")]
-
-
-def percent(mean: float, low: float, high: float) -> str:
-    """A score and its interval, such as '57.6 [55.1, 60.2]'."""
-    return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
-
-
-def resampled(group_by: str, num_seeds: int) -> str:
-    """What the 95 % intervals of ``num_seeds`` runs cover."""
-    if num_seeds > 1:
-        return f"bootstrap over test {group_by}s and seeds"
-    return f"bootstrap over test {group_by}s; one seed, so they leave out the variation between seeds"
-
-
-def cell(task: dict[str, Any], source: str, modality: str) -> str:
-    """The score of one source, or '' if it has none. Controls without features appear in every column."""
-    value = task.get(modality, {}).get(source) or task.get("none", {}).get(source)
-    return percent(value["mean"], value["low"], value["high"]) if value else ""
 
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
@@ -54,13 +21,16 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
     for name, task in result["summary"].items():
         modalities = columns_of(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
-        title = f"{result['data']}: {name} ({PROBE_NAMES.get(probe, probe)}; {seeds} seed{'s' * (seeds != 1)})"
+        about = (
+            f"{PROBE_NAMES.get(probe, probe)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
+        )
+        title = f"{result['data']}: {name} ({about})"
         table = Table(title=title, title_justify="left", title_style="bold")
         table.add_column("accuracy %")
         for modality in modalities:
             table.add_column(modality, justify="right", no_wrap=True)
         for source in sources_of(task):
-            table.add_row(source, *(cell(task, source, m) for m in modalities))
+            table.add_row(source, *(cell_text(task, source, m) for m in modalities))
         console.print(table)
     console.print(f"95 % intervals: {resampled(result['group_by'], seeds)}.", style="dim")
     for note in result.get("notes", ()):
@@ -85,7 +55,7 @@ def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Rows of source, direction and ``RETRIEVAL`` in percent, averaged over seeds."""
     rows = []
     for (source, direction), found in by_direction(records).items():
-        rows.append([source, direction, *(f"{100 * recall(found, key):.1f}" for key in RETRIEVAL)])
+        rows.append([source, direction, *(percent(recall(found, key)) for key in RETRIEVAL)])
     return rows
 
 

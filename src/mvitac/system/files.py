@@ -72,8 +72,9 @@ def check_place(path: Path) -> None:
 
 
 def brief(error: BaseException) -> str:
-    """Return the first line of a library's error, at most 160 characters, to quote in an error message."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+    """Return the first line of a library's error, some 160 characters in whole words, to quote in an error message."""
+    line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return line if len(line) <= 160 else f"{line[:156].rsplit(' ', 1)[0]} ..."
 
 
 def write_json(path: Path, value: Any) -> None:

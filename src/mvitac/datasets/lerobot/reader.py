@@ -104,7 +104,7 @@ class LeRobotConfig(RowsConfig):
                 elif not self.allow_missing:
                     raise ValueError(
                         f"{file}: no frame within {self.tolerance:g} s of {moment:.3f} s (episode {name}, the nearest is"
-                        f" {miss:.3f} s away): give a larger tolerance, or allow_missing"
+                        f" {miss:.3f} s away): give a larger --data.tolerance, or --data.allow-missing"
                     )
         return places
 

@@ -5,6 +5,7 @@ Row numbers count from 1, row indices from 0.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def image_columns(manifest: Manifest, vision: str | None, touch: tuple[str, ...]
     if not (vision or touch):
         raise ValueError(
             f"{manifest.file} has no column vision, touch, or left and right (it has {', '.join(have)}):"
-            " name the image columns by vision and touch"
+            " name the image columns, --data.vision COLUMN --data.touch COLUMN"
         )
     return vision, touch
 
@@ -45,13 +46,13 @@ def backgrounds_from_columns(
     """Read the background of each touch column from a column of its own (default: "background")."""
     if not columns and "background" not in (*manifest.columns, *manifest.found):
         raise ValueError(
-            f"{manifest.file} has no column 'background': difference images need background columns, or no_contact rows"
+            f"{manifest.file} has no column 'background': difference images need background columns, or --data.no-contact"
         )
     columns = columns or ("background",)
     if len(columns) != len(touch):
         raise ValueError(
             f"background {' '.join(columns)}: difference images of touch {' '.join(touch)} need as many background"
-            " columns, or no_contact rows"
+            " columns, or --data.no-contact for rows without contact"
         )
     for column in columns:
         manifest.check(column)
@@ -109,22 +110,21 @@ def check_present(
         gaps = [[refs[c][i] is None for c in columns] for i in range(len(numbers))]
         for number, gap in zip(numbers, gaps, strict=True):
             if any(gap) and not (allow_missing and all(gap)):
-                hint = (
-                    "allow_missing accepts rows without a modality" if all(gap) else "stacked sensors need both images"
-                )
+                accept = "--data.allow-missing accepts rows without a modality"
+                hint = accept if all(gap) else "stacked sensors need both images"
                 raise ValueError(
                     f"{manifest.file} row {number} has no {columns[gap.index(True)]} path: fill it, or leave the row out"
-                    f" (only); {hint}"
+                    f" (--data.only); {hint}"
                 )
         lacking = [bool(gap) and all(gap) for gap in gaps]
         if all(lacking) and columns:
-            raise ValueError(f"{manifest.file}: {modality} is empty in every row: leave it out by {modality}=''")
+            raise ValueError(f"{manifest.file}: {modality} is empty in every row: leave it out by --data.{modality} ''")
         if any(lacking):
             missing[modality] = lacking
     present = [m for m, columns in by_modality.items() if columns]
     for i, number in enumerate(numbers):
         if missing and all(m in missing and missing[m][i] for m in present):
-            raise ValueError(f"{manifest.file} row {number} has neither image: leave it out (only)")
+            raise ValueError(f"{manifest.file} row {number} has neither image: leave it out (--data.only)")
     return missing
 
 
@@ -153,8 +153,10 @@ def check_files(
                 name = manifest.rows[number - 1].get(column) or Path(ref.path).name
                 missing.append(f"row {number} {column} {name}{' (0 bytes)' if size == 0 else ''}")
     if missing:
+        tried = "; backslashes were also tried as slashes" if "\\" in missing[0] else ""
+        tried = "; C:\\... is on another computer" if re.search(r" [A-Za-z]:\\", missing[0]) else tried
         raise ValueError(
             f"{manifest.file}: {len(missing)} of {len(sizes)} image files are missing or empty, e.g."
-            f" {'; '.join(missing[:3])} (paths are relative to {manifest.root})"
+            f" {'; '.join(missing[:3])} (paths are relative to {manifest.root}{tried})"
         )
     return sizes, stamps

@@ -70,7 +70,7 @@ class Manifest:
         counter = f"{column}_frame" if f"{column}_frame" in self.columns else "frame"
         for number, row in enumerate(self.rows, 1):
             cell = row[column]
-            path = os.path.join(root, cell)
+            path = _find(root, cell)
             if not cell:
                 refs.append(None)
             elif not cell.lower().endswith(VIDEOS):
@@ -83,6 +83,17 @@ class Manifest:
                     f" {row.get(counter, 'nothing')!r}: give the frame's number, from 0"
                 )
         return refs
+
+
+def _find(root: str, cell: str) -> str:
+    """The path that ``cell`` means: relative to ``root``, ``~`` as the home folder, and Windows' backslashes as slashes.
+
+    A file that has exactly this name is preferred.
+    """
+    path = os.path.join(root, cell)
+    if ("\\" in cell or cell.startswith("~")) and not os.path.lexists(path):
+        return os.path.join(root, os.path.expanduser(cell.replace("\\", "/")))
+    return path
 
 
 def text_of(value: Any) -> str:
@@ -111,7 +122,7 @@ def in_clone(path: Path, inside: str, pattern: str, url: str) -> Path:
         if next(root.glob(pattern), None) is not None:
             return root
     lacks = f"holds no {inside}/{pattern}" if path.is_dir() else "does not exist"
-    raise ValueError(f"{path} {lacks}: git clone {url}, and give the clone as path")
+    raise ValueError(f"{path} {lacks}: git clone {url}, and give the clone as --data.path")
 
 
 def find_manifest(path: Path) -> Path | None:
@@ -122,7 +133,7 @@ def find_manifest(path: Path) -> Path | None:
             raise ValueError(f"{path} holds {' and '.join(p.name for p in found)}: give the path of one of them")
         return found[0] if found else None
     if not path.is_file():
-        raise ValueError(f"{path} does not exist: give a manifest ({', '.join(MANIFESTS)}) or a folder as path")
+        raise ValueError(f"{path} does not exist: give a manifest ({', '.join(MANIFESTS)}) or a folder as --data.path")
     if path.suffix.lower() not in MANIFESTS:
         raise ValueError(f"{path} is not a manifest: its name must end in {', '.join(MANIFESTS)}")
     return path
@@ -241,7 +252,7 @@ def _split_rows(root: Path, split: str, pictures: str, allow_missing: bool) -> l
         lacking = next((name for name, images in found.items() if key not in images), None)
         if lacking and not allow_missing:
             raise ValueError(
-                f"{first} has no counterpart {base / lacking / key}.*: add it, remove the other, or allow_missing"
+                f"{first} has no counterpart {base / lacking / key}.*: add it, remove the other, or --data.allow-missing"
             )
         label, *below = key.split("/")
         if not below:

@@ -106,7 +106,7 @@ def check_split_names(where: str, column: str, numbers: Sequence[int], splits: S
     for number, split in zip(numbers, splits, strict=True):
         if split not in SPLITS:
             wanted = likely_split(split)
-            hint = f"; write {wanted!r} instead" if wanted else f"; or split={BY_GROUP} ignores the column"
+            hint = f"; write {wanted!r} instead" if wanted else f"; or --data.split {BY_GROUP} ignores the column"
             raise ValueError(f"{where} row {number}: {unknown(f'split in column {column!r}', split, SPLITS)}{hint}")
 
 
@@ -120,12 +120,12 @@ def check_leak(where: str, split: str, what: str, values: Sequence[str], splits:
         sides[value].add("train" if side == "unlabelled" else side)
     leaks = [value for value, found in sides.items() if len(found) > 1]
     if leaks:
-        advice = (
-            "give the group that holds them together" if split == BY_GROUP else f"split={BY_GROUP} assigns whole groups"
-        )
+        advice = f"--data.split {BY_GROUP} assigns whole groups"
+        if split == BY_GROUP:
+            advice = "give the group that holds them together (--data.group)"
         raise ValueError(
             f"{where}: split {split!r} leaks: {len(leaks)} of {len(sides)} {what} are in more than one split, e.g."
-            f" {leaks[0]!r} in {' and '.join(sorted(sides[leaks[0]]))}; {advice}, or allow_leak accepts it"
+            f" {leaks[0]!r} in {' and '.join(sorted(sides[leaks[0]]))}; {advice}, or --data.allow-leak accepts it"
         )
 
 
@@ -141,7 +141,9 @@ def check_sides(
         for side in ("train", "test"):
             if not any(label >= 0 and s == side for label, s in zip(target, splits, strict=True)):
                 hint = (
-                    "more groups or another share are needed" if split == BY_GROUP else "a probe needs train and test"
+                    "give more groups, or another --data.test-share"
+                    if split == BY_GROUP
+                    else "a probe needs train and test"
                 )
                 raise ValueError(f"{where}: {what} gives label {task.name!r} no labelled rows in {side}: {hint}")
 

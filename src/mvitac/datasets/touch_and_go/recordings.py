@@ -62,7 +62,7 @@ def _base(root: Path) -> Path:
     base = root / "dataset" if (root / "dataset").is_dir() else root
     if not base.is_dir():
         raise ValueError(
-            f"{base} is not a folder: give the download (with dataset/ in it) as root; get it from {HOMEPAGE}"
+            f"{base} is not a folder: give the download (with dataset/ in it) as --data.root; get it from {HOMEPAGE}"
         )
     return base
 
