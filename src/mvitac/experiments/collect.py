@@ -33,7 +33,6 @@ from mvitac.run import Run, load_run
 from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.provenance import provenance
-from mvitac.training.sampler import training_rows
 from mvitac.training.setup import check_same
 from mvitac.training.views import gel_mirror
 
@@ -93,7 +92,7 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
         raise ValueError(f"dataset {plan.data.name!r} has no {', '.join(missing)}")
     run = plan.run(row, plan.data, 0)
     own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
-    run.check(own.spec, len(training_rows(run, own)), own.size)
+    run.check(own.spec, len(run.method.training_rows(own)), own.size)
     gel_mirror(run, own, torch.device("cpu"))
     run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
     return own, run.without_idle(own.spec).digest()
@@ -196,7 +195,7 @@ def leaks(pack: Pack, tasks: Sequence[AnyTask]) -> str:
 def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
     """Steps, pairs, images, median seconds and (if measured) peak GPU memory of one run of a row."""
     run = jobs[0].run
-    rows = len(training_rows(run, pack))
+    rows = len(run.method.training_rows(pack))
     method = run.method.build(pack.spec, replace(run.encoder, weights=SCRATCH))
     steps = run.num_steps(rows)
     peaks = [read_json(p, "peak memory")["peak_bytes"] for job in jobs if (p := job.out / "memory.json").exists()]
@@ -228,7 +227,7 @@ def forecast(work: Work) -> list[str]:
     lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
     known = [seconds_of(job.out) for job in work.jobs if job.done and not job.failure]
     for label, job in rows.items():
-        num = len(training_rows(job.run, work.pack))
+        num = len(job.run.method.training_rows(work.pack))
         steps = job.run.num_steps(num)
         mine = [j for j in work.jobs if j.label == label]
         lines.append(

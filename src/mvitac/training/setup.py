@@ -20,7 +20,6 @@ from mvitac.system.files import brief, check_place, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.sampler import training_rows
 from mvitac.training.step import Step
 from mvitac.training.views import gel_mirror
 from mvitac.transforms.gel_flip import GelMirror
@@ -56,7 +55,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
     pack = _open_pack(run, world, quiet) if pack is None else pack
-    rows = training_rows(run, pack)
+    rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)
     check_divisible(run, world)
