@@ -94,7 +94,7 @@ def test_the_plans_hold_the_papers_tables() -> None:
     assert list(TABLE1.printed_majority.values()) == [18.6, 66.1, 56.3]
     second = {row.label: row.printed["both"]["success"] for row in TABLE2.rows if row.printed}
     assert second == {"TAG (CMC)": 56.3, "MViTac": 60.3, "Calandra et al., supervised": 73.1}
-    run = TABLE2.run(TABLE2.rows[3], PackConfig(), 0)
+    run = TABLE2.run(TABLE2.rows[3], PackConfig(), 0, phased=True)
     assert run.augment.touch.grayscale == run.augment.vision.grayscale == 0
 
 
@@ -223,7 +223,7 @@ def test_changed_fields_are_checked() -> None:
         changed(run, {"steps": "many"})
     with pytest.raises(ValueError, match="row 'MViTac': temperature"):
         Plan(name="x", rows=(Row(label="MViTac", set={"method.temperature": -1.0}),)).run(
-            Row(label="MViTac", set={"method.temperature": -1.0}), PackConfig(), 0
+            Row(label="MViTac", set={"method.temperature": -1.0}), MaterialsConfig(), 0
         )
     assert setting("optim.lr=1e-3") == ("optim.lr", 1e-3)
     assert setting("encoder.weights=scratch") == ("encoder.weights", "scratch")
@@ -405,7 +405,7 @@ def test_scores_that_do_not_say_what_they_are_of_are_of_linear_probes(pack: Pack
 
 def test_tables_say_where_pairs_are_from(done: tuple[Path, dict], pack: Pack) -> None:
     said = {
-        (positives, views): pairs_of(replace(recipe("smoke", PackConfig()), positives=positives), views, pack)
+        (positives, views): pairs_of(replace(recipe("smoke", pack), positives=positives), views, pack)
         for positives in ("same-image", "same-touch", "same-touch-pairs")
         for views in (1, 2)
     }

@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 
 from mvitac.data import notebook
 from mvitac.data.jpeg import Jpegs, Lazy
-from mvitac.data.spec import DataSpec, ValueTask
+from mvitac.data.spec import PHASES, DataSpec, ValueTask
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json
 
@@ -186,6 +186,14 @@ class Pack:
         """int64 [N], number of each row's touch group (column touch_group, else group): its rows are near-duplicates."""
         name = "touch_group" if "touch_group" in self.table.column_names else "group"
         return np.unique(self.column(name).astype(str), return_inverse=True)[1]
+
+    @functools.cached_property
+    def phased(self) -> bool:
+        """Whether rows of a touch group show the phases of a grasp (column phase: before, during, after).
+
+        Else they show repeated touches, or frames of one.
+        """
+        return "phase" in self.table.column_names and set(self.column("phase").astype(str)) <= set(PHASES)
 
     @functools.cached_property
     def _rows_by_touch_group(self) -> list[np.ndarray]:

@@ -27,8 +27,8 @@ class DatasetConfig(Registered, ABC):
 
     local: ClassVar[tuple[str, ...]] = ("workers",)
     """Options that do not affect the result."""
-    phased: ClassVar[bool] = False
-    """Whether rows of a touch group show phases of a grasp (before, during, after) instead of repeated touches."""
+    phased: ClassVar[bool | None] = None
+    """``Pack.phased`` where it is known before the data is opened. None: the opened pack decides."""
 
     size: int = 256
     """Side of the stored images in pixels; crops are taken from them (paper: 256)."""

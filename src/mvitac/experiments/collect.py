@@ -77,7 +77,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     jobs = []
     for seed in range(plan.seeds):
         for row, own in possible:
-            run = replace(plan.run(row, plan.data, seed), device=device)
+            run = replace(plan.run(row, plan.data, seed, pack.phased), device=device)
             job = Job(row.label, run, out / "runs" / slug(row.label) / f"seed{seed}", session, plan.stress)
             if (job.out / "run.json").exists():
                 check_same(job.run, own, job.out)
@@ -90,7 +90,7 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
     assert plan.data is not None
     if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
         raise ValueError(f"dataset {plan.data.name!r} has no {', '.join(missing)}")
-    run = plan.run(row, plan.data, 0)
+    run = plan.run(row, plan.data, 0, pack.phased)
     own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
     run.check(own.spec, len(run.method.training_rows(own)), own.size)
     gel_mirror(run, own, torch.device("cpu"))

@@ -107,7 +107,7 @@ class Plan:
         if not self.folds:
             return [("", self)]
         assert self.data is not None
-        whole = recipe(self.recipe, self.data)  # the data of the plan, without changes of single rows
+        whole = recipe(self.recipe, self.data, phased=False)  # for its data alone
         parts = [
             {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
         ]
@@ -122,10 +122,13 @@ class Plan:
         datas = [changed(whole, part).data for part in parts]
         return [(name, replace(self, data=data, folds=())) for name, data in zip(names, datas, strict=True)]
 
-    def run(self, row: Row, data: DatasetConfig, seed: int) -> Run:
-        """The run of one row and seed; ValueError if a field does not exist or its value does not fit."""
+    def run(self, row: Row, data: DatasetConfig, seed: int, phased: bool | None = None) -> Run:
+        """The run of one row and seed; ValueError if a field does not exist or its value does not fit.
+
+        ``phased`` is that of the opened data, as for ``recipe``.
+        """
         try:
-            base = with_method(recipe(row.recipe or self.recipe, data), row.method)
+            base = with_method(recipe(row.recipe or self.recipe, data, phased), row.method)
             return replace(changed(base, {**self.set, **row.set}), seed=seed)
         except ValueError as error:
             raise ValueError(f"row {row.label!r}: {error}") from None

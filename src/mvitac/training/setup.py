@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
+from mvitac.datasets.base import DatasetConfig
 from mvitac.methods.base import Method
 from mvitac.model import Model, precision_of
 from mvitac.nn.memory_bank import replicated, shard_banks
@@ -54,7 +55,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     """
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
-    pack = _open_pack(run, world, quiet) if pack is None else pack
+    pack = open_pack(run.data, world, quiet) if pack is None else pack
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)
@@ -133,11 +134,11 @@ def _check_precision(begun: str, asked: Run, run: Run, out: Path) -> None:
         )
 
 
-def _open_pack(run: Run, world: World, quiet: bool) -> Pack:
-    """Open the data of ``run``. Rank 0 simulates or packs what does not exist yet, then the others open it."""
+def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
+    """Open ``data``. Rank 0 simulates or packs what does not exist yet, then the others open it."""
     if world.rank:
         world.wait()
-    pack = run.data.open(quiet=quiet or not world.writes)
+    pack = data.open(quiet=quiet or not world.writes)
     if not world.rank:
         world.wait()
     return pack

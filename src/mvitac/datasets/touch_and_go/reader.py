@@ -62,6 +62,7 @@ class TouchAndGoConfig(DatasetConfig):
     """
 
     name: ClassVar[str] = "touch-and-go"
+    phased: ClassVar[bool | None] = False
 
     root: Path = Path("touch_and_go")
     """Folder of the download: with dataset/<recording>/ in it, or with the recordings themselves."""
