@@ -25,7 +25,7 @@ from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work, seconds_of
-from mvitac.experiments.plan import Plan, Row, slug
+from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.model import precision_of
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
@@ -216,7 +216,7 @@ def pairs_of(run: Run, views: int, pack: Pack) -> str:
     """Which rows form a positive pair (``Run.positives``). This matters more than the choice of most methods."""
     other = run.positives != "same-image" if views > 1 else run.positives == "same-touch-pairs"
     several = len(np.unique(pack.touch_groups)) < pack.num
-    return "two rows of a touch" if other and several else "one row"
+    return "two rows of a touch" if other and several else ONE_ROW
 
 
 def forecast(work: Work) -> list[str]:

@@ -16,6 +16,8 @@ from mvitac.run import Run
 
 Printed = dict[str, dict[str, float]]
 """modality -> task -> top-1 accuracy in percent as printed in the paper."""
+ONE_ROW = "one row"
+"""Where the pairs of a run are from if its positives are views of the same image, as in the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,7 @@ class Row:
     set: dict[str, Any] = field(default_factory=dict)
     """Fields of the run to change, by dotted name, e.g. {"method.temperature": 0.2, "optim.lr": 0.03}."""
     printed: Printed = field(default_factory=dict)
-    """The paper's numbers for this row."""
+    """The paper's numbers for this row, with positives of the same image. Shown beside such scores of probe paper only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,7 @@ class Plan:
     stress: bool = False
     """Also run stress tests: few labels, noisy images, a missing modality, a leaking split (``evaluation.robustness``)."""
     printed_on: str = ""
-    """Name of the dataset of the paper's numbers."""
+    """Name of the dataset of the paper's numbers, with its split: they are shown beside scores on this data only."""
     printed_majority: dict[str, float] = field(default_factory=dict)
     """task -> majority rate as printed in the paper."""
 

@@ -108,8 +108,9 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
         folds = f"{len(plan.folds)} fold{'s' * (len(plan.folds) > 1)}"
         text.append(f"{folds}: every test {result['group_by']} is scored once{unseen}.")
     if shown:
-        other = "." if _papers(result, plan) else ", which is other data: compare the order of rows, not values."
-        text.append(f'"printed" is the paper\'s number on {plan.printed_on}{other}')
+        text.append(f'"printed" is the paper\'s number on {plan.printed_on}, by the same probe and positives.')
+    elif result["data"] == plan.printed_on and plan.probes[0] != "paper":
+        text.append("The paper's numbers are of its own probe: `--probes paper` shows them.")
     text += [f"Note: {note}." for note in _notes(result)]
     if result["leaks"]:
         text.append(f"**LEAK: {result['leaks']}.**")
@@ -153,11 +154,6 @@ def _made(result: dict[str, Any]) -> str:
     runs = list(dict.fromkeys(short(commit) for commit in result.get("run_commits", ()))) or [tables]
     code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
     return ", ".join([code, *(result.get("run_devices") or [result["device"]])])
-
-
-def _papers(result: dict[str, Any], plan: Plan) -> bool:
-    """Whether this is the paper's data. Its name may end with a split: touch-and-go (official)."""
-    return result["data"].split(" ")[0] == plan.printed_on
 
 
 def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
@@ -218,7 +214,7 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
         cells = (_tex_cell(line, task, lines) for task in tasks)
         text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
     note = f"% {plan.title or plan.name}; data {result['data']}"
-    if plan.printed_on:
+    if any(cell.printed is not None for line in lines for cell in line.cells.values()):
         note += f"; in brackets: printed in the paper on {plan.printed_on}"
     notes = [note, *(f"% Note: {note}." for note in _notes(result))]
     if result["leaks"]:
@@ -268,12 +264,10 @@ def comma(result: dict[str, Any]) -> str:
 
 
 def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
-    """The table as a PNG (``figures.comparison``), with the paper's numbers if this is the paper's data."""
-    printed = _papers(result, _plan(result))
+    """The table as a PNG (``figures.comparison``)."""
     panels: dict[str, list[Dot]] = {}
     for line in lines:
         for task, cell in line.cells.items():
-            paper = cell.printed if printed else None
-            dot = Dot(line.source, line.modality, cell.mean, cell.low, cell.high, paper, line.control)
+            dot = Dot(line.source, line.modality, cell.mean, cell.low, cell.high, cell.printed, line.control)
             panels.setdefault(task, []).append(dot)
     return to_png(comparison(panels), dpi=110)
