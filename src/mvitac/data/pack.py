@@ -166,7 +166,7 @@ class Pack:
     def rows(
         self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = (), by: str = "split"
     ) -> np.ndarray:
-        """Return row numbers, ascending int64.
+        """Return row numbers, ascending int64. Without ``by``, rows that are ``hidden`` are left out.
 
         Args:
             splits: Splits to include.
@@ -175,6 +175,8 @@ class Pack:
             by: Column with the split.
         """
         mask = np.isin(self.column(by), splits)
+        if by == "split":
+            mask &= ~self.hidden
         for modality in having:
             mask &= self.has(modality)
         for name, value in (only or {}).items():
@@ -186,6 +188,24 @@ class Pack:
         """int64 [N], number of each row's touch group (column touch_group, else group): its rows are near-duplicates."""
         name = "touch_group" if "touch_group" in self.table.column_names else "group"
         return np.unique(self.column(name).astype(str), return_inverse=True)[1]
+
+    @property
+    def own_ids(self) -> np.ndarray:
+        """The rows' ids as text [N], as in the pack they are from."""
+        return self.column("id").astype(str)
+
+    @functools.cached_property
+    def hidden(self) -> np.ndarray:
+        """bool [N], rows of val and test that are labelled only for a task with a split of its own.
+
+        In this split only that task may see them (Touch and Go's official split: frames that only the rough lists name).
+        """
+        tasks = self.spec.tasks
+        labelled, others = ([t.name for t in tasks if (t.split == "split") == shared] for shared in (True, False))
+        if not labelled or not others:
+            return np.zeros(self.num, bool)
+        seen, alone = (np.any([self.labels(name) >= 0 for name in names], axis=0) for names in (labelled, others))
+        return np.isin(self.column("split"), ("val", "test")) & alone & ~seen
 
     @functools.cached_property
     def phased(self) -> bool:

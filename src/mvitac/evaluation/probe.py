@@ -279,6 +279,12 @@ def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor
     return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
 
 
+def retrieved_rows(pack: Pack) -> np.ndarray:
+    """Test rows with all modalities, of the phase that the first task is about."""
+    only = pack.spec.tasks[0].only if pack.spec.tasks else None
+    return pack.rows("test", only=only, having=pack.spec.modalities)
+
+
 def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
     """Retrieval of test groups across modalities, in both directions.
 
@@ -288,8 +294,7 @@ def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
-    only = pack.spec.tasks[0].only if pack.spec.tasks else None
-    rows = pack.rows("test", only=only, having=pack.spec.modalities)
+    rows = retrieved_rows(pack)
     sizes = np.bincount(_group_numbers(pack, rows))
     if len(sizes) < MIN_GALLERY:
         return []
