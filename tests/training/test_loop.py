@@ -37,7 +37,9 @@ def straight(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_leaves_the_promised_files(straight: Path) -> None:
-    assert {p.name for p in straight.iterdir()} == {"run.json", "log.jsonl", "checkpoint.pt", "model.safetensors"}
+    assert {p.name for p in straight.iterdir()} == {
+        *("run.json", "trained_on.safetensors", "log.jsonl", "checkpoint.pt", "model.safetensors")
+    }
     lines = [json.loads(line) for line in (straight / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [2, 4, 6, 8]
     assert [line["step"] for line in lines if "eval" in line] == [4, 8]

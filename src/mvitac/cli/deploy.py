@@ -16,6 +16,7 @@ from mvitac.deploy.artifact import load, read
 from mvitac.deploy.publish import own_data, with_readouts
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.system.progress import shown
 
 
@@ -29,6 +30,8 @@ class _PublishOptions:
     """The new folder."""
     on: Path | None = None
     """Fit the probes on this pack instead of the data the run was trained on."""
+    allow_leak: bool = False
+    """Score also rows or groups of --on that the run was trained on; the card says LEAK beside such scores."""
     push: str | None = None
     """Also upload the folder to the Hugging Face Hub under this name (owner/name); needs `hf auth login`."""
     private: bool = False
@@ -39,13 +42,14 @@ def publish(argv: list[str]) -> None:
     """mvitac publish RUN OUT [--on PACK] [--push OWNER/NAME]"""
     options = parse(_PublishOptions, argv, "publish")
     with shown(Console(stderr=True)):
-        out = write_artifact(options.run, options.out, Pack(options.on) if options.on else None)
+        pack = Pack(options.on) if options.on else None
+        out = write_artifact(options.run, options.out, pack, allow_leak=options.allow_leak)
     table = Table(title=f"{out}: accuracy of its probes", title_justify="left")
     for column in ("task", "from", "accuracy %", "majority %"):
         table.add_column(column)
     for readout in read(out).readouts.values():
         q = readout.question
-        table.add_row(q.task, q.modality, f"{100 * q.accuracy:.1f}", f"{100 * q.majority:.1f}")
+        table.add_row(q.task, q.modality, f"{100 * q.accuracy:.1f}{leak_mark(q.leak)}", f"{100 * q.majority:.1f}")
     Console(markup=False).print(table)
     if options.push:
         print(f"pushed: {push_artifact(out, options.push, private=options.private)}")

@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 
 from mvitac.data import notebook
 from mvitac.data.jpeg import Jpegs, Lazy
-from mvitac.data.spec import PHASES, DataSpec, ValueTask
+from mvitac.data.spec import PHASES, AnyTask, DataSpec, ValueTask
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json
 
@@ -154,6 +154,12 @@ class Pack:
             found[self.column(name).astype(str) != value] = np.nan
         return found
 
+    def answered(self, task: AnyTask) -> np.ndarray:
+        """Return bool [N], which rows have a label, or a value of at least one target."""
+        if isinstance(task, ValueTask):
+            return np.asarray(np.isfinite(self.values(task)).any(axis=1))
+        return self.labels(task.name) >= 0
+
     @functools.cached_property
     def _labels(self) -> dict[tuple[str, ...], np.ndarray]:
         return {}
@@ -200,11 +206,11 @@ class Pack:
 
         In this split only that task may see them (Touch and Go's official split: frames that only the rough lists name).
         """
-        tasks = self.spec.tasks
-        labelled, others = ([t.name for t in tasks if (t.split == "split") == shared] for shared in (True, False))
-        if not labelled or not others:
+        tasks = self.spec.all_tasks
+        shared, others = ([t for t in tasks if (t.split == "split") == same] for same in (True, False))
+        if not shared or not others:
             return np.zeros(self.num, bool)
-        seen, alone = (np.any([self.labels(name) >= 0 for name in names], axis=0) for names in (labelled, others))
+        seen, alone = (np.any([self.answered(task) for task in some], axis=0) for some in (shared, others))
         return np.isin(self.column("split"), ("val", "test")) & alone & ~seen
 
     @functools.cached_property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import Task
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.evaluation.classifiers import fit_linear, spread_out
+from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.features import features
+from mvitac.evaluation.leaks import Scored, leak_mark, write_sources
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.scores import score
 from mvitac.model import Model, load
@@ -42,6 +45,15 @@ def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
                 readouts[readout.question.name] = readout
             advance()
     return readouts
+
+
+def _scorable(pack: Pack, task: Task) -> bool:
+    """Whether the task has labelled rows in train and test."""
+    try:
+        split_rows(pack, task)
+    except ValueError:
+        return False
+    return True
 
 
 def _fit_readout(model: Model, pack: Pack, task: Task, source: str, modalities: list[str]) -> LinearProbe | None:
@@ -84,19 +96,21 @@ def with_readouts(model: Model, pack: Pack | None = None) -> Model:
     return model
 
 
-def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
+def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False) -> Path:
     """Write the artifact of a finished run.
 
     Args:
         run: the run's folder.
         out: the new folder.
         pack: data to fit the probes on (default: the data the run was trained on).
+        allow_leak: score also rows or groups of ``pack`` that the run was trained on; the card says LEAK beside scores.
 
     Returns:
         ``out``. The artifact was loaded once, as a check, before it got this name.
 
     Raises:
-        ValueError: ``out`` exists or cannot be written, or the run or its data is missing.
+        ValueError: ``out`` exists or cannot be written, the run or its data is missing, or the run was trained on what
+            ``pack`` would score.
     """
     if out.exists():
         raise ValueError(f"{out} already exists: choose another place, or delete it first")
@@ -104,12 +118,20 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
     model = load(run)
     _, record = load_run(run)
     pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
-    model = with_readouts(model, pack)
+    tasks = {task.name: task for task in pack.spec.tasks if _scorable(pack, task)}
+    learned = check_unseen([run], [model], pack, list(tasks.values()), allow_leak=allow_leak)[0]
+    model, scored = with_readouts(model, pack), Scored(pack)
+    for readout in model.readouts.values():
+        q = readout.question
+        leak = scored.leak(learned, split_rows(pack, tasks[q.task], q.modality).test)
+        readout.question = replace(q, leak=leak)
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         _write_weights(model, partial)
         write_json(partial / "run.json", record)
+        if learned is not None:
+            write_sources(partial, learned)
         manifest = _describe(model, pack)
         write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
@@ -172,6 +194,10 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
 def _about(model: Model, learned: str, data: str) -> list[str]:
     """The part of the model card on the model: what it is, an example, scores, classes."""
     run = model.run
+    leaks = dict.fromkeys(r.question.leak for r in model.readouts.values() if r.question.leak)
+    unseen = "rows of groups that neither encoders nor probes saw"
+    if leaks:
+        unseen = f"test rows. LEAK, what the encoders saw of them: {'; '.join(leaks)}"
     lines = [
         f"# {run.method.name} on {learned}",
         "",
@@ -187,14 +213,15 @@ def _about(model: Model, learned: str, data: str) -> list[str]:
         "",
         "## Scores",
         "",
-        "Accuracy on rows of groups that neither encoders nor probes saw; majority is always the most frequent class.",
+        f"Accuracy on {unseen}; majority is always the most frequent class.",
         "",
         "| task | from | accuracy % | majority % | test rows |",
         "|---|---|---:|---:|---:|",
     ]
     for readout in model.readouts.values():
         q = readout.question
-        lines.append(f"| {q.task} | {q.modality} | {100 * q.accuracy:.1f} | {100 * q.majority:.1f} | {q.num_test} |")
+        accuracy = f"{100 * q.accuracy:.1f}{leak_mark(q.leak)}"
+        lines.append(f"| {q.task} | {q.modality} | {accuracy} | {100 * q.majority:.1f} | {q.num_test} |")
     return [*lines, "", "## Classes", "", *(f"- {task}: {', '.join(c)}" for task, c in model.classes.items()), ""]
 
 

@@ -67,7 +67,10 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
         if len(parts) < len(folds):
             continue
         if "group_sums" in parts[0]:
-            pooled.append({**{key: parts[0][key] for key in keys}, **pool_values(parts)})
+            whole = pool_values(parts)
+            if leaks := leaks_in(parts):
+                whole["leak"] = leaks
+            pooled.append({**{key: parts[0][key] for key in keys}, **whole})
             continue
         sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
         means = {}
@@ -81,6 +84,8 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
             "group_sizes": sizes,
             "group_correct": correct,
         }
+        if leaks := leaks_in(parts):
+            whole["leak"] = leaks
         pooled.append({**{key: parts[0][key] for key in keys}, **means, **whole})
     return pooled
 
@@ -212,12 +217,19 @@ def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[di
     return found
 
 
+def leaks_in(records: Sequence[dict[str, Any]]) -> str:
+    """The leaks of records (``evaluation.leaks``), without repetition; controls and records of 0.1.0 have none."""
+    return "; ".join(dict.fromkeys(record["leak"] for record in records if record.get("leak")))
+
+
 def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
     """Accuracy as task -> modality -> method or control -> mean, low, high and seeds (``by_cell``, ``interval``)."""
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
         mean, low, high = interval(found)
         seeds = [record["seed"] for record in found if record["seed"] is not None]
-        cell = {"mean": mean, "low": low, "high": high, "seeds": seeds}
+        cell: dict[str, Any] = {"mean": mean, "low": low, "high": high, "seeds": seeds}
+        if leaks := leaks_in(found):
+            cell["leak"] = leaks
         summary.setdefault(task, {}).setdefault(modality, {})[source] = cell
     return summary

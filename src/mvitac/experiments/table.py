@@ -8,7 +8,7 @@ from typing import Any
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
 from mvitac.evaluation.robustness import STRESSES
-from mvitac.evaluation.scores import by_cell, interval, paired_difference
+from mvitac.evaluation.scores import by_cell, interval, leaks_in, paired_difference
 from mvitac.experiments.plan import ONE_ROW, Plan
 from mvitac.registry import from_json
 from mvitac.report.tables import MODALITY_ORDER
@@ -25,6 +25,8 @@ class Cell:
     printed: float | None
     difference: tuple[float, float, float, float] | None
     """To the reference row: mean, low, high, p."""
+    leak: str = ""
+    """Which test rows were trained on (``evaluation.leaks``)."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,9 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
                     paper = None if trained or probe != "paper" else _printed(result, plan, task, modality, source)
                     seeds = max(1, sum(record["seed"] is not None for record in mine))
                     gap = paired_difference(mine, against) if against else None
-                    cells[task] = Cell(*interval(mine), seeds, None if paper is None else paper / 100, gap)
+                    cells[task] = Cell(
+                        *interval(mine), seeds, None if paper is None else paper / 100, gap, leaks_in(mine)
+                    )
             if cells:
                 lines.append(Line(source, modality, cells, control=source in controls))
     return lines

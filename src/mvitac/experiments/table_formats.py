@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.scores import by_cell, least_p
 from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Cell, Line, lines_of, stresses_of
@@ -74,7 +75,7 @@ def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
         row = _first_cells(line)
         for task in tasks:
             cell = line.cells.get(task)
-            score = percent(cell.mean, cell.low, cell.high) if cell else ""
+            score = percent(cell.mean, cell.low, cell.high, cell.leak) if cell else ""
             row += [score, *([_printed(cell)] if shown else []), _gap(cell)]
         rows.append(row)
     return _pipes(heads, rows)
@@ -231,7 +232,7 @@ def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
     number = f"{100 * cell.mean:.1f}"
     number = rf"\textbf{{{number}}}" if not line.control and cell.mean == best else number
     paper = f" [{100 * cell.printed:.1f}]" if cell.printed is not None else ""
-    return f"{number} $\\pm$ {50 * (cell.high - cell.low):.1f}{paper}"
+    return f"{number} $\\pm$ {50 * (cell.high - cell.low):.1f}{paper}{leak_mark(cell.leak)}"
 
 
 def _tex(text: str) -> str:
@@ -245,7 +246,7 @@ def comma(result: dict[str, Any]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     heads = ("row", "control", "probe", "modality", "task", "accuracy", "low", "high", "seeds", "printed")
-    writer.writerow((*heads, "difference", "difference_low", "difference_high", "p"))
+    writer.writerow((*heads, "difference", "difference_low", "difference_high", "p", "leak"))
     tables = {**{probe: lines_of(result, probe) for probe in _plan(result).probes}, **stresses_of(result)}
     scored: dict[str, dict[str, None]] = {}  # source -> its probes
     for record in result["records"]:
@@ -259,7 +260,7 @@ def comma(result: dict[str, Any]) -> str:
                     continue
                 written.add(key)
                 values = (line.source, int(line.control), probe, line.modality, task, cell.mean, cell.low, cell.high)
-                writer.writerow((*values, cell.seeds, cell.printed, *(cell.difference or ("",) * 4)))
+                writer.writerow((*values, cell.seeds, cell.printed, *(cell.difference or ("",) * 4), cell.leak))
     return buffer.getvalue()
 
 

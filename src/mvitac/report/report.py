@@ -16,6 +16,7 @@ from rich.console import Console
 from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import cross_modal, split_rows
 from mvitac.model import load, precision_of
 from mvitac.registry import to_json
@@ -190,13 +191,14 @@ def verdicts(study: Study) -> list[str]:
     clauses = []
     for task in list(study.result["summary"])[:1]:
         modality, own, controls = evidence.headline(study, task)
+        mark = leak_mark(own.get("leak", ""))
         names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk"}
         beside = [f"{names.get(name, name)} {100 * cell['mean']:.1f}" for name, cell in controls.items()]
         methods = study.result["summary"][task][modality]
         others = [f"{s} {100 * methods[s]['mean']:.1f}" for s in study.sources[1:] if s in methods]
         by = f" with {study.sources[0]}" if others else ""
         clauses.append(
-            ", ".join([f"{WORDS[modality]} reaches {100 * own['mean']:.1f} % on {task}{by}", *others, *beside])
+            ", ".join([f"{WORDS[modality]} reaches {100 * own['mean']:.1f} %{mark} on {task}{by}", *others, *beside])
         )
     found = tables.by_direction(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
     if found:
@@ -214,7 +216,8 @@ def _tile(study: Study, task: str) -> str:
     found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
     verdict = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
     verdict = verdict if controls else ""
-    numbers = f"{100 * own['mean']:.1f}<small> % [{100 * own['low']:.1f}, {100 * own['high']:.1f}]</small>"
+    mark = leak_mark(own.get("leak", ""))
+    numbers = f"{100 * own['mean']:.1f}<small> % [{100 * own['low']:.1f}, {100 * own['high']:.1f}]{mark}</small>"
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
     what = f"<h3>{escape(task)} <small>{escape(WORDS[modality] + by)}</small></h3>"
     return f'<div class="card tile">{what}<div class="big">{numbers}</div>{verdict}</div>'

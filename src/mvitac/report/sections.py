@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import MIN_GALLERY
 from mvitac.evaluation.scores import interval, summarise
 from mvitac.model import Model
@@ -101,12 +102,15 @@ def probe(study: Study) -> str:
     scores = ("accuracy", "balanced_accuracy", "macro_f1", "auroc")
     rows = [
         [r["source"], "" if r["seed"] is None else str(r["seed"]), r["task"], r["modality"], r["probe"]]
-        + ["" if r[k] is None else f"{100 * r[k]:.1f}" for k in scores]
+        + ["" if r[k] is None else f"{100 * r[k]:.1f}{leak_mark(r.get('leak', ''))}" for k in scores]
         for r in records
     ]
     columns = ("", "seed", "task", "features", "probe", "accuracy", "balanced", "macro F1", "AUROC")
     numbers.append(html.fold("Every probe with balanced accuracy, F1 and AUROC (%)", html.table(columns, rows)))
-    intro = f"A probe ({names[0]}) on frozen features, scored on unseen {study.pack.spec.group_by}s."
+    by = study.pack.spec.group_by
+    intro = f"A probe ({names[0]}) on frozen features, scored on {tables.unseen_groups(by, records)}."
+    for leak in study.result.get("leaks", ()):
+        intro += f" LEAK: {leak}."
     if {r["source"] for r in records} - set(study.sources):
         intro += " Grey bars are controls: the same probe on an untrained trunk, raw pixels, and the image border."
     return html.paragraph(intro) + html.grid(drawn) + "".join(numbers)
@@ -132,7 +136,7 @@ def retrieval(study: Study) -> str:
         mean, low, high = interval(records)
         groups.setdefault(direction, {})[source] = {"mean": mean, "low": low, "high": high}
     by, num = study.pack.spec.group_by, found[0]["num_groups"]
-    title = f"R@5 over {num} unseen {by}s"
+    title = f"R@5 over {num} {tables.unseen_groups(by, found)}"
     drawing = figures.bars(title, groups, {"chance": found[0]["chance R@5"]}, f"own {by} among the first five, %")
     drawn = study.figure("retrieval", drawing, f"{title}, with chance; the numbers are in the table")
     rows = [[row[0], row[1].replace("->", "→"), *row[2:]] for row in tables.retrieval_rows(found)]

@@ -8,7 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mvitac.evaluation.scores import interval
+from mvitac.evaluation.leaks import leak_mark
+from mvitac.evaluation.scores import interval, leaks_in
 
 MODALITY_ORDER = ("none", "touch", "vision", "both")
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
@@ -30,9 +31,9 @@ def sources_of(task: dict[str, Any]) -> list[str]:
     return [*own, *(s for s in last if s in found), *sorted(fixed, key=lambda s: s == "majority")]
 
 
-def percent(mean: float, low: float, high: float) -> str:
-    """A score and its interval, such as '57.6 [55.1, 60.2]'."""
-    return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+def percent(mean: float, low: float, high: float, leak: str = "") -> str:
+    """A score and its interval, such as '57.6 [55.1, 60.2]', with LEAK if there is one (``evaluation.leaks``)."""
+    return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]{leak_mark(leak)}"
 
 
 def resampled(group_by: str, num_seeds: int) -> str:
@@ -42,10 +43,15 @@ def resampled(group_by: str, num_seeds: int) -> str:
     return f"bootstrap over test {group_by}s; one seed, so they leave out the variation between seeds"
 
 
+def unseen_groups(group_by: str, records: Sequence[dict[str, Any]]) -> str:
+    """The test groups of ``records``: unseen ones, unless a source was trained on some of them or may have been."""
+    return f"{'test' if leaks_in(records) else 'unseen'} {group_by}s"
+
+
 def cell(task: dict[str, Any], source: str, modality: str) -> str:
     """The score of one source, or '' if it has none. Controls without features appear in every column."""
     value = task.get(modality, {}).get(source) or task.get("none", {}).get(source)
-    return percent(value["mean"], value["low"], value["high"]) if value else ""
+    return percent(value["mean"], value["low"], value["high"], value.get("leak", "")) if value else ""
 
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
@@ -60,18 +66,22 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         for modality in modalities:
             table.add_column(modality, justify="right", no_wrap=True)
         for source in sources_of(task):
-            table.add_row(source, *(cell(task, source, m) for m in modalities))
+            # LEAK on a line of its own, else the table is too wide.
+            table.add_row(source, *(cell(task, source, m).replace(" LEAK", "\nLEAK") for m in modalities))
         console.print(table)
     console.print(f"95 % intervals: {resampled(result['group_by'], seeds)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
+    for leak in result.get("leaks", ()):
+        console.print(f"LEAK: {leak}", markup=False, highlight=False)
 
 
 def print_retrieval(result: dict[str, Any], console: Console) -> None:
     """Print cross-modal retrieval as one table, if the methods have a shared space."""
     if not result["retrieval"]:
         return
-    table = Table(title=f"retrieval over unseen {result['group_by']}s", title_justify="left", title_style="bold")
+    unseen = unseen_groups(result["group_by"], result["retrieval"])
+    table = Table(title=f"retrieval over {unseen}", title_justify="left", title_style="bold")
     table.add_column("")
     table.add_column("query -> found")
     for column in RETRIEVAL:
@@ -85,7 +95,9 @@ def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Rows of source, direction and ``RETRIEVAL`` in percent, averaged over seeds."""
     rows = []
     for (source, direction), found in by_direction(records).items():
-        rows.append([source, direction, *(f"{100 * recall(found, key):.1f}" for key in RETRIEVAL)])
+        mark = leak_mark(leaks_in(found))
+        rows.append([source, direction, *(f"{100 * recall(found, key):.1f}{mark}" for key in RETRIEVAL[:-1])])
+        rows[-1].append(f"{100 * recall(found, RETRIEVAL[-1]):.1f}")
     return rows
 
 

@@ -10,6 +10,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.leaks import FILE, source_of, write_sources
 from mvitac.methods.base import Method
 from mvitac.model import Model, precision_of
 from mvitac.nn.memory_bank import replicated, shard_banks
@@ -74,6 +75,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
         start = checkpoint.restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
+    if world.writes and not (out / FILE).exists():
+        write_sources(out, [source_of(pack, rows)])
     if not resumed and world.writes:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
         here = {"device": describe(device), "precision": run.precision}
