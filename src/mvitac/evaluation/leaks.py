@@ -71,7 +71,10 @@ def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list
         try:
             with safetensors.safe_open(folder / FILE, framework="numpy") as file:
                 names = file.metadata()
-                return [Source(names[i], *(file.get_tensor(f"{i}.{k}") for k in ("ids", "groups"))) for i in names]
+                return [
+                    Source(names[i], *(file.get_tensor(f"{i}.{k}") for k in ("ids", "groups")))
+                    for i in sorted(names, key=int)
+                ]
         except Exception as error:  # safetensors raises several types for damaged files
             raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
     own = pack if pack.digest == digest else _own_pack(folder, run)

@@ -290,7 +290,7 @@ def confusions(study: Study) -> str:
     return html.paragraph(intro) + html.grid(drawn)
 
 
-def headline(study: Study, task: str) -> tuple[str, dict[str, float], dict[str, dict[str, float]]]:
+def headline(study: Study, task: str) -> tuple[str, dict[str, Any], dict[str, dict[str, Any]]]:
     """The modality to show (both, else the best), the first method's score on it, and those of the controls."""
     found, source = study.result["summary"][task], study.sources[0]
     have = [m for m in tables.columns_of(found) if source in found[m]]
