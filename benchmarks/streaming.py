@@ -31,7 +31,7 @@ from mvitac.recipes import recipe
 from mvitac.run import Run
 from mvitac.system.files import write_json
 from mvitac.system.provenance import provenance
-from mvitac.training.sampler import batches, training_rows
+from mvitac.training.sampler import batches
 
 
 @dataclass
@@ -59,7 +59,7 @@ class Noise(Source):
 
 def epoch(run: Run, pack: Pack, number: int, step_s: float) -> float:
     """Read one epoch. Return the seconds spent waiting for its batches."""
-    rows = training_rows(run, pack)
+    rows = run.method.training_rows(pack)
     per_epoch, waited = run.steps_per_epoch(len(rows)), 0.0
     order = batches(run, pack, rows, number * per_epoch, (number + 1) * per_epoch, expect=pack.expect)
     while True:

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
+from mvitac.cli.main import main
+from mvitac.data.build import build
 from mvitac.data.pack import Pack
+from mvitac.data.sharding import write_shards
 from mvitac.data.spec import DataSpec, Task
+from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.recipes import RECIPES, recipe
-from mvitac.registry import from_json, to_json
-from mvitac.run import Run
+from mvitac.registry import find, from_json, to_json
+from mvitac.run import Run, load_run
 
 
 def test_paper_constants() -> None:
@@ -128,8 +137,62 @@ def test_a_new_dataset_says_itself_that_its_rows_are_phases() -> None:
 
     assert recipe("modern", Phased()).positives == "same-image"
     assert recipe("paper", Phased()).augment.vision.grayscale == 0
-    assert recipe("paper", PackConfig()).augment.vision.grayscale == 0.2
+    assert recipe("paper", PackConfig(), phased=False).augment.vision.grayscale == 0.2
 
 
 def test_a_recipe_takes_an_open_pack(pack: Pack) -> None:
     assert recipe("smoke", pack) == recipe("smoke", PackConfig(path=pack.path))
+
+
+@pytest.fixture(scope="module")
+def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four simulated grasps as a pack, as shards, as files with a manifest, and as a parquet file of the Hub."""
+    root = tmp_path_factory.mktemp("grasps")
+    pack = build(GraspsConfig(num=4, size=32).source(), root / "pack", size=32, quiet=True)
+    write_shards(pack, str(root / "stream"), quiet=True)
+    rows, cells = [], []
+    for i in range(pack.num):
+        names = {"vision": f"v{i}.png", "left": f"l{i}.png", "right": f"r{i}.png"}
+        touch = pack.images["touch"][i]
+        for file, image in zip(names.values(), (pack.images["vision"][i], touch[..., :3], touch[..., 3:]), strict=True):
+            Image.fromarray(image).save(root / file)
+        about = {name: str(pack.column(name)[i]) for name in ("phase", "group", "touch_group")}
+        rows.append({**names, **about})
+        cells.append({**{k: {"bytes": (root / v).read_bytes(), "path": v} for k, v in names.items()}, **about})
+    table = pa.Table.from_pylist(rows)
+    pa.csv.write_csv(table, root / "folder.csv")
+    pq.write_table(pa.Table.from_pylist(cells), root / "hub.parquet")
+    return root
+
+
+@pytest.mark.parametrize("name", ["pack", "stream", "folder", "hub"])
+def test_grasps_have_the_recipe_of_the_simulator_however_they_are_read(
+    name: str, grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The opened pack decides: in Python, and in `mvitac pretrain`, where single fields still come after the recipe."""
+    where = {"pack": "path=pack", "stream": "url=stream", "folder": "path=folder.csv", "hub": "path=hub.parquet"}
+    option, value = where[name].split("=")
+    config = find(DatasetConfig, name)(size=32, **{option: str(grasps / value) if name == "stream" else grasps / value})
+    for one in RECIPES:
+        expected, found = recipe(one, GraspsConfig()), recipe(one, config)
+        assert replace(found, data=expected.data) == expected, one
+    monkeypatch.chdir(grasps)
+    words = ["--data", name, f"--data.{option}", value, "--recipe", "smoke", "--batch-size", "2", "--steps", "1"]
+    words += ["--data.size", "32", "--quiet", "--log-every", "5", "--augment.touch.grayscale", "0.1"]
+    if name in ("folder", "hub"):
+        words += ["--data.test-share", "0", "--data.val-share", "0", "--data.touch-group", "touch_group"]
+    elif name == "stream":
+        words += ["--data.window", "1"]
+    assert main(["pretrain", *words, "--out", str(tmp_path / "run")]) == 0
+    run, _ = load_run(tmp_path / "run")
+    assert (run.positives, run.log_every) == ("same-image", 5)
+    assert (run.augment.vision.grayscale, run.augment.touch.grayscale) == (0, 0.1)
+
+
+def test_rows_with_other_phases_are_no_grasps(pack: Pack) -> None:
+    """Only the moments of a grasp count, whatever a table calls a phase."""
+    for values, phased in ((["before", "during"], True), (["during", "during"], True), (["pressed", "during"], False)):
+        other = Pack(pack.path)
+        other.table = pack.table.append_column("phase", pa.array(values * (pack.num // 2)))
+        assert other.phased is phased
+    assert not pack.phased

@@ -16,17 +16,17 @@ from mvitac.run import Optim, Run
 from mvitac.transforms.random_views import Augment, ViewAugment
 
 
-def paper(data: DatasetConfig) -> Run:
+def paper(data: DatasetConfig, phased: bool | None = None) -> Run:
     """The settings printed in the paper: ResNet-18 from ImageNet, Adam at lr .03 without a schedule, batch 256, 240 epochs.
 
     No grayscale views for grasping (appendix B). Needs one 24 GB GPU. The fields of ``MViTacConfig`` say which values the
     paper leaves open (m, lambda_inter, hidden width). lr .03 is very high for Adam: expect unstable training.
     """
-    views = ViewAugment(grayscale=0.0) if data.phased else ViewAugment()
+    views = ViewAugment(grayscale=0.0) if _is_phased(data, phased) else ViewAugment()
     return Run(recipe="paper", data=data, augment=Augment(vision=views, touch=views))
 
 
-def authors(data: DatasetConfig) -> Run:
+def authors(data: DatasetConfig, phased: bool | None = None) -> Run:
     """The settings of the authors' released code, without its defects.
 
     The code is https://github.com/ligerfotis/mvitac at commit a5b572d.
@@ -37,7 +37,7 @@ def authors(data: DatasetConfig) -> Run:
     short batch of an epoch.
     """
     views = ViewAugment(flip=0.25, grayscale=0.2)
-    base = paper(data)
+    base = paper(data, phased)
     return replace(
         base,
         recipe="authors",
@@ -47,7 +47,7 @@ def authors(data: DatasetConfig) -> Run:
     )
 
 
-def modern(data: DatasetConfig) -> Run:
+def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
     """Current practice. The list gives the reason and the measured effect of each change.
 
     Unless noted, effects are measured in 300 steps of `demo`'s networks with momentum keys (docs/results/ablation.md).
@@ -78,20 +78,21 @@ def modern(data: DatasetConfig) -> Run:
     - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16, a step takes ten times as
       long or more. The scores of the two differ in one of nine cases only (docs/speed.md).
     """
-    base = paper(data)
+    phased = _is_phased(data, phased)
+    base = paper(data, phased)
     return replace(
         base,
         recipe="modern",
         method=MViTacConfig(head_norm=True, keys="end-to-end", pairs="all", momentum_end=1.0),
         optim=Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=1e-4, schedule="cosine", warmup=0.05),
         sampler="one-per-touch",
-        positives="same-image" if data.phased else "same-touch",
+        positives="same-image" if phased else "same-touch",
         augment=replace(base.augment, touch=replace(base.augment.touch, flip=0.0)),
         precision="auto",
     )
 
 
-def demo(data: DatasetConfig) -> Run:
+def demo(data: DatasetConfig, phased: bool | None = None) -> Run:
     """`modern` for a laptop's CPU: ResNet-10 from scratch at 48 px, 1,150 steps of 64 pairs.
 
     - The paper's momentum keys, because the demo shows the paper's method.
@@ -101,7 +102,7 @@ def demo(data: DatasetConfig) -> Run:
     - Constant momentum .9: with .99 rising to 1 the keys would average over more steps than a short run has.
     - Crops of at least 40 % of the area, no grayscale, lr 2e-3: easier views for few steps.
     """
-    base = modern(data)
+    base = modern(data, phased)
     views = ViewAugment(scale=(0.4, 1.0), grayscale=0.0)
     return replace(
         base,
@@ -116,7 +117,7 @@ def demo(data: DatasetConfig) -> Run:
     )
 
 
-def quick(data: DatasetConfig) -> Run:
+def quick(data: DatasetConfig, phased: bool | None = None) -> Run:
     """`demo` with half the pairs: end-to-end keys instead of the paper's momentum keys, 1,350 steps of 32 pairs.
 
     `mvitac demo` trains this recipe. It takes at most 12 minutes on two cores without fast bf16.
@@ -126,7 +127,7 @@ def quick(data: DatasetConfig) -> Run:
     - Batch 32 for twice the steps of batch 64, and the learning rate divided by the square root of 2.
     - Batch size and number of steps were chosen on split val, seed 0, never on test (docs/simulator.md).
     """
-    base = demo(data)
+    base = demo(data, phased)
     return replace(
         base,
         recipe="quick",
@@ -138,9 +139,9 @@ def quick(data: DatasetConfig) -> Run:
     )
 
 
-def smoke(data: DatasetConfig) -> Run:
+def smoke(data: DatasetConfig, phased: bool | None = None) -> Run:
     """`demo` in seconds, for tests: a tiny trunk at 32 px, batch 16, 8 steps. Its scores have no meaning."""
-    base = demo(data)
+    base = demo(data, phased)
     return replace(
         base,
         recipe="smoke",
@@ -155,7 +156,13 @@ def smoke(data: DatasetConfig) -> Run:
     )
 
 
-RECIPES: dict[str, Callable[[DatasetConfig], Run]] = {
+def _is_phased(data: DatasetConfig, phased: bool | None) -> bool:
+    """``phased`` if it is given, else what the dataset says of itself, else what its opened pack says."""
+    known = data.phased if phased is None else phased
+    return data.open(quiet=True).phased if known is None else known
+
+
+RECIPES: dict[str, Callable[[DatasetConfig, bool | None], Run]] = {
     f.__name__: f for f in (paper, authors, modern, demo, quick, smoke)
 }
 
@@ -174,12 +181,15 @@ def with_method(run: Run, method: str) -> Run:
     return replace(run, method=replace(new, **{name: getattr(run.method, name) for name in changed}))
 
 
-def recipe(name: str, data: DatasetConfig | Pack | None = None) -> Run:
+def recipe(name: str, data: DatasetConfig | Pack | None = None, phased: bool | None = None) -> Run:
     """Return the named recipe as a ``Run``.
 
     Args:
         name: One of ``RECIPES``: paper, authors, modern, demo, quick, smoke.
         data: Dataset to train on, or an open pack. Default: simulated touches of materials, as in `mvitac demo`.
+        phased: Whether rows of a touch group show the phases of a grasp. They are then not each other's positives, and
+            views are not grayscale. Default: what the data says (``Pack.phased``); datasets that do not know it
+            beforehand are opened.
 
     Raises:
         ValueError: If there is no such recipe.
@@ -191,5 +201,5 @@ def recipe(name: str, data: DatasetConfig | Pack | None = None) -> Run:
     if name not in RECIPES:
         raise unknown("recipe", name, RECIPES)
     if isinstance(data, Pack):
-        data = PackConfig(path=data.path)
-    return RECIPES[name](data or default(DatasetConfig, "materials"))
+        data, phased = PackConfig(path=data.path), data.phased if phased is None else phased
+    return RECIPES[name](data or default(DatasetConfig, "materials"), phased)

@@ -74,17 +74,23 @@ LATER_IN_DIGEST = {"later in digest": True}
 """Metadata of a field that is always written, but is omitted from digests at its default, so that old digests stay valid."""
 
 
+def formerly(value: Any) -> dict[str, Any]:
+    """Metadata of a field that older files lack and whose default is not what they mean, which is ``value``.
+
+    An absent field reads as ``value``, and digests omit it at this value, so that old digests stay valid.
+    """
+    return {"formerly": value}
+
+
 def to_json(config: Any, *, for_digest: bool = False) -> Any:
     """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``.
 
     Args:
         config: A config, or a container of configs and plain values.
-        for_digest: Leave out the fields of ``LATER_IN_DIGEST`` that have their default.
+        for_digest: Leave out the fields of ``LATER_IN_DIGEST`` and ``formerly`` that older files lack.
     """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        omitted = (LATER, LATER_IN_DIGEST) if for_digest else (LATER,)
-        all_fields = dataclasses.fields(config)
-        written = [f for f in all_fields if f.metadata not in omitted or getattr(config, f.name) != f.default]
+        written = [f for f in dataclasses.fields(config) if not _is_omitted(f, getattr(config, f.name), for_digest)]
         fields = {f.name: to_json(getattr(config, f.name), for_digest=for_digest) for f in written}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
@@ -92,6 +98,12 @@ def to_json(config: Any, *, for_digest: bool = False) -> Any:
     if isinstance(config, (list, tuple)):
         return [to_json(value, for_digest=for_digest) for value in config]
     return str(config) if isinstance(config, Path) else config
+
+
+def _is_omitted(field: dataclasses.Field, value: Any, for_digest: bool) -> bool:
+    if "formerly" in field.metadata:
+        return for_digest and value == field.metadata["formerly"]
+    return field.metadata in ((LATER, LATER_IN_DIGEST) if for_digest else (LATER,)) and value == field.default
 
 
 def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
@@ -154,6 +166,8 @@ def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in given:
             raise ValueError(f"{where}: field {field.name!r} is missing")
+        if "formerly" in field.metadata:
+            given.setdefault(field.name, to_json(field.metadata["formerly"]))
     return cls(**{key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()})
 
 

@@ -10,11 +10,12 @@ import json
 import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from filelock import FileLock
 from PIL import Image
@@ -25,6 +26,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.partial_pack import RowFile
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.probe import retrieved_rows
 from mvitac.system import locks
 from support.toy import Counting, Toy, toy_pack
 
@@ -397,3 +399,23 @@ def test_shows_itself_in_a_notebook(pack: Pack) -> None:
     strips = [Image.open(io.BytesIO(base64.b64decode(part.split('"')[0]))) for part in page.split("base64,")[1:]]
     assert [strip.size for strip in strips] == [(6 * 32, 32)] * 2  # vision and touch of six rows
     assert np.array_equal(np.asarray(strips[0])[:, :32], pack.images["vision"][0])
+
+
+def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:
+    """A task with a split of its own may score rows that no other task labels. Nothing else may count them as test."""
+    other = Pack(pack.path)
+    first, second = pack.spec.tasks
+    alone = np.isin(pack.column("split"), ("test", "train")) & (np.arange(pack.num) % 2 == 0)
+    label = np.where(alone, -1, pack.column("label_pattern"))
+    place = other.table.column_names.index("label_pattern")
+    other.table = other.table.set_column(place, "label_pattern", pa.array(label))
+    other.table = other.table.append_column("split_bright", pa.array(["train", "test"] * (pack.num // 2)))
+    other.spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
+    hidden = set(np.flatnonzero(alone & (pack.column("split") == "test")))
+    assert hidden and set(pack.rows("test")) - set(other.rows("test")) == hidden == set(np.flatnonzero(other.hidden))
+    assert set(other.rows("train")) == set(pack.rows("train"))  # without a label, but for pre-training
+    assert set(other.rows("train", by="split_bright")) == set(range(0, pack.num, 2))  # its own split has them
+    assert not {*retrieved_rows(other)} & hidden and hidden < {*retrieved_rows(pack)}
+    unlabelled = Pack(pack.path)
+    unlabelled.table = other.table
+    assert not unlabelled.hidden.any()  # one split for all tasks: nobody else may see them

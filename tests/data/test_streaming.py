@@ -31,7 +31,7 @@ from mvitac.run import Run
 from mvitac.system.distributed import World
 from mvitac.training import validation
 from mvitac.training.loop import train
-from mvitac.training.sampler import batches, epoch_order, mix, partners, shard_order, training_rows
+from mvitac.training.sampler import batches, epoch_order, mix, partners, shard_order
 from support.forged_packs import seal
 from support.toy import Toy
 from support.training_runs import assert_equal_weights, power_cut, smoke
@@ -110,8 +110,8 @@ def test_partners_stay_in_the_shard(pack: Pack, tmp_path: Path) -> None:
     write_shards(pack, str(tmp_path / "s"), shard_mb=0.007, quiet=True)  # one row each: a touch of two is cut
     found, rows = opened(tmp_path / "s", tmp_path / "c"), np.arange(72)
     assert np.array_equal(partners(found, rows, torch.Generator().manual_seed(0)), rows)
-    whole = partners(pack, training_rows(smoke(pack), pack), torch.Generator().manual_seed(0))
-    assert (whole != training_rows(smoke(pack), pack)).all()
+    whole = partners(pack, smoke(pack).method.training_rows(pack), torch.Generator().manual_seed(0))
+    assert (whole != smoke(pack).method.training_rows(pack)).all()
 
 
 # -- the order --------------------------------------------------------------------------------------------------------
@@ -139,13 +139,16 @@ def test_every_row_once_and_few_shards_at_a_time(num_lanes: int, window: int) ->
 def test_touches_keep_apart_in_a_batch(shards: Path, tmp_path: Path) -> None:
     found = opened(shards, tmp_path / "c", limit=10**6, window=9)
     run = replace(stream(shards, tmp_path / "c"), sampler="one-per-touch", batch_size=12)
-    for rows in batches(run, found, training_rows(run, found), 0, 12):
+    for rows in batches(run, found, run.method.training_rows(found), 0, 12):
         assert len(set(found.touch_groups[rows])) == 12
 
 
 def test_processes_read_what_one_epoch_has(shards: Path, tmp_path: Path) -> None:
     found = opened(shards, tmp_path / "c")
-    run, rows = stream(shards, tmp_path / "c", batch_size=12), training_rows(stream(shards, tmp_path / "c"), found)
+    run, rows = (
+        stream(shards, tmp_path / "c", batch_size=12),
+        stream(shards, tmp_path / "c").method.training_rows(found),
+    )
     for epoch in range(2):
         order = list(batches(run, found, rows, 6 * epoch, 6 * epoch + 6, World(0, 2)))
         assert sorted(np.concatenate(order)) == rows.tolist()
@@ -161,7 +164,7 @@ def test_processes_read_what_one_epoch_has(shards: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("sampler", ["shuffle", "one-per-touch"])
 def test_the_order_of_a_pack_on_the_disk_is_what_it_was(pack: Pack, sampler: Any) -> None:
-    run, rows = smoke(pack, sampler=sampler), training_rows(smoke(pack), pack)
+    run, rows = smoke(pack, sampler=sampler), smoke(pack).method.training_rows(pack)
     groups = None if sampler == "shuffle" else pack.touch_groups[rows]
     expected = rows[epoch_order(len(rows), groups, mix(run.seed, 1, 0))][: 4 * 16].reshape(4, 16)
     for size in (1, 2):
@@ -248,7 +251,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
 
 
 def epoch(pack: StreamedPack, run: Run, start: int, end: int) -> None:
-    for rows in batches(run, pack, training_rows(run, pack), start, end, expect=pack.expect):
+    for rows in batches(run, pack, run.method.training_rows(pack), start, end, expect=pack.expect):
         for modality in pack.spec.modalities:
             pack.images[modality][rows]
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from PIL import Image
 
@@ -30,9 +31,12 @@ from mvitac.datasets.touch_and_go.lists import (
     read_list,
     read_lists,
 )
-from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig
+from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig, _columns, _spec
 from mvitac.datasets.touch_and_go.recordings import Recording
-from mvitac.evaluation.probe import split_rows
+from mvitac.evaluation.leaks import Scored, source_of
+from mvitac.evaluation.probe import retrieved_rows, split_rows
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.methods.supervised import SupervisedConfig
 from support.videos import numbered, read_number, write_video
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -107,6 +111,39 @@ def test_the_published_lists_parse_to_the_published_counts() -> None:
     assert round(1 - sum(test[label] for label in SOFT) / test.total(), 3) == 0.680  # hard
     assert round(max(test.values()) / test.total(), 3) == 0.240
     assert 10 not in test
+
+
+@published
+def test_frames_that_only_the_rough_lists_name_are_hidden_from_all_else() -> None:
+    """Retrieval has the owners' 29,879 test rows, not 50,614, and the supervised rough has the labels of its probe."""
+    listed = read_lists(LISTS)
+    find_touches(listed)
+    assign_official(listed, 0, 0)
+    pack = object.__new__(Pack)  # the table alone
+    pack.spec = _spec(TouchAndGoConfig(split="official"), True, (), False)
+    pack.table, pack.num = pa.Table.from_pylist([_columns(frame, pack.spec) for frame in listed]), len(listed)
+    split, touch = pack.column("split"), pack.column("touch_group")
+    named = np.array([frame.listed for frame in listed])
+    assert (split == "test").sum() == 50_614 and len(set(touch[split == "test"]) & set(touch[split == "train"])) == 177
+    test = retrieved_rows(pack)
+    assert len(test) == 29_879 and set(named[test]) == {"test"}
+    assert not set(touch[test]) & set(touch[pack.rows("train")])
+    assert pack.hidden.sum() == 20_735 and (pack.column("split_rough")[pack.hidden] == "train").sum() == 16_892
+    rough = next(task for task in pack.spec.tasks if task.name == "rough")
+    rows = split_rows(pack, rough)
+    assert (len(rows.fitted), len(rows.test)) == (35_119, 8_085)
+    method = SupervisedConfig(tasks=("rough",))
+    assert set(method.training_rows(pack)) == set(rows.fitted)
+    assert len(MViTacConfig().training_rows(pack)) == 91_982
+    groups = pack.column("group")
+    pack.table = pack.table.select(
+        ["id", "group", "split", "split_rough", "label_category", "label_soft", "label_rough"]
+    )
+    source, scored = source_of(pack, pack.rows("train")), Scored(pack)
+    assert scored.leak([source], test) == (
+        f"0 of 29879 test rows and 100 of {len(set(groups[test]))} test recordings were trained on"
+        " (touch-and-go (official))"
+    )
 
 
 @published

@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 import torch
 import torch.nn.functional as F
@@ -14,7 +15,7 @@ import torch.nn.functional as F
 from mvitac.data.pack import Pack
 from mvitac.evaluation.diagnostics import spread
 from mvitac.evaluation.features import pack_features
-from mvitac.evaluation.probe import probe_model
+from mvitac.evaluation.probe import probe_model, split_rows
 from mvitac.methods.byol import BYOLConfig, regression
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.cmc import CMC, CMCConfig, nce
@@ -29,9 +30,12 @@ from mvitac.model import load
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Bank, Queue, shard_banks
 from mvitac.recipes import with_method
-from mvitac.run import Optim
+from mvitac.registry import to_json
+from mvitac.run import Optim, Run
 from mvitac.system.distributed import World
+from mvitac.training.loader import Feed
 from mvitac.training.loop import train
+from mvitac.training.views import make_views
 from support.slow_losses import slow_info_nce
 from support.small_methods import ROWS, TINY, build, outcome, small, views
 from support.toy import Toy
@@ -355,6 +359,50 @@ def test_supervised_on_one_modality(pack: Pack, modality: str) -> None:
     assert set(method.encoders()) == {modality}
     with pytest.raises(ValueError, match="unknown modality"):
         SupervisedConfig(modalities=("vision",)).build(Toy(vision_channels=0).spec(), TINY)
+
+
+@pytest.mark.parametrize("config", [SupervisedConfig, CalandraConfig])
+def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, config: type) -> None:
+    """Also of a task with a split of its own, as rough of Touch and Go's lists, and of rows without the other sense."""
+    other = copy.copy(pack)
+    other._labels = {}  # type: ignore[misc]
+    first, second = pack.spec.tasks
+    other.spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
+    turned = {"test": "train", "train": "test"}
+    columns = {"split_bright": [turned.get(s, s) if row % 2 else s for row, s in enumerate(pack.column("split"))]}
+    columns["has_vision"] = [row % 5 > 0 for row in range(pack.num)]
+    for name, values in columns.items():
+        other.table = other.table.append_column(name, pa.array(values))
+    for sense in ("touch", "vision", "both"):
+        method = config(modalities=() if sense == "both" else (sense,))
+        rows = method.training_rows(other)
+        for task in other.spec.tasks:
+            learned = other.labels(task.name, *method.label_splits)[rows]
+            fitted = split_rows(other, task, sense).fitted
+            assert set(rows[learned >= 0]) == set(fitted) and 0 < len(fitted) < len(rows)
+    alone = config(labels="train").training_rows(other)  # as before: pre-training's rows, and labels of train
+    assert set(alone) == set(other.rows("train", having=("vision", "touch")))
+    batch = make_views(
+        smoke(pack, method=config()),
+        other,
+        rows,
+        1,
+        torch.Generator().manual_seed(0),
+        torch.device("cpu"),
+        Feed(other, torch.device("cpu")),
+    )
+    assert (batch.labels["bright"].numpy() == other.labels("bright", "train", "val")[rows]).all()
+
+
+def test_supervised_runs_of_before_keep_their_labels_and_digest(pack: Pack) -> None:
+    new = smoke(pack, method=SupervisedConfig())
+    old = to_json(new)
+    del old["method"]["labels"]
+    before = Run.load(old)
+    assert isinstance(before.method, SupervisedConfig) and before.method.labels == "train"
+    assert "labels" not in to_json(before, for_digest=True)["method"]
+    assert to_json(before)["method"]["labels"] == "train" and Run.load(to_json(before)) == before
+    assert new.digest() != before.digest() and Run.load(to_json(new)) == new
 
 
 def test_calandra_has_a_trunk_per_stream() -> None:

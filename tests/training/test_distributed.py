@@ -20,7 +20,7 @@ from mvitac.methods.base import Method
 from mvitac.recipes import recipe
 from mvitac.system.distributed import World
 from mvitac.training.loop import train
-from mvitac.training.sampler import batches, training_rows
+from mvitac.training.sampler import batches
 from mvitac.training.step import Step
 from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
 from support.processes import begin
@@ -132,7 +132,7 @@ def test_the_loop_keeps_whole_banks_when_the_number_of_processes_changes(
         together(tmp_path, "train", str(pack.path), str(out), "3", "cmc", fails=True)
         assert torch.load(out / "checkpoint.pt")["step"] == 2
         train(run, out, resume=True, quiet=True)
-    rows = training_rows(run, pack)
+    rows = run.method.training_rows(pack)
     seen = np.isin(rows, np.concatenate(list(batches(run, pack, rows, 0, 4))))
     assert 0 < seen.sum() < len(rows)
     torch.manual_seed(run.seed)

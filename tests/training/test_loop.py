@@ -37,7 +37,9 @@ def straight(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_leaves_the_promised_files(straight: Path) -> None:
-    assert {p.name for p in straight.iterdir()} == {"run.json", "log.jsonl", "checkpoint.pt", "model.safetensors"}
+    assert {p.name for p in straight.iterdir()} == {
+        *("run.json", "trained_on.safetensors", "log.jsonl", "checkpoint.pt", "model.safetensors")
+    }
     lines = [json.loads(line) for line in (straight / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [2, 4, 6, 8]
     assert [line["step"] for line in lines if "eval" in line] == [4, 8]
@@ -182,13 +184,23 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
 
 
 def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
-    run = smoke(
-        pack, method=SupervisedConfig(tasks=("pattern",)), steps=60, batch_size=30, optim=Optim(name="adamw", lr=3e-3)
-    )
+    method = SupervisedConfig(tasks=("pattern",), labels="train")
+    run = smoke(pack, method=method, steps=60, batch_size=30, optim=Optim(name="adamw", lr=3e-3))
     out = train(run, tmp_path / "r", quiet=True)
     values = json.loads((out / "log.jsonl").read_text().splitlines()[-1])["eval"]
     assert values["touch/knn pattern"] > 0.9, values
     assert "alignment" not in values  # it has no shared space
+
+
+def test_rows_that_were_trained_on_are_not_scored_as_held_out(pack: Pack) -> None:
+    """With the labels of val, a supervised run has no held-out rows: spread and rank only, of training rows."""
+    values = {}
+    for labels in ("train", "train-and-val"):
+        run = smoke(pack, method=SupervisedConfig(labels=labels))  # type: ignore[arg-type]
+        values[labels] = set(evaluate(fresh(run, pack.spec, pack.size), pack, run))
+    assert values["train"] - values["train-and-val"] == {
+        f"{m}/knn {task}" for m in ("touch", "vision") for task in ("pattern", "bright")
+    }
 
 
 def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:

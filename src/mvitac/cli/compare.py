@@ -9,6 +9,7 @@ from rich.console import Console
 from mvitac.cli.options import parse, selectors
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.evaluate import ProbeConfig
+from mvitac.evaluation.probe import Probe
 from mvitac.experiments.collect import forecast
 from mvitac.experiments.cross_validation import gather_folds, lay_out_folds, together
 from mvitac.experiments.jobs import do_all, submit
@@ -33,6 +34,9 @@ class _Options:
     folds: tuple[str, ...]
     """Cross-validation: the field of the data that makes each fold, e.g. --folds split=fold1 split=fold2. Test groups
     must differ between folds, and are pooled."""
+    probes: tuple[Probe, ...]
+    """Probes that score the features: linear, paper, knn. The tables show the first; paper is the one of the paper's
+    numbers."""
     set: tuple[str, ...] = ()
     """field=value for every row of the plan, e.g. --set steps=100 encoder.weights=scratch; a row's own values come
     after."""
@@ -114,6 +118,7 @@ def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
         out=Path("runs") / f"compare-{plan.name}-{data.name}",
         seeds=plan.seeds,
         folds=plan.folds,
+        probes=plan.probes,
         stress=plan.stress,
     )
     choices = {"plans": PLANS, "data": DatasetConfig.choices, "recipes": RECIPES}
@@ -132,6 +137,7 @@ def _changed(plan: Plan, recipe: str, options: _Options) -> Plan:
         recipe=recipe,
         seeds=options.seeds,
         folds=options.folds,
+        probes=options.probes,
         stress=options.stress,
         set={**plan.set, **dict(setting(text) for text in options.set)},
     )

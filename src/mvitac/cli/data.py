@@ -12,7 +12,8 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, check_json, console, parse, save_json, selectors, short
 from mvitac.data.build import build
-from mvitac.data.pack import SPLITS, Pack
+from mvitac.data.pack import Pack
+from mvitac.data.pack_table import SPLITS
 from mvitac.data.sharding import write_shards
 from mvitac.data.spec import Task
 from mvitac.datasets.base import DatasetConfig

@@ -30,6 +30,8 @@ class _PublishOptions:
     """The new folder."""
     on: Path | None = None
     """Fit the probes on this pack instead of the data the run was trained on."""
+    allow_leak: bool = False
+    """Score also rows or groups of --on that the run was trained on; the card says LEAK beside such scores."""
     push: str | None = None
     """Also upload the folder to the Hugging Face Hub under this name (owner/name); needs `hf auth login`."""
     private: bool = False
@@ -40,7 +42,8 @@ def publish(argv: list[str]) -> None:
     """mvitac publish RUN OUT [--on PACK] [--push OWNER/NAME]"""
     options = parse(_PublishOptions, argv, "publish")
     with shown(Console(stderr=True)):
-        out = write_artifact(options.run, options.out, Pack(options.on) if options.on else None)
+        pack = Pack(options.on) if options.on else None
+        out = write_artifact(options.run, options.out, pack, allow_leak=options.allow_leak)
     print_summary(read_manifest(out)["scores"], Console(markup=False))
     print(f"written: {out}")
     if options.push:

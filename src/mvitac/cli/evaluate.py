@@ -33,6 +33,8 @@ class _ProbeOptions:
     learn_on: Path | None = None
     """Fit the probes on the train rows of this pack, and score them on the test rows of --on: transfer to a sensor
     without labels."""
+    allow_leak: bool = False
+    """Score a run also on rows or groups of --on that it was trained on. LEAK stands beside every such score."""
     stress: bool = False
     """Also use 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and report the
     gain of a split that leaks groups."""
@@ -51,7 +53,7 @@ def probe(argv: list[str]) -> None:
             raise ValueError("--learn-on fits the probes: name the pack on which they are scored, --on PACK")
         pack = JoinedPack(Pack(options.learn_on), pack)
     with shown(Console(stderr=True)):
-        result = probe_runs(options.runs, options.config, pack)
+        result = probe_runs(options.runs, options.config, pack, allow_leak=options.allow_leak)
     say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
     for kind in options.config.probes:
         print_summary({**result, "summary": summarise(result["records"], kind)}, say, probe=kind)
@@ -74,7 +76,10 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
             model = load(path)
             data = pack or model.run.data.open()
             own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
-            records += [{**own, **r} for r in stress(model, data, *chosen(data, options.config))]
+            leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
+            records += [
+                {**own, **r, "leak": leaks[r["task"]]} for r in stress(model, data, *chosen(data, options.config))
+            ]
     return records
 
 

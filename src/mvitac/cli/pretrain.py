@@ -1,6 +1,6 @@
 """``mvitac pretrain``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +12,10 @@ from mvitac.methods.base import MethodConfig
 from mvitac.recipes import RECIPES, recipe, with_method
 from mvitac.registry import default
 from mvitac.run import Run, read_record
+from mvitac.system.distributed import join
 from mvitac.training.log import LOGGERS, open_loggers
 from mvitac.training.loop import train
+from mvitac.training.setup import check_out, open_pack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +34,9 @@ def pretrain(argv: list[str]) -> None:
     chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger", "--sink"))
     if "--sink" in chosen:  # the name of --logger in 0.1.0
         chosen.setdefault("--logger", chosen["--sink"])
-    base = _chosen_run(chosen, asks_help(rest))
+    base = _chosen_run(chosen, phased=False)
+    if not asks_help(rest):
+        _check_data_is_named(chosen)
     description = f"""Pre-train encoders without labels.
 
     First choose, then change single fields below (defaults are those of the chosen recipe):
@@ -43,24 +47,34 @@ def pretrain(argv: list[str]) -> None:
       --logger {"|".join(LOGGERS)}   also log there (extras; none by default)
     """
     usual = _Options(run=base, out=Path("runs") / f"{base.data.name}-{base.method.name}-{base.recipe}")
-    options = parse(_Options, rest, "pretrain", default=usual, description=description)
+    options, pack = parse(_Options, rest, "pretrain", default=usual, description=description), None
+    if base.data.phased is None and "--from" not in chosen:  # the recipe depends on what the opened data says
+        check_out(options.out, options.resume)
+        pack = open_pack(options.run.data, join(), options.quiet)
+        options = parse(_Options, rest, "pretrain", default=replace(usual, run=_chosen_run(chosen, pack.phased)))
     with open_loggers(chosen.get("--logger"), options.out, options.run) as loggers:
-        out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers)
+        out = train(options.run, options.out, resume=options.resume, quiet=options.quiet, loggers=loggers, pack=pack)
     print(f"trained: {out}\nnext: mvitac probe {out}")
 
 
-def _chosen_run(chosen: dict[str, str], help_only: bool) -> Run:
-    """The run before single fields are changed: a recorded one, or a recipe with its data and method."""
+def _chosen_run(chosen: dict[str, str], phased: bool) -> Run:
+    """The run before single fields are changed: a recorded one, or a recipe with its data and method.
+
+    ``phased`` is for data that does not know it before it is opened.
+    """
     if "--from" in chosen:
         for name in ("--method", "--data", "--recipe"):
             if name in chosen:
                 raise ValueError(f"--from already decides {name}: leave it out, or change single fields")
         return read_record(Path(chosen["--from"]))[0]
-    base = recipe(chosen.get("--recipe", "demo"), default(DatasetConfig, chosen.get("--data", "materials")))
-    base = with_method(base, chosen.get("--method", base.method.name))
-    if "--data" not in chosen and not help_only:
+    data = default(DatasetConfig, chosen.get("--data", "materials"))
+    base = recipe(chosen.get("--recipe", "demo"), data, phased if data.phased is None else data.phased)
+    return with_method(base, chosen.get("--method", base.method.name))
+
+
+def _check_data_is_named(chosen: dict[str, str]) -> None:
+    if "--data" not in chosen and "--from" not in chosen:
         raise ValueError(
             f"name the data to learn from: --data {'|'.join(DatasetConfig.choices)} (or --from RUN.JSON); without data of"
             " your own: mvitac demo, or mvitac pretrain --data materials --recipe demo, which simulates"
         )
-    return base

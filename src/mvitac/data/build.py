@@ -25,7 +25,8 @@ from rich.console import Console
 
 from mvitac.data.build_parts import Work, make_parts
 from mvitac.data.jpeg import QUALITY
-from mvitac.data.pack import FORMAT, FORMAT_VERSIONS, SUFFIXES, Pack, Store, check_table
+from mvitac.data.pack import FORMAT, FORMAT_VERSIONS, SUFFIXES, Pack, Store
+from mvitac.data.pack_table import check_table
 from mvitac.data.partial_pack import JpegFile, Part, RowFile
 from mvitac.data.source import Source
 from mvitac.data.spec import DataSpec

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import fit
-from mvitac.data.pack import SPLITS
+from mvitac.data.pack_table import SPLITS
 from mvitac.data.partial_pack import JpegFile, Part, RowFile
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.data.spec import DataSpec

@@ -58,6 +58,10 @@ class JoinedPack(Pack):
                     f" {len(shared)}: give packs whose splits agree, or give a different {by} another name"
                 )
 
+    @property
+    def own_ids(self) -> np.ndarray:
+        return np.array([one.partition("/")[2] for one in self.column("id")])
+
 
 def _check_shapes(learn: Pack, score: Pack) -> None:
     for modality in ("vision", "touch"):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -25,7 +25,8 @@ import pyarrow.parquet as pq
 
 from mvitac.data import notebook
 from mvitac.data.jpeg import Jpegs, Lazy
-from mvitac.data.spec import DataSpec, ValueTask
+from mvitac.data.pack_table import check_table
+from mvitac.data.spec import PHASES, AnyTask, DataSpec, ValueTask
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json
 
@@ -34,8 +35,6 @@ SHARDED = "mvitac-shards"
 FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}
 """Format version by how images are stored."""
 SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}
-SPLITS = ("train", "val", "test", "unlabelled")
-"""Pre-training uses train and unlabelled. Val is for choosing (kNN during training, a probe's C), test for scores only."""
 
 Store = Literal["raw", "jpeg"]
 Images = np.ndarray | Lazy
@@ -154,6 +153,12 @@ class Pack:
             found[self.column(name).astype(str) != value] = np.nan
         return found
 
+    def answered(self, task: AnyTask) -> np.ndarray:
+        """Return bool [N], which rows have a label, or a value of at least one target."""
+        if isinstance(task, ValueTask):
+            return np.asarray(np.isfinite(self.values(task)).any(axis=1))
+        return self.labels(task.name) >= 0
+
     @functools.cached_property
     def _labels(self) -> dict[tuple[str, ...], np.ndarray]:
         return {}
@@ -166,7 +171,7 @@ class Pack:
     def rows(
         self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = (), by: str = "split"
     ) -> np.ndarray:
-        """Return row numbers, ascending int64.
+        """Return row numbers, ascending int64. Without ``by``, rows that are ``hidden`` are left out.
 
         Args:
             splits: Splits to include.
@@ -175,6 +180,8 @@ class Pack:
             by: Column with the split.
         """
         mask = np.isin(self.column(by), splits)
+        if by == "split":
+            mask &= ~self.hidden
         for modality in having:
             mask &= self.has(modality)
         for name, value in (only or {}).items():
@@ -186,6 +193,32 @@ class Pack:
         """int64 [N], number of each row's touch group (column touch_group, else group): its rows are near-duplicates."""
         name = "touch_group" if "touch_group" in self.table.column_names else "group"
         return np.unique(self.column(name).astype(str), return_inverse=True)[1]
+
+    @property
+    def own_ids(self) -> np.ndarray:
+        """The rows' ids as text [N], as in the pack they are from."""
+        return self.column("id").astype(str)
+
+    @functools.cached_property
+    def hidden(self) -> np.ndarray:
+        """bool [N], rows of val and test that are labelled only for a task with a split of its own.
+
+        In this split only that task may see them (Touch and Go's official split: frames that only the rough lists name).
+        """
+        tasks = self.spec.all_tasks
+        shared, others = ([t for t in tasks if (t.split == "split") == same] for same in (True, False))
+        if not shared or not others:
+            return np.zeros(self.num, bool)
+        seen, alone = (np.any([self.answered(task) for task in some], axis=0) for some in (shared, others))
+        return np.isin(self.column("split"), ("val", "test")) & alone & ~seen
+
+    @functools.cached_property
+    def phased(self) -> bool:
+        """Whether rows of a touch group show the phases of a grasp (column phase: before, during, after).
+
+        Else they show repeated touches, or frames of one.
+        """
+        return "phase" in self.table.column_names and set(self.column("phase").astype(str)) <= set(PHASES)
 
     @functools.cached_property
     def _rows_by_touch_group(self) -> list[np.ndarray]:
@@ -269,73 +302,6 @@ class Pack:
             held = f"{images.dtype} {images.shape}" if isinstance(images, np.ndarray) else "no array"
             raise ValueError(f"{path} holds {held}, pack.json promises uint8 {expected}")
         return images
-
-
-def check_table(table: pa.Table, spec: DataSpec) -> None:
-    """Check what every reader of a pack's table relies on; ValueError names the column, the row and what is allowed."""
-    labels = {f"label_{task.name}": len(task.classes) for task in spec.tasks}
-    controls = [c for columns in spec.controls.values() for c in columns]
-    targets = {target.name: target for task in spec.values for target in task.targets}
-    asked = (*labels, *controls, *targets, *(c for task in spec.all_tasks for c in task.only))
-    for name in ("id", "group", "split", *asked):
-        if name not in table.column_names:
-            raise unknown("column", name, table.column_names)
-    for name in ("id", "group", "split", "touch_group", *labels):
-        if name in table.column_names and table.column(name).null_count:
-            row = _first(table.column(name).is_null().to_numpy())
-            raise ValueError(f"column {name} is empty in row {row}: every row needs one")
-    for name in (f"has_{modality}" for modality in spec.modalities):
-        if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
-            raise ValueError(f"column {name} holds {table.column(name).type}: write true or false in every row")
-    for column in dict.fromkeys(("split", *(task.split for task in spec.all_tasks))):
-        if column not in table.column_names:
-            raise unknown("column", column, table.column_names)
-        for split in table.column(column).unique().to_pylist():
-            if split not in SPLITS:
-                raise unknown(column, str(split), SPLITS)
-    for name, num in labels.items():
-        _check_labels(table.column(name), name, num)
-    for name in controls:
-        _check_numbers(table.column(name), name, "a control needs a number in every row", np.isfinite)
-    for name in targets:
-        _check_numbers(table.column(name), name, "a value is a finite number, or NaN for none", _finite_or_nan)
-    _check_ids(table.column("id").to_pylist())
-
-
-def _first(bad: np.ndarray) -> int:
-    return int(np.flatnonzero(bad)[0])
-
-
-def _check_labels(column: pa.ChunkedArray, name: str, num: int) -> None:
-    if not pa.types.is_integer(column.type):
-        raise ValueError(
-            f"column {name} holds {column.type}: a label is a whole number, 0 to {num - 1}, or -1 for none"
-        )
-    values = column.to_numpy()
-    if (bad := (values < -1) | (values >= num)).any():
-        row = _first(bad)
-        raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
-
-
-def _finite_or_nan(values: np.ndarray) -> np.ndarray:
-    return ~np.isinf(values)
-
-
-def _check_numbers(column: pa.ChunkedArray, name: str, need: str, allowed: Callable[[np.ndarray], np.ndarray]) -> None:
-    kind = column.type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-        raise ValueError(f"column {name} holds {kind}: {need}")
-    values = column.to_numpy(zero_copy_only=False).astype(float)
-    if (bad := ~allowed(values)).any():
-        raise ValueError(f"column {name} is {values[_first(bad)]} in row {_first(bad)}: {need}")
-
-
-def _check_ids(ids: list[Any]) -> None:
-    seen: set[Any] = set()
-    for one in ids:
-        if one in seen:
-            raise ValueError(f"id {one!r} occurs twice: give every sample its own")
-        seen.add(one)
 
 
 def has_difference(pack: Pack) -> bool:

@@ -9,6 +9,8 @@ from typing import Literal
 from mvitac.registry import LATER
 
 MODALITIES = ("vision", "touch")
+PHASES = ("before", "during", "after")
+"""Values of column phase: the moments of a grasp."""
 
 
 @dataclass(frozen=True, kw_only=True)

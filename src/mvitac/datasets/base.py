@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import ClassVar, Literal
 
 from mvitac.data.build import build, check_request, stored_as
@@ -27,8 +28,8 @@ class DatasetConfig(Registered, ABC):
 
     local: ClassVar[tuple[str, ...]] = ("workers",)
     """Options that do not affect the result."""
-    phased: ClassVar[bool] = False
-    """Whether rows of a touch group show phases of a grasp (before, during, after) instead of repeated touches."""
+    phased: ClassVar[bool | None] = None
+    """``Pack.phased`` where it is known before the data is opened. None: the opened pack decides."""
 
     size: int = 256
     """Side of the stored images in pixels; crops are taken from them (paper: 256)."""
@@ -77,6 +78,15 @@ class DatasetConfig(Registered, ABC):
     def source(self) -> Source:
         """Return the source of samples; ValueError if the data does not exist."""
 
+    def place(self, source: Source | None = None) -> Path:
+        """Return the folder in the cache where ``open`` builds the pack of ``source``, by default of this dataset."""
+        source = source or self.source()
+        kept = stored_as(self.store, self.quality)
+        stamps = source.stamps()
+        changed = {} if stamps is None else {"stamps": digest(stamps)}
+        key = digest({"fingerprint": source.fingerprint(), "size": self.size, **kept, **changed})[:16]
+        return cache_dir() / "packs" / f"{self.name}-{key}"
+
     def open(self, *, quiet: bool = False) -> Pack:
         """Return the pack of this dataset, with windows of frames if they are asked for.
 
@@ -87,11 +97,7 @@ class DatasetConfig(Registered, ABC):
     def _frames(self, quiet: bool) -> Pack:
         """Return the pack of single frames."""
         source = self.source()
-        kept = stored_as(self.store, self.quality)
-        stamps = source.stamps()
-        changed = {} if stamps is None else {"stamps": digest(stamps)}
-        key = digest({"fingerprint": source.fingerprint(), "size": self.size, **kept, **changed})[:16]
-        path = cache_dir() / "packs" / f"{self.name}-{key}"
+        path = self.place(source)
         if path.exists():
             pack = Pack(path)
             # A pack from before its reader named values has their columns already.

@@ -50,6 +50,7 @@ class MaterialsConfig(SimulatedConfig):
     """Simulated touches of 20 material classes, labelled by category, hard/soft and rough/smooth; split by instance."""
 
     name: ClassVar[str] = "materials"
+    phased: ClassVar[bool | None] = False
 
     touches: int = 5
     """Touches per instance, each with its own position, force, sensor and lamp."""
@@ -127,7 +128,7 @@ class GraspsConfig(SimulatedConfig):
     """Simulated two-finger grasps of 106 objects, before, during and after the lift, labelled by success."""
 
     name: ClassVar[str] = "grasps"
-    phased: ClassVar[bool] = True
+    phased: ClassVar[bool | None] = True
 
     num: int = 5300
     """Number of grasps; each gives three rows (before, during, after)."""

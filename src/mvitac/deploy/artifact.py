@@ -30,7 +30,7 @@ from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 FORMAT, FORMAT_VERSION = "mvitac-artifact", 1
 MANIFEST = "artifact.json"
-FILES = ("model.safetensors", "probes.safetensors", "run.json", "README.md")
+FILES = ("model.safetensors", "probes.safetensors", "run.json", "trained_on.safetensors", "README.md")
 """The only names an artifact may use."""
 PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".npy", ".npz", ".joblib")
 """Suffixes of files that some program may unpickle. An artifact has none: one that does was changed."""

@@ -18,8 +18,9 @@ from mvitac.data.spec import Task
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.controls import Records, controls_of
-from mvitac.evaluation.evaluate import stored_result
+from mvitac.evaluation.evaluate import check_unseen, stored_result
 from mvitac.evaluation.features import features
+from mvitac.evaluation.leaks import Scored, write_sources
 from mvitac.evaluation.probe import score_rows, split_rows
 from mvitac.evaluation.scores import cell_text, columns_of, resampled, sources_of, summarise, tested_on
 from mvitac.model import Model, load
@@ -50,6 +51,15 @@ def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]
             found += [fitted] if fitted else []
             advance()
     return found
+
+
+def _scorable(pack: Pack, task: Task) -> bool:
+    """Whether the task has labelled rows in train and test."""
+    try:
+        split_rows(pack, task)
+    except ValueError:
+        return False
+    return True
 
 
 def _fit_readout(
@@ -127,19 +137,21 @@ def with_readouts(model: Model, pack: Pack | None = None) -> Model:
     return model
 
 
-def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
+def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False) -> Path:
     """Write the artifact of a finished run.
 
     Args:
         run: the run's folder.
         out: the new folder.
         pack: data to fit the probes on (default: the data the run was trained on).
+        allow_leak: score also rows or groups of ``pack`` that the run was trained on; the card says LEAK beside scores.
 
     Returns:
         ``out``. The artifact was loaded once, as a check, before it got this name.
 
     Raises:
-        ValueError: ``out`` exists or cannot be written, or the run or its data is missing.
+        ValueError: ``out`` exists or cannot be written, the run or its data is missing, or the run was trained on what
+            ``pack`` would score.
     """
     if out.exists():
         raise ValueError(f"{out} already exists: choose another place, or delete it first")
@@ -147,14 +159,22 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
     model = load(run)
     _, record = load_run(run)
     pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
+    tasks = {task.name: task for task in pack.spec.tasks if _scorable(pack, task)}
+    learned, scored = check_unseen([run], [model], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
     fitted = _fit_all(model, pack)
+    for readout, found in fitted:
+        q = readout.question
+        found["leak"] = scored.leak(learned, split_rows(pack, tasks[q.task], q.modality).test)
+        readout.question = replace(q, leak=found["leak"])
     model.readouts = {readout.question.name: readout for readout, _ in fitted}
-    scores = _scores(run, model, pack, [record for _, record in fitted])
+    scores = _scores(run, model, pack, [found for _, found in fitted])
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         _write_weights(model, partial)
         write_json(partial / "run.json", record)
+        if learned is not None:
+            write_sources(partial, learned)
         manifest = {**_describe(model, pack), "scores": scores}
         write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
@@ -233,7 +253,7 @@ def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> lis
         "",
         "## Scores",
         "",
-        *_score_tables(scores),
+        *_score_tables(model, scores),
         "## Classes",
         "",
         *(f"- {task}: {', '.join(c)}" for task, c in model.classes.items()),
@@ -241,14 +261,18 @@ def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> lis
     ]
 
 
-def _score_tables(scores: dict[str, Any]) -> list[str]:
+def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
     """A Markdown table per task: accuracy with its interval, next to the controls."""
     if not scores["summary"]:
         return ["No task has labelled rows in train and test.", ""]
     by = scores["group_by"]
+    leaks = dict.fromkeys(r.question.leak for r in model.readouts.values() if r.question.leak)
+    unseen = f"{by}s that neither encoders nor probes saw"
+    if leaks:
+        unseen = f"test rows. LEAK, what the encoders saw of them: {'; '.join(leaks)}"
     lines = [
-        f"Accuracy in percent of linear probes, on {by}s that neither encoders nor probes saw. The rows below the first are"
-        f" controls. 95 % intervals: {resampled(by, 1)}.",
+        f"Accuracy in percent of linear probes, on {unseen}. The rows below the first are controls. 95 % intervals:"
+        f" {resampled(by, 1)}.",
         "",
     ]
     for name, task in scores["summary"].items():

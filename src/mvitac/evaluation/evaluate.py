@@ -12,7 +12,17 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, start_weights
-from mvitac.evaluation.probe import PROBES, Probe, cross_modal, probe_model, probes_of, split_rows, with_classes
+from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
+from mvitac.evaluation.probe import (
+    PROBES,
+    Probe,
+    cross_modal,
+    probe_model,
+    probes_of,
+    retrieved_rows,
+    split_rows,
+    with_classes,
+)
 from mvitac.evaluation.scores import summarise
 from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
@@ -50,7 +60,9 @@ class ProbeConfig:
             raise ValueError(f"imagenet {self.imagenet}: give a file that exists")
 
 
-def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None) -> dict[str, Any]:
+def probe_runs(
+    paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None, *, allow_leak: bool = False
+) -> dict[str, Any]:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
     Example:
@@ -61,13 +73,16 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
         session: What to probe.
         pack: Other data to probe on. Default: the data the runs were trained on.
+        allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
 
     Returns:
-        A dict with "data", "pack", "group_by", "notes", "classes", "records", "retrieval", "summary", "asked" (the
-        config) and "models" (digests of the weights).
+        A dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary", "asked" (the
+        config) and "models" (digests of the weights). A record has a "leak", which is empty unless its test rows, or their
+        groups, were trained on.
 
     Raises:
-        ValueError: If a path is no run, a run is given twice, or the runs and the data do not fit together.
+        ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
+            trained on rows or groups that other data than its own would score.
     """
     _check_paths(paths)
     models = [load(path) for path in paths]
@@ -85,13 +100,15 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
             split_rows(pack, task, modality)
     if session.controls:
         _check_weights(models, session)
+    scored_rows = Scored(pack)
+    sources = check_unseen(paths, models, pack, tasks, allow_leak=allow_leak)
     records: Records = []
     retrieval: Records = []
     num = len(models) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
     with work("fitting probes", num, "probes"):
         scored = in_threads(
-            lambda each: _probe_run(*each, pack, tasks, modalities, session),
-            list(zip(paths, models, names, strict=True)),
+            lambda each: _probe_run(*each, scored_rows, tasks, modalities, session),
+            list(zip(paths, models, names, sources, strict=True)),
         )
     for own, found in scored:
         records += own
@@ -108,6 +125,7 @@ def probe_runs(paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = 
         "models": _digests(paths),
         "group_by": pack.spec.group_by,
         "notes": list(pack.spec.notes),
+        "leaks": leaks_of([*records, *retrieval]),
         "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
         "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
         "records": records,
@@ -162,6 +180,28 @@ def _check_models(paths: Sequence[Path], models: Sequence[Model], pack: Pack) ->
                 )
 
 
+def check_unseen(
+    paths: Sequence[Path], models: Sequence[Model], pack: Pack, tasks: Sequence[AnyTask], *, allow_leak: bool
+) -> list[list[Source] | None]:
+    """What each run at ``paths`` learned from; None where that is not known.
+
+    Raises:
+        ValueError: If a run saw what other data than its own would score. In its own data the split was chosen, so the
+            scores only say LEAK.
+    """
+    scored, sources = Scored(pack), []
+    for path, model in zip(paths, models, strict=True):
+        digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
+        sources.append(learned := read_sources(path, model.run, digest, pack))
+        for task in tasks if learned is not None and digest != pack.digest and not allow_leak else ():
+            if leak := scored.leak(learned, split_rows(pack, task).test):
+                raise ValueError(
+                    f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}; give a pack whose test"
+                    " groups it was not trained on, or --allow-leak to score it with LEAK beside every score"
+                )
+    return sources
+
+
 def _check_weights(models: Sequence[Model], session: ProbeConfig) -> None:
     """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
     for weights in start_weights([m.run for m in models], session.imagenet):
@@ -172,17 +212,20 @@ def _probe_run(
     path: Path,
     model: Model,
     source: str,
-    pack: Pack,
+    learned: Sequence[Source] | None,
+    scored: Scored,
     tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     session: ProbeConfig,
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of one run."""
-    own = {"source": source, "seed": model.run.seed, "run": str(path)}
+    own, pack = {"source": source, "seed": model.run.seed, "run": str(path)}, scored.pack
     records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
+    leaks = {task.name: scored.leak(learned, split_rows(pack, task).test) for task in tasks}
     for record in records:
         record["source"] += END_TO_END if record["probe"] == "own" else ""
-    found = [{**own, **r} for r in cross_modal(model, pack)]
+        record["leak"] = leaks[record["task"]]
+    found = [{**own, **r, "leak": scored.leak(learned, retrieved_rows(pack))} for r in cross_modal(model, pack)]
     return records, found
 
 

@@ -70,7 +70,7 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
         ValueError: If no labelled row is left in train or in test.
     """
     having = names_in(modality, pack)
-    known = answered(pack, task)
+    known = pack.answered(task)
     found = {s: pack.rows(s, only=task.only, having=having, by=task.split) for s in ("train", "val", "test")}
     train, val, test = (rows[known[rows]] for rows in found.values())
     if not len(train) or not len(test):
@@ -90,13 +90,6 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
 def names_in(modality: str, pack: Pack) -> tuple[str, ...]:
     """The modalities that "touch", "vision", "both" or "none" stands for."""
     return tuple(pack.spec.modalities) if modality == "both" else () if modality == "none" else (modality,)
-
-
-def answered(pack: Pack, task: AnyTask) -> np.ndarray:
-    """bool [N]: which rows have a label, or a value of at least one target."""
-    if isinstance(task, ValueTask):
-        return np.asarray(np.isfinite(pack.values(task)).any(axis=1))
-    return labels_of(pack, task) >= 0
 
 
 def _num_classes(pack: Pack, task: AnyTask, rows: np.ndarray) -> int:
@@ -279,6 +272,12 @@ def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor
     return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
 
 
+def retrieved_rows(pack: Pack) -> np.ndarray:
+    """Test rows with all modalities, of the phase that the first task is about."""
+    only = pack.spec.tasks[0].only if pack.spec.tasks else None
+    return pack.rows("test", only=only, having=pack.spec.modalities)
+
+
 def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
     """Retrieval of test groups across modalities, in both directions.
 
@@ -288,8 +287,7 @@ def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
-    only = pack.spec.tasks[0].only if pack.spec.tasks else None
-    rows = pack.rows("test", only=only, having=pack.spec.modalities)
+    rows = retrieved_rows(pack)
     sizes = np.bincount(_group_numbers(pack, rows))
     if len(sizes) < MIN_GALLERY:
         return []

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
 
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.value_scores import mean_r2, pool_values
 
 NUM_DRAWS = 2000
@@ -67,7 +68,10 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
         if len(parts) < len(folds):
             continue
         if "group_sums" in parts[0]:
-            pooled.append({**{key: parts[0][key] for key in keys}, **pool_values(parts)})
+            whole = pool_values(parts)
+            if leaks := leaks_in(parts):
+                whole["leak"] = leaks
+            pooled.append({**{key: parts[0][key] for key in keys}, **whole})
             continue
         sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
         means = {}
@@ -81,6 +85,8 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
             "group_sizes": sizes,
             "group_correct": correct,
         }
+        if leaks := leaks_in(parts):
+            whole["leak"] = leaks
         pooled.append({**{key: parts[0][key] for key in keys}, **means, **whole})
     return pooled
 
@@ -219,14 +225,21 @@ def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[di
     return found
 
 
+def leaks_in(records: Sequence[dict[str, Any]]) -> str:
+    """The leaks of records (``evaluation.leaks``), without repetition; controls and records of 0.1.0 have none."""
+    return "; ".join(dict.fromkeys(record["leak"] for record in records if record.get("leak")))
+
+
 def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
     """Accuracy as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``)."""
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
         mean, low, high = interval(found)
         seeds = [record["seed"] for record in found if record["seed"] is not None]
-        groups = num_groups_of(found[0])
-        cell = {"mean": mean, "low": low, "high": high, "seeds": seeds, "groups": groups}
+        cell: dict[str, Any] = {"mean": mean, "low": low, "high": high, "seeds": seeds}
+        cell["groups"] = num_groups_of(found[0])
+        if leaks := leaks_in(found):
+            cell["leak"] = leaks
         summary.setdefault(task, {}).setdefault(modality, {})[source] = cell
     return summary
 
@@ -241,9 +254,9 @@ def percent(value: float) -> str:
     return f"{100 * value:.1f}"
 
 
-def with_interval(mean: float, low: float, high: float) -> str:
-    """A score and its 95 % interval, such as '57.6 [55.1, 60.2]'."""
-    return f"{percent(mean)} [{percent(low)}, {percent(high)}]"
+def with_interval(mean: float, low: float, high: float, leak: str = "") -> str:
+    """A score and its 95 % interval, such as '57.6 [55.1, 60.2]', with LEAK if there is one (``evaluation.leaks``)."""
+    return f"{percent(mean)} [{percent(low)}, {percent(high)}]{leak_mark(leak)}"
 
 
 def resampled(group_by: str, num_seeds: int) -> str:
@@ -276,4 +289,4 @@ def sources_of(task: dict[str, Any]) -> list[str]:
 def cell_text(task: dict[str, Any], source: str, modality: str) -> str:
     """The score of one source, or '' if it has none. Controls without features appear in every column."""
     value = task.get(modality, {}).get(source) or task.get("none", {}).get(source)
-    return with_interval(value["mean"], value["low"], value["high"]) if value else ""
+    return with_interval(value["mean"], value["low"], value["high"], value.get("leak", "")) if value else ""

@@ -25,7 +25,7 @@ from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work, pairs_per_second, seconds_of
-from mvitac.experiments.plan import Plan, Row, slug
+from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.model import precision_of
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
@@ -34,7 +34,6 @@ from mvitac.system.device import describe, describe_precision, pick_device, pick
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.progress import duration
 from mvitac.system.provenance import provenance
-from mvitac.training.sampler import training_rows
 from mvitac.training.setup import check_same
 from mvitac.training.views import gel_mirror
 
@@ -79,7 +78,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     jobs = []
     for seed in range(plan.seeds):
         for row, own in possible:
-            run = replace(plan.run(row, plan.data, seed), device=device)
+            run = replace(plan.run(row, plan.data, seed, pack.phased), device=device)
             job = Job(row.label, run, out / "runs" / slug(row.label) / f"seed{seed}", session, plan.stress)
             if (job.out / "run.json").exists():
                 check_same(job.run, own, job.out)
@@ -92,9 +91,9 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
     assert plan.data is not None
     if missing := sorted(key for key in row.set if key.startswith("data.") and not hasattr(plan.data, key[5:])):
         raise ValueError(f"dataset {plan.data.name!r} has no {', '.join(missing)}")
-    run = plan.run(row, plan.data, 0)
+    run = plan.run(row, plan.data, 0, pack.phased)
     own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
-    run.check(own.spec, len(training_rows(run, own)), own.size)
+    run.check(own.spec, len(run.method.training_rows(own)), own.size)
     gel_mirror(run, own, torch.device("cpu"))
     run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
     return own, run.without_idle(own.spec).digest()
@@ -197,7 +196,7 @@ def leaks(pack: Pack, tasks: Sequence[AnyTask]) -> str:
 def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
     """Steps, pairs, images, median seconds and (if measured) peak GPU memory of one run of a row."""
     run = jobs[0].run
-    rows = len(training_rows(run, pack))
+    rows = len(run.method.training_rows(pack))
     method = run.method.build(pack.spec, replace(run.encoder, weights=SCRATCH))
     steps = run.num_steps(rows)
     peaks = [read_json(p, "peak memory")["peak_bytes"] for job in jobs if (p := job.out / "memory.json").exists()]
@@ -218,7 +217,7 @@ def pairs_of(run: Run, views: int, pack: Pack) -> str:
     """Which rows form a positive pair (``Run.positives``). This matters more than the choice of most methods."""
     other = run.positives != "same-image" if views > 1 else run.positives == "same-touch-pairs"
     several = len(np.unique(pack.touch_groups)) < pack.num
-    return "two rows of a touch" if other and several else "one row"
+    return "two rows of a touch" if other and several else ONE_ROW
 
 
 def forecast(work: Work, *, measure: bool = False) -> list[str]:
@@ -232,7 +231,7 @@ def forecast(work: Work, *, measure: bool = False) -> list[str]:
     lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
     images = {}
     for label, job in rows.items():
-        num = len(training_rows(job.run, work.pack))
+        num = len(job.run.method.training_rows(work.pack))
         steps = job.run.num_steps(num)
         images[label] = steps * job.run.batch_size * _images_per_pair(job.run, work.pack)
         mine = [j for j in work.jobs if j.label == label]

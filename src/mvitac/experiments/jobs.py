@@ -36,7 +36,6 @@ from mvitac.system.processes import my_device, side_by_side
 from mvitac.system.progress import Bars, shown
 from mvitac.training.log import Logger, in_a_bar, last_line
 from mvitac.training.loop import Diverged, Interrupted, train
-from mvitac.training.sampler import training_rows
 
 
 @dataclass(frozen=True)
@@ -228,7 +227,7 @@ class _Progress:
         self.tasks: dict[Path, TaskID] = {}  # bars of the active runs
         if bars:
             # A fold may take a few steps more or less than counted here.
-            self.steps = {job.out: job.run.num_steps(len(training_rows(job.run, work.pack))) for job in work.jobs}
+            self.steps = {job.out: job.run.num_steps(len(job.run.method.training_rows(work.pack))) for job in work.jobs}
             for job in work.jobs:
                 self._read(job)
             self.overall = bars.add_task("all runs", total=len(todo), unit="runs", rate="")

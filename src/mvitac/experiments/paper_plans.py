@@ -68,7 +68,7 @@ VARIANTS = (
 TABLE1 = Plan(
     name="table1",
     title="Table I: material properties by linear probes of frozen features",
-    printed_on="touch-and-go",
+    printed_on="touch-and-go (official)",
     printed_majority=_three(18.6, 66.1, 56.3),
     rows=(
         replace(TOUCH_ONLY, printed={"touch": _three(57.4, 89.1, 79.3)}),
@@ -87,7 +87,7 @@ TABLE1 = Plan(
 TABLE2 = Plan(
     name="table2",
     title="Table II: grasp success on unseen objects",
-    printed_on="calandra",
+    printed_on="calandra (authors)",
     set={"augment.vision.grayscale": 0.0, "augment.touch.grayscale": 0.0},  # appendix B: none for grasping
     rows=(
         Row(label="TAG (CMC)", method="cmc", printed={"both": {"success": 56.3}}),

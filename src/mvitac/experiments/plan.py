@@ -16,6 +16,8 @@ from mvitac.run import Run
 
 Printed = dict[str, dict[str, float]]
 """modality -> task -> top-1 accuracy in percent as printed in the paper."""
+ONE_ROW = "one row"
+"""Where the pairs of a run are from if its positives are views of the same image, as in the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,7 @@ class Row:
     set: dict[str, Any] = field(default_factory=dict)
     """Fields of the run to change, by dotted name, e.g. {"method.temperature": 0.2, "optim.lr": 0.03}."""
     printed: Printed = field(default_factory=dict)
-    """The paper's numbers for this row."""
+    """The paper's numbers for this row, with positives of the same image. Shown beside such scores of probe paper only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,7 @@ class Plan:
     stress: bool = False
     """Also run stress tests: few labels, noisy images, a missing modality, a leaking split (``evaluation.robustness``)."""
     printed_on: str = ""
-    """Name of the dataset of the paper's numbers."""
+    """Name of the dataset of the paper's numbers, with its split: they are shown beside scores on this data only."""
     printed_majority: dict[str, float] = field(default_factory=dict)
     """task -> majority rate as printed in the paper."""
 
@@ -107,7 +109,7 @@ class Plan:
         if not self.folds:
             return [("", self)]
         assert self.data is not None
-        whole = recipe(self.recipe, self.data)  # the data of the plan, without changes of single rows
+        whole = recipe(self.recipe, self.data, phased=False)  # for its data alone
         parts = [
             {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
         ]
@@ -122,10 +124,13 @@ class Plan:
         datas = [changed(whole, part).data for part in parts]
         return [(name, replace(self, data=data, folds=())) for name, data in zip(names, datas, strict=True)]
 
-    def run(self, row: Row, data: DatasetConfig, seed: int) -> Run:
-        """The run of one row and seed; ValueError if a field does not exist or its value does not fit."""
+    def run(self, row: Row, data: DatasetConfig, seed: int, phased: bool | None = None) -> Run:
+        """The run of one row and seed; ValueError if a field does not exist or its value does not fit.
+
+        ``phased`` is that of the opened data, as for ``recipe``.
+        """
         try:
-            base = with_method(recipe(row.recipe or self.recipe, data), row.method)
+            base = with_method(recipe(row.recipe or self.recipe, data, phased), row.method)
             return replace(changed(base, {**self.set, **row.set}), seed=seed)
         except ValueError as error:
             raise ValueError(f"row {row.label!r}: {error}") from None

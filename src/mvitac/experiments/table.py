@@ -8,8 +8,8 @@ from typing import Any
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
 from mvitac.evaluation.robustness import STRESSES
-from mvitac.evaluation.scores import MODALITY_ORDER, by_cell, interval, paired_difference
-from mvitac.experiments.plan import Plan
+from mvitac.evaluation.scores import MODALITY_ORDER, by_cell, interval, leaks_in, paired_difference
+from mvitac.experiments.plan import ONE_ROW, Plan
 from mvitac.registry import from_json
 
 
@@ -24,6 +24,8 @@ class Cell:
     printed: float | None
     difference: tuple[float, float, float, float] | None
     """To the reference row: mean, low, high, p."""
+    leak: str = ""
+    """Which test rows were trained on (``evaluation.leaks``)."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,10 @@ class Line:
 
 
 def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
-    """The lines of the table: rows in the plan's order, then controls. ``probe`` defaults to the plan's first."""
+    """The lines of the table: rows in the plan's order, then controls. ``probe`` defaults to the plan's first.
+
+    The paper's numbers stand beside scores of the same split, positives and probe only (``_printed``).
+    """
     plan: Plan = from_json(Plan, result["plan"], "plan")
     probe = probe or plan.probes[0]
     records = by_cell(result["records"], probe)
@@ -54,22 +59,28 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
                 if mine := records.get((task, modality, source)):
                     against = records.get((task, modality, plan.reference)) if source != plan.reference else None
                     trained = (task, modality, source + END_TO_END) in records
-                    # The paper printed the score of a supervised row's own classifier; it has no stress tests.
-                    paper = None if trained or probe in STRESSES else _printed(plan, task, modality, source)
+                    # The paper printed the score of a supervised row's own classifier.
+                    paper = None if trained or probe != "paper" else _printed(result, plan, task, modality, source)
                     seeds = max(1, sum(record["seed"] is not None for record in mine))
                     gap = paired_difference(mine, against) if against else None
-                    cells[task] = Cell(*interval(mine), seeds, None if paper is None else paper / 100, gap)
+                    cells[task] = Cell(
+                        *interval(mine), seeds, None if paper is None else paper / 100, gap, leaks_in(mine)
+                    )
             if cells:
                 lines.append(Line(source, modality, cells, control=source in controls))
     return lines
 
 
-def _printed(plan: Plan, task: str, modality: str, source: str) -> float | None:
-    """The paper's number in percent, if it has one."""
+def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, source: str) -> float | None:
+    """The paper's number in percent, if it has one for this split, of positives from the same image."""
+    if result["data"] != plan.printed_on:
+        return None
     if source == "majority":
         return plan.printed_majority.get(task)
-    printed = {row.label: row.printed for row in plan.rows}
-    return printed.get(source.removesuffix(END_TO_END), {}).get(modality, {}).get(task)
+    label = source.removesuffix(END_TO_END)
+    printed = {row.label: row.printed for row in plan.rows}.get(label, {})
+    pairs = {cost["row"]: cost["pairs_of"] for cost in result["cost"]}
+    return printed.get(modality, {}).get(task) if pairs.get(label) == ONE_ROW else None
 
 
 def stresses_of(result: dict[str, Any]) -> dict[str, list[Line]]:

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.scores import by_cell, least_p, num_groups_of, percent, resampled, with_interval
 from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Cell, Line, lines_of, stresses_of
@@ -74,7 +75,7 @@ def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
         row = _first_cells(line)
         for task in tasks:
             cell = line.cells.get(task)
-            score = with_interval(cell.mean, cell.low, cell.high) if cell else ""
+            score = with_interval(cell.mean, cell.low, cell.high, cell.leak) if cell else ""
             row += [score, *([_printed(cell)] if shown else []), _gap(cell)]
         rows.append(row)
     return _pipes(heads, rows)
@@ -108,8 +109,9 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
         folds = f"{len(plan.folds)} fold{'s' * (len(plan.folds) > 1)}"
         text.append(f"{folds}: every test {result['group_by']} is scored once{unseen}.")
     if shown:
-        other = "." if _papers(result, plan) else ", which is other data: compare the order of rows, not values."
-        text.append(f'"printed" is the paper\'s number on {plan.printed_on}{other}')
+        text.append(f'"printed" is the paper\'s number on {plan.printed_on}, by the same probe and positives.')
+    elif result["data"] == plan.printed_on and plan.probes[0] != "paper":
+        text.append("The paper's numbers are of its own probe: `--probes paper` shows them.")
     text += [f"Note: {note}." for note in _notes(result)]
     if result["leaks"]:
         text.append(f"**LEAK: {result['leaks']}.**")
@@ -153,11 +155,6 @@ def _made(result: dict[str, Any]) -> str:
     runs = list(dict.fromkeys(short(commit) for commit in result.get("run_commits", ()))) or [tables]
     code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
     return ", ".join([code, *(result.get("run_devices") or [result["device"]])])
-
-
-def _papers(result: dict[str, Any], plan: Plan) -> bool:
-    """Whether this is the paper's data. Its name may end with a split: touch-and-go (official)."""
-    return result["data"].split(" ")[0] == plan.printed_on
 
 
 def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
@@ -218,7 +215,7 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
         cells = (_tex_cell(line, task, lines) for task in tasks)
         text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
     note = f"% {plan.title or plan.name}; data {result['data']}"
-    if plan.printed_on:
+    if any(cell.printed is not None for line in lines for cell in line.cells.values()):
         note += f"; in parentheses: printed in the paper on {plan.printed_on}"
     notes = [note, *(f"% Note: {note}." for note in _notes(result))]
     if result["leaks"]:
@@ -235,7 +232,7 @@ def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
     number, _, ends = with_interval(cell.mean, cell.low, cell.high).partition(" ")
     number = rf"\textbf{{{number}}}" if not line.control and cell.mean == best else number
     paper = f" ({percent(cell.printed)})" if cell.printed is not None else ""
-    return f"{number} {ends}{paper}"
+    return f"{number} {ends}{paper}{leak_mark(cell.leak)}"
 
 
 def _tex(text: str) -> str:
@@ -249,7 +246,7 @@ def comma(result: dict[str, Any]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     heads = ("row", "control", "probe", "modality", "task", "accuracy", "low", "high", "seeds", "printed")
-    writer.writerow((*heads, "difference", "difference_low", "difference_high", "p"))
+    writer.writerow((*heads, "difference", "difference_low", "difference_high", "p", "leak"))
     tables = {**{probe: lines_of(result, probe) for probe in _plan(result).probes}, **stresses_of(result)}
     scored: dict[str, dict[str, None]] = {}  # source -> its probes
     for record in result["records"]:
@@ -263,17 +260,15 @@ def comma(result: dict[str, Any]) -> str:
                     continue
                 written.add(key)
                 values = (line.source, int(line.control), probe, line.modality, task, cell.mean, cell.low, cell.high)
-                writer.writerow((*values, cell.seeds, cell.printed, *(cell.difference or ("",) * 4)))
+                writer.writerow((*values, cell.seeds, cell.printed, *(cell.difference or ("",) * 4), cell.leak))
     return buffer.getvalue()
 
 
 def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
-    """The table as a PNG (``figures.comparison``), with the paper's numbers if this is the paper's data."""
-    printed = _papers(result, _plan(result))
+    """The table as a PNG (``figures.comparison``)."""
     panels: dict[str, list[Dot]] = {}
     for line in lines:
         for task, cell in line.cells.items():
-            paper = cell.printed if printed else None
-            dot = Dot(line.source, line.modality, cell.mean, cell.low, cell.high, paper, line.control)
+            dot = Dot(line.source, line.modality, cell.mean, cell.low, cell.high, cell.printed, line.control)
             panels.setdefault(task, []).append(dot)
     return to_png(comparison(panels), dpi=110)

@@ -11,9 +11,11 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.registry import Registered
@@ -160,9 +162,14 @@ class MethodConfig(Registered, ABC):
                 f" choose a --method that needs no pairs ({', '.join(others)})"
             )
 
-    def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
-        """Tasks whose labels the method learns from. Empty for a self-supervised method."""
-        return ()
+    @property
+    def label_splits(self) -> tuple[str, ...]:
+        """Splits whose labels ``Views.labels`` has."""
+        return ("train",)
+
+    def training_rows(self, pack: Pack) -> np.ndarray:
+        """Pack rows to train on, ascending: train and unlabelled, with all modalities."""
+        return pack.rows("train", "unlabelled", having=pack.spec.modalities)
 
     def without_idle(self, spec: DataSpec) -> Self:
         """This config with every setting that has no effect on the dataset at a fixed value.

@@ -6,17 +6,19 @@ from labels: its own classifiers are scored, and its frozen trunks are probed li
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Self
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
-from mvitac.registry import unknown
+from mvitac.registry import formerly, unknown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +29,28 @@ class LabelledConfig(MethodConfig):
     """Tasks to learn. Default: all tasks of the dataset."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
     """Modalities to learn from. Default: all modalities of the dataset."""
+    labels: Literal["train", "train-and-val"] = field(default="train-and-val", metadata=formerly("train"))
+    """Splits whose labels are learned from. train-and-val: the rows that probes are fitted on. train: rows of train alone,
+    as in version 0.1.0."""
+
+    @property
+    def label_splits(self) -> tuple[str, ...]:
+        return ("train",) if self.labels == "train" else ("train", "val")
+
+    def training_rows(self, pack: Pack) -> np.ndarray:
+        """Pack rows with a label to learn from, by the split of their task, and with the modalities to learn from."""
+        if self.labels == "train":
+            rows = super().training_rows(pack)
+        else:
+            rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in self.modalities_of(pack.spec)]))
+        labelled = {task: pack.labels(task, *self.label_splits)[rows] >= 0 for task in self.labels_needed(pack.spec)}
+        for task, there in labelled.items():
+            if not there.any():
+                raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
+        return rows[np.logical_or.reduce(list(labelled.values()))]
 
     def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
+        """Tasks to learn. Raises ValueError if the dataset lacks one, or has none."""
         known = [task.name for task in spec.tasks]
         for task in self.tasks:
             if task not in known:

@@ -5,12 +5,14 @@ Shapes: B images, D features (a probe on both modalities reads vision, then touc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from mvitac.registry import LATER
 
 UNSEEN = -1e4
 """Logit of a class without training examples: probability 0 in fp32, and still finite in fp16."""
@@ -29,6 +31,8 @@ class ProbeInfo:
     majority: float
     """Accuracy on the same rows of always predicting the most frequent class."""
     num_test: int
+    leak: str = field(default="", metadata=LATER)
+    """Which test rows the encoders were trained on, or "unknown" (``evaluation.leaks``)."""
 
     @property
     def name(self) -> str:

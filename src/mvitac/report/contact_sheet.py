@@ -12,7 +12,8 @@ from html import escape
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mvitac.data.pack import SPLITS, Pack
+from mvitac.data.pack import Pack
+from mvitac.data.pack_table import SPLITS
 from mvitac.registry import unknown
 
 GAP, LINE = 6, 22

@@ -16,6 +16,7 @@ from rich.console import Console
 from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import cross_modal, split_rows
 from mvitac.evaluation.scores import percent, resampled, summarise, with_interval
 from mvitac.model import load, precision_of
@@ -197,13 +198,14 @@ def verdicts(study: Study) -> list[str]:
     clauses = []
     for task in list(study.result["summary"])[:1]:
         modality, own, controls = evidence.headline(study, task)
+        mark = leak_mark(own.get("leak", ""))
         names = {"untrained": "untrained trunk", "imagenet": "frozen ImageNet trunk"}
         beside = [f"{names.get(name, name)} {percent(cell['mean'])}" for name, cell in controls.items()]
         methods = study.result["summary"][task][modality]
         others = [f"{s} {percent(methods[s]['mean'])}" for s in study.sources[1:] if s in methods]
         by = f" with {study.sources[0]}" if others else ""
         clauses.append(
-            ", ".join([f"{WORDS[modality]} reaches {percent(own['mean'])} % on {task}{by}", *others, *beside])
+            ", ".join([f"{WORDS[modality]} reaches {percent(own['mean'])} %{mark} on {task}{by}", *others, *beside])
         )
     found = tables.by_direction(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
     if found:
@@ -221,7 +223,7 @@ def _tile(study: Study, task: str) -> str:
     found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
     verdict = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
     verdict = verdict if controls else ""
-    number, _, ends = with_interval(own["mean"], own["low"], own["high"]).partition(" ")
+    number, _, ends = with_interval(own["mean"], own["low"], own["high"], own.get("leak", "")).partition(" ")
     numbers = f"{number}<small> % {ends}</small>"
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
     what = f"<h3>{escape(task)} <small>{escape(WORDS[modality] + by)}</small></h3>"

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import MIN_GALLERY
 from mvitac.evaluation.scores import (
     MODALITY_ORDER,
@@ -110,12 +111,15 @@ def probe(study: Study) -> str:
     scores = ("accuracy", "balanced_accuracy", "macro_f1", "auroc")
     rows = [
         [r["source"], "" if r["seed"] is None else str(r["seed"]), r["task"], r["modality"], r["probe"]]
-        + ["" if r.get(k) is None else percent(r[k]) for k in scores]  # a task with values has none
+        + ["" if r.get(k) is None else percent(r[k]) + leak_mark(r.get("leak", "")) for k in scores]  # values have none
         for r in records
     ]
     columns = ("", "seed", "task", "features", "probe", "accuracy", "balanced", "macro F1", "AUROC")
     numbers.append(html.fold("Every probe with balanced accuracy, F1 and AUROC (%)", html.table(columns, rows)))
-    intro = f"A probe ({names[0]}) on frozen features, scored on unseen {study.pack.spec.group_by}s."
+    by = study.pack.spec.group_by
+    intro = f"A probe ({names[0]}) on frozen features, scored on {tables.unseen_groups(by, records)}."
+    for leak in study.result.get("leaks", ()):
+        intro += f" LEAK: {leak}."
     if {r["source"] for r in records} - set(study.sources):
         intro += " Grey bars are controls: the same probe on an untrained trunk, raw pixels, and the image border."
     return html.paragraph(intro) + html.grid(drawn) + "".join(numbers)
@@ -144,7 +148,7 @@ def retrieval(study: Study) -> str:
         mean, low, high = interval(records)
         groups.setdefault(direction, {})[source] = {"mean": mean, "low": low, "high": high}
     by, num = study.pack.spec.group_by, found[0]["num_groups"]
-    title = f"R@5 over {num} unseen {by}s"
+    title = f"R@5 over {num} {tables.unseen_groups(by, found)}"
     drawing = figures.bars(title, groups, {"chance": found[0]["chance R@5"]}, f"own {by} among the first five, %")
     drawn = study.figure("retrieval", drawing, f"{title}, with chance; the numbers are in the table")
     rows = [[row[0], row[1].replace("->", "→"), *row[2:]] for row in tables.retrieval_rows(found)]
@@ -298,7 +302,7 @@ def confusions(study: Study) -> str:
     return html.paragraph(intro) + html.grid(drawn)
 
 
-def headline(study: Study, task: str) -> tuple[str, dict[str, float], dict[str, dict[str, float]]]:
+def headline(study: Study, task: str) -> tuple[str, dict[str, Any], dict[str, dict[str, Any]]]:
     """The modality to show (both, else the best), the first method's score on it, and those of the controls."""
     found, source = study.result["summary"][task], study.sources[0]
     have = [m for m in columns_of(found) if source in found[m]]

@@ -8,11 +8,26 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mvitac.evaluation.scores import cell_text, columns_of, interval, percent, resampled, sources_of, tested_on
+from mvitac.evaluation.leaks import leak_mark
+from mvitac.evaluation.scores import (
+    cell_text,
+    columns_of,
+    interval,
+    leaks_in,
+    percent,
+    resampled,
+    sources_of,
+    tested_on,
+)
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
 """Columns of a retrieval table, in percent."""
+
+
+def unseen_groups(group_by: str, records: Sequence[dict[str, Any]]) -> str:
+    """The test groups of ``records``: unseen ones, unless a source was trained on some of them or may have been."""
+    return f"{'test' if leaks_in(records) else 'unseen'} {group_by}s"
 
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
@@ -30,18 +45,22 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         for modality in modalities:
             table.add_column(modality, justify="right", no_wrap=True)
         for source in sources_of(task):
-            table.add_row(source, *(cell_text(task, source, m) for m in modalities))
+            # LEAK on a line of its own, else the table is too wide.
+            table.add_row(source, *(cell_text(task, source, m).replace(" LEAK", "\nLEAK") for m in modalities))
         console.print(table)
     console.print(f"95 % intervals: {resampled(result['group_by'], seeds)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
+    for leak in result.get("leaks", ()):
+        console.print(f"LEAK: {leak}", markup=False, highlight=False)
 
 
 def print_retrieval(result: dict[str, Any], console: Console) -> None:
     """Print cross-modal retrieval as one table, if the methods have a shared space."""
     if not result["retrieval"]:
         return
-    table = Table(title=f"retrieval over unseen {result['group_by']}s", title_justify="left", title_style="bold")
+    unseen = unseen_groups(result["group_by"], result["retrieval"])
+    table = Table(title=f"retrieval over {unseen}", title_justify="left", title_style="bold")
     table.add_column("")
     table.add_column("query -> found")
     for column in RETRIEVAL:
@@ -55,7 +74,9 @@ def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Rows of source, direction and ``RETRIEVAL`` in percent, averaged over seeds."""
     rows = []
     for (source, direction), found in by_direction(records).items():
-        rows.append([source, direction, *(percent(recall(found, key)) for key in RETRIEVAL)])
+        mark = leak_mark(leaks_in(found))
+        rows.append([source, direction, *(percent(recall(found, key)) + mark for key in RETRIEVAL[:-1])])
+        rows[-1].append(percent(recall(found, RETRIEVAL[-1])))
     return rows
 
 

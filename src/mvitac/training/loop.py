@@ -49,7 +49,8 @@ def train(
 ) -> Path:
     """Pre-train and write the result into a folder.
 
-    The folder gets run.json (the settings), log.jsonl, checkpoint.pt (to resume from) and model.safetensors (the result).
+    The folder gets run.json (the settings), trained_on.safetensors (hashes of the rows it learns from), log.jsonl,
+    checkpoint.pt (to resume from) and model.safetensors (the result).
 
     Args:
         run: What to train, e.g. ``mvitac.recipe("demo")``.

@@ -13,19 +13,6 @@ from mvitac.run import Run
 from mvitac.system.distributed import World
 
 
-def training_rows(run: Run, pack: Pack) -> np.ndarray:
-    """Pack rows to train on: train and unlabelled, with both modalities, and with a label if the method needs labels."""
-    rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)
-    tasks = run.method.labels_needed(pack.spec)
-    if not tasks:
-        return rows
-    labels = {task: pack.labels(task, "train")[rows] >= 0 for task in tasks}
-    for task, there in labels.items():
-        if not there.any():
-            raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
-    return rows[np.logical_or.reduce(list(labels.values()))]
-
-
 def mix(*numbers: int) -> int:
     """Combine several numbers into one 63-bit seed, by numpy's SeedSequence."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
+from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.leaks import FILE, source_of, write_sources
 from mvitac.methods.base import Method
 from mvitac.model import Model, precision_of
 from mvitac.nn.memory_bank import replicated, shard_banks
@@ -20,7 +22,6 @@ from mvitac.system.files import brief, check_place, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.sampler import training_rows
 from mvitac.training.step import Step
 from mvitac.training.views import gel_mirror
 from mvitac.transforms.gel_flip import GelMirror
@@ -55,8 +56,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     """
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
-    pack = _open_pack(run, world, quiet) if pack is None else pack
-    rows = training_rows(run, pack)
+    pack = open_pack(run.data, world, quiet) if pack is None else pack
+    rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)
     check_divisible(run, world)
@@ -74,6 +75,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
         start = checkpoint.restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
+    if world.writes and not (out / FILE).exists():
+        write_sources(out, [source_of(pack, rows)])
     if not resumed and world.writes:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
         here = {"device": describe(device), "precision": run.precision}
@@ -134,11 +137,11 @@ def _check_precision(begun: str, asked: Run, run: Run, out: Path) -> None:
         )
 
 
-def _open_pack(run: Run, world: World, quiet: bool) -> Pack:
-    """Open the data of ``run``. Rank 0 simulates or packs what does not exist yet, then the others open it."""
+def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
+    """Open ``data``. Rank 0 simulates or packs what does not exist yet, then the others open it."""
     if world.rank:
         world.wait()
-    pack = run.data.open(quiet=quiet or not world.writes)
+    pack = data.open(quiet=quiet or not world.writes)
     if not world.rank:
         world.wait()
     return pack

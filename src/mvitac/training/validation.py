@@ -18,7 +18,7 @@ NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
 def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """Scores on held-out groups (split val, never test). Only rows with both modalities are used.
 
-    Without a val split, the scores are computed on training rows, and there is no kNN accuracy.
+    Without rows of val that are not trained on, the scores are computed on training rows, and there is no kNN accuracy.
 
     Returns:
         name -> value, e.g. "touch/knn category", "vision/rankme", "vision->touch R@5".
@@ -26,7 +26,7 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
     modalities = pack.spec.modalities
     train_rows = _sample(pack, pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
-    val_rows = pack.rows("val", having=modalities)
+    val_rows = np.setdiff1d(pack.rows("val", having=modalities), run.method.training_rows(pack))
     held_out = len(val_rows) > 1
     rows = _sample(pack, val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders}

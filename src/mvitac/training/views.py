@@ -104,5 +104,8 @@ def make_views(
                 seen = mirror.random(seen, source, run.augment.touch, generator)
             view = random_view(seen, config, run.augment.size, generator, dtype)
             images[modality].append(view)
-    labels = {t.name: torch.from_numpy(pack.labels(t.name, "train")[rows]).to(device) for t in pack.spec.tasks}
+    labels = {
+        t.name: torch.from_numpy(pack.labels(t.name, *run.method.label_splits)[rows]).to(device)
+        for t in pack.spec.tasks
+    }
     return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))

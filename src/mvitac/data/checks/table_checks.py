@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from mvitac.data.checks.finding import Finding, Verdict, share, some
-from mvitac.data.pack import SPLITS, Pack
+from mvitac.data.pack import Pack
+from mvitac.data.pack_table import SPLITS
 from mvitac.data.source import Count
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")

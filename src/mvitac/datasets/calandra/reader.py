@@ -27,7 +27,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mvitac.data.source import Count, Sample, Source, one_stamp, stamp_of
-from mvitac.data.spec import DataSpec, Task
+from mvitac.data.spec import PHASES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.calandra.objects import (
     AUTHORS_TEST,
@@ -44,7 +44,6 @@ from mvitac.system.files import brief, digest
 
 VERSION = 1
 """Version of this reader. Increase it when the same shards would give another pack."""
-PHASES = ("before", "during", "after")
 Phase = Literal["before", "during", "after"]
 NUM_SHARDS, NUM_PER_SHARD, NUM_GRASPS = 38, 250, 9296
 SHARD = re.compile(r"calandra_corl2017_(\d{3})\.h5")
@@ -69,7 +68,7 @@ class CalandraConfig(DatasetConfig):
     """Grasps of about 106 objects with two GelSights (stacked, 6 channels) and a Kinect, labelled by success."""
 
     name: ClassVar[str] = "calandra"
-    phased: ClassVar[bool] = True
+    phased: ClassVar[bool | None] = True
 
     path: Path = Path("data/calandra")
     """Folder with some or all of the shards calandra_corl2017_000.h5 to _037.h5."""
@@ -152,8 +151,9 @@ class Calandra(Source):
         self._grasps = [grasp for grasp in everything if grasp.damage or grasp.object in self._splits]
 
     def spec(self) -> DataSpec:
+        partial = ", partial" if len(self._files) < NUM_SHARDS else ""
         return DataSpec(
-            name="calandra",
+            name=f"calandra ({self.config.split}{partial})",
             vision_channels=3,
             touch_channels=6,
             tasks=tuple(TASKS[asked] for asked in self.config.ask),

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mvitac.data.pack import SPLITS
+from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import AnyTask, Target, Task, ValueTask
 from mvitac.datasets.table.image_columns import Background, Refs
 from mvitac.datasets.table.manifest import Manifest, number_of

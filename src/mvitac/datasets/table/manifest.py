@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mvitac.data.images import IMAGES
-from mvitac.data.pack import SPLITS
+from mvitac.data.pack_table import SPLITS
 from mvitac.datasets.table.image_refs import VIDEOS, File, Frame, ImageRef
 from mvitac.datasets.table.splits import likely_split
 from mvitac.registry import unknown

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mvitac.data.pack import SPLITS
+from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import AnyTask
 from mvitac.datasets.table.image_refs import Frame, ImageRef
 from mvitac.registry import unknown

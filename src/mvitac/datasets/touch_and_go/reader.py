@@ -62,6 +62,7 @@ class TouchAndGoConfig(DatasetConfig):
     """
 
     name: ClassVar[str] = "touch-and-go"
+    phased: ClassVar[bool | None] = False
 
     root: Path = Path("touch_and_go")
     """Folder of the download: with dataset/<recording>/ in it, or with the recordings themselves."""
@@ -141,7 +142,7 @@ class TouchAndGo(Source):
         notes = leaks(listed) if config.split == "official" else []
         if missing:
             notes.append(missing_report(missing, self._num_names))
-        self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes))
+        self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes), bool(missing))
         lists = [file for file in sorted(self._lists.glob("*.txt")) if file.name in LIST_FILES]
         self._fingerprint = {
             "reader": f"touch-and-go {VERSION}",
@@ -284,12 +285,12 @@ def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
     return columns
 
 
-def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...]) -> DataSpec:
+def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...], missing: bool) -> DataSpec:
     # The rough/smooth lists have another split than the category lists.
     own = "split_rough" if config.split == "official" else "split"
     tasks = [Task(name="category", classes=CLASSES), Task(name="soft", classes=("hard", "soft"))]
     return DataSpec(
-        name=f"touch-and-go ({config.split})",
+        name=f"touch-and-go ({config.split}{', partial' if missing else ''})",
         vision_channels=3 * (config.modalities != "touch"),
         touch_channels=3 * (config.modalities != "vision"),
         tasks=(*tasks, *([Task(name="rough", classes=("smooth", "rough"), split=own)] if rough else [])),

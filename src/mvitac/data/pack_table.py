@@ -1,0 +1,82 @@
+"""What every reader of a pack's table relies on, checked. This module does not import torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from mvitac.data.spec import DataSpec
+from mvitac.registry import unknown
+
+SPLITS = ("train", "val", "test", "unlabelled")
+"""Pre-training uses train and unlabelled. Val is for choosing (kNN during training, a probe's C), test for scores only."""
+
+
+def check_table(table: pa.Table, spec: DataSpec) -> None:
+    """Check what every reader of a pack's table relies on; ValueError names the column, the row and what is allowed."""
+    labels = {f"label_{task.name}": len(task.classes) for task in spec.tasks}
+    controls = [c for columns in spec.controls.values() for c in columns]
+    targets = {target.name: target for task in spec.values for target in task.targets}
+    asked = (*labels, *controls, *targets, *(c for task in spec.all_tasks for c in task.only))
+    for name in ("id", "group", "split", *asked):
+        if name not in table.column_names:
+            raise unknown("column", name, table.column_names)
+    for name in ("id", "group", "split", "touch_group", *labels):
+        if name in table.column_names and table.column(name).null_count:
+            row = _first(table.column(name).is_null().to_numpy())
+            raise ValueError(f"column {name} is empty in row {row}: every row needs one")
+    for name in (f"has_{modality}" for modality in spec.modalities):
+        if name in table.column_names and (table.column(name).null_count or table.column(name).type != pa.bool_()):
+            raise ValueError(f"column {name} holds {table.column(name).type}: write true or false in every row")
+    for column in dict.fromkeys(("split", *(task.split for task in spec.all_tasks))):
+        if column not in table.column_names:
+            raise unknown("column", column, table.column_names)
+        for split in table.column(column).unique().to_pylist():
+            if split not in SPLITS:
+                raise unknown(column, str(split), SPLITS)
+    for name, num in labels.items():
+        _check_labels(table.column(name), name, num)
+    for name in controls:
+        _check_numbers(table.column(name), name, "a control needs a number in every row", np.isfinite)
+    for name in targets:
+        _check_numbers(table.column(name), name, "a value is a finite number, or NaN for none", _finite_or_nan)
+    _check_ids(table.column("id").to_pylist())
+
+
+def _first(bad: np.ndarray) -> int:
+    return int(np.flatnonzero(bad)[0])
+
+
+def _check_labels(column: pa.ChunkedArray, name: str, num: int) -> None:
+    if not pa.types.is_integer(column.type):
+        raise ValueError(
+            f"column {name} holds {column.type}: a label is a whole number, 0 to {num - 1}, or -1 for none"
+        )
+    values = column.to_numpy()
+    if (bad := (values < -1) | (values >= num)).any():
+        row = _first(bad)
+        raise ValueError(f"{name} is {values[row]} in row {row}: give 0 to {num - 1}, or -1 for none")
+
+
+def _finite_or_nan(values: np.ndarray) -> np.ndarray:
+    return ~np.isinf(values)
+
+
+def _check_numbers(column: pa.ChunkedArray, name: str, need: str, allowed: Callable[[np.ndarray], np.ndarray]) -> None:
+    kind = column.type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+        raise ValueError(f"column {name} holds {kind}: {need}")
+    values = column.to_numpy(zero_copy_only=False).astype(float)
+    if (bad := ~allowed(values)).any():
+        raise ValueError(f"column {name} is {values[_first(bad)]} in row {_first(bad)}: {need}")
+
+
+def _check_ids(ids: list[Any]) -> None:
+    seen: set[Any] = set()
+    for one in ids:
+        if one in seen:
+            raise ValueError(f"id {one!r} occurs twice: give every sample its own")
+        seen.add(one)

@@ -1,0 +1,154 @@
+"""Test rows that a model was trained on: what a run learned from is kept beside it, and compared with what is scored.
+
+    <run>/trained_on.safetensors    for each source i: <i>.ids and <i>.groups, sorted hashes (uint64) of the ids and groups
+                                    of the rows trained on; its name in the header
+
+A run has one source, its own training rows. A run that starts from another's weights would add that run's sources.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from mvitac.data.pack import Pack
+from mvitac.data.windows import windowed
+from mvitac.datasets.pack import PackConfig
+from mvitac.run import Run
+from mvitac.system.files import brief, write_atomic
+
+FILE = "trained_on.safetensors"
+UNKNOWN = "unknown"
+"""A leak that cannot be checked, because nothing says what the run was trained on."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Rows of a dataset that a model learned from."""
+
+    name: str
+    """Name of the dataset."""
+    ids: np.ndarray
+    """uint64, sorted: hashes of the rows' ids."""
+    groups: np.ndarray
+    """uint64, sorted: hashes of the rows' groups."""
+
+
+def source_of(pack: Pack, rows: np.ndarray) -> Source:
+    """The source that pack ``rows`` are."""
+    return Source(pack.spec.name, *(np.unique(found[rows]) for found in _hashes(pack)))
+
+
+def write_sources(folder: Path, sources: Sequence[Source]) -> None:
+    """Write what the run in ``folder`` learns from."""
+    arrays = {f"{i}.{key}": getattr(source, key) for i, source in enumerate(sources) for key in ("ids", "groups")}
+    data = safetensors.numpy.save(arrays, metadata={str(i): source.name for i, source in enumerate(sources)})
+    write_atomic(folder / FILE, lambda file: file.write(data))
+
+
+def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list[Source] | None:
+    """What the run in ``folder`` learned from.
+
+    Runs of version 0.1.0 have no such file. Their rows are computed from their data if it is ``pack`` or is still there.
+
+    Args:
+        folder: Folder of the run.
+        run: Its settings.
+        digest: Digest of the pack it was trained on, from run.json.
+        pack: The data to score, which may be the same.
+
+    Returns:
+        The sources, or None if they are not known.
+    """
+    if (folder / FILE).exists():
+        try:
+            with safetensors.safe_open(folder / FILE, framework="numpy") as file:
+                names = file.metadata()
+                return [
+                    Source(names[i], *(file.get_tensor(f"{i}.{k}") for k in ("ids", "groups")))
+                    for i in sorted(names, key=int)
+                ]
+        except Exception as error:  # safetensors raises several types for damaged files
+            raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
+    own = pack if pack.digest == digest else _own_pack(folder, run)
+    if own is None or own.digest != digest:
+        return None
+    return [source_of(own, run.method.training_rows(own))]
+
+
+def _own_pack(folder: Path, run: Run) -> Pack | None:
+    """The pack that a run was trained on, if it is on disk. Published artifacts name paths of other machines: None."""
+    if not (folder / "log.jsonl").exists():
+        return None
+    try:
+        place = run.data.path if isinstance(run.data, PackConfig) else run.data.place()
+        return windowed(Pack(place, verify=False), run.data.frame_window())
+    except (ValueError, OSError):
+        return None
+
+
+class Scored:
+    """The rows of a pack that are scored, to be compared with what models learned from."""
+
+    def __init__(self, pack: Pack) -> None:
+        self.pack, (self._ids, self._groups) = pack, _hashes(pack)
+
+    def leak(self, sources: Sequence[Source] | None, rows: np.ndarray) -> str:
+        """Say which of the test ``rows``, and how many of their groups, are in ``sources``; "" if none is."""
+        if sources is None:
+            return UNKNOWN
+        found = []
+        for source in sources:
+            groups = np.unique(self._groups[rows])
+            num_rows, num_groups = (
+                int(np.isin(a, b).sum()) for a, b in ((self._ids[rows], source.ids), (groups, source.groups))
+            )
+            if num_rows or num_groups:
+                by = self.pack.spec.group_by
+                found.append(
+                    f"{num_rows} of {len(rows)} test rows and {num_groups} of {len(groups)} test {by}s were trained on"
+                    f" ({source.name})"
+                )
+        return "; ".join(found)
+
+
+def leak_mark(leak: str) -> str:
+    """What stands beside a score whose test rows, or their groups, were trained on."""
+    return {"": "", UNKNOWN: " LEAK?"}.get(leak, " LEAK")
+
+
+def leaks_of(records: Sequence[dict[str, Any]]) -> list[str]:
+    """One line for each source of ``records`` with a leak, or of which it is not known."""
+    lines: dict[str, None] = {}
+    for record in records:
+        if record.get("leak") == UNKNOWN:
+            lines[f"{record['source']}: what it was trained on is unknown, so leaks cannot be excluded"] = None
+        elif record.get("leak"):
+            lines[f"{record['source']}, {record.get('task') or 'retrieval'}: {record['leak']}"] = None
+    return list(lines)
+
+
+def _hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
+    """uint64 [N] hashes of the ids and of the groups of all rows.
+
+    Numbers, and groups that are single rows, mean nothing outside their dataset: its name is part of them.
+    """
+    name = pack.spec.name.split(" (")[0]
+    ids, groups = pack.own_ids, pack.column("group").astype(str)
+    weak = pack.spec.group_by == "row"
+    return _hash(ids, name, False), _hash(groups, name, weak)
+
+
+def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:
+    unique, inverse = np.unique(texts, return_inverse=True)
+    named = (f"{name}/{text}" if weak or text.isdigit() else text for text in unique.tolist())
+    return np.array([int.from_bytes(hashlib.blake2b(t.encode(), digest_size=8).digest()) for t in named], np.uint64)[
+        inverse
+    ]

@@ -1,0 +1,171 @@
+"""What a run was trained on is compared with what is scored: refused, or LEAK beside every score."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.deploy.publish import publish
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.leaks import FILE, Scored, leaks_of, read_sources, source_of, write_sources
+from mvitac.evaluation.scores import pool, summarise, with_interval
+from mvitac.report.report import write_report
+from mvitac.report.tables import unseen_groups
+from mvitac.run import load_run
+from mvitac.system.files import read_json
+from support.toy import Toy
+from support.training_runs import smoke
+
+ALL = "72 of 72 test rows and 36 of 36 test instances were trained on (toy)"
+
+
+@dataclass
+class Turned(Toy):
+    """The same samples with train and test the other way round."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        turned = {"train": "test", "test": "train"}
+        return [replace(sample, columns={**sample.columns, "split": turned.get(s := sample.columns["split"], s)})]
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Turned(), tmp_path_factory.mktemp("turned") / "pack", size=32, quiet=True)
+
+
+@pytest.fixture
+def run(smoke_run: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(smoke_run, tmp_path / "run")
+
+
+def test_scores_of_rows_that_were_trained_on_are_refused(
+    run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["probe", str(run), "--on", str(turned.path), "--json", str(tmp_path / "x.json")]) == 2
+    error = capsys.readouterr().err
+    assert ALL in error and "--allow-leak" in error and "'pattern'" in error and error.count("\n") == 1
+    assert not (run / "probe.json").exists() and not (tmp_path / "x.json").exists()
+    assert main(["publish", str(run), str(tmp_path / "art"), "--on", str(turned.path)]) == 2
+    assert ALL in capsys.readouterr().err and not (tmp_path / "art").exists()
+
+
+def test_leak_stands_beside_every_score(
+    run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the terminal, JSON, the report and the card; not beside controls, which learned nothing from those rows."""
+    file = tmp_path / "x.json"
+    assert main(["probe", str(run), "--on", str(turned.path), "--allow-leak", "--json", str(file)]) == 0
+    shown = capsys.readouterr().out
+    lines = [line for line in shown.splitlines() if "LEAK" in line and "LEAK:" not in line]
+    # 2 tasks of 3 inputs, then 2 directions of retrieval at R@1, R@5 and R@10
+    assert [line.count("LEAK") for line in lines] == [3, 3, 3, 3] and shown.count("LEAK: mvitac, ") == 3
+    assert max(map(len, shown.splitlines()[:-1])) <= 80 and "untrained" in shown
+    assert ALL in " ".join(shown.split()) and "retrieval over test instances" in shown and "unseen" not in shown
+    result = read_json(file, "scores")
+    for record in [*result["records"], *result["retrieval"]]:
+        assert record.get("leak", "") == (ALL if record["source"] == "mvitac" else ""), record["source"]
+    assert result["summary"]["pattern"]["touch"]["mvitac"]["leak"] == ALL
+    assert "leak" not in result["summary"]["pattern"]["touch"]["untrained"]
+    assert {r["leak"] for r in read_json(run / "probe.json", "scores")["records"] if "run" in r} == {ALL}
+    page = write_report([run], tmp_path / "report", result=result, pack=turned, quiet=True).read_text()
+    assert page.count(" LEAK") >= 4 + 6 + 6 and "scored on test instances" in page and "unseen" not in page
+    card = (publish(run, tmp_path / "art", turned, allow_leak=True) / "README.md").read_text()
+    lines = [line for line in card.splitlines() if line.startswith(("| pattern", "| bright"))]
+    assert len(lines) == 6 and all(" LEAK |" in line for line in lines)
+    assert ALL in card and "neither encoders nor probes saw" not in card
+    assert (tmp_path / "art" / FILE).read_bytes() == (run / FILE).read_bytes()
+
+
+def test_unseen_test_rows_have_no_leak(run: Path, pack: Pack, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["probe", str(run), "--on", str(pack.path), "--no-controls"]) == 0
+    shown = capsys.readouterr().out
+    assert "LEAK" not in shown and "retrieval over unseen instances" in shown
+    assert {r["leak"] for r in read_json(run / "probe.json", "scores")["records"]} == {""}
+
+
+def test_runs_without_a_list_are_compared_by_their_pack_or_unknown(
+    run: Path, pack: Pack, turned: Pack, tmp_path: Path
+) -> None:
+    """Version 0.1.0 kept no list of the rows."""
+    settings, record = load_run(run)
+    kept = read_sources(run, settings, record["pack"], turned)
+    (run / FILE).unlink()
+    for scored in (pack, turned):  # its own data, and data that its own is compared with
+        found = read_sources(run, settings, record["pack"], scored)
+        assert found and kept and found[0].name == kept[0].name == "toy"
+        assert all((getattr(found[0], k) == getattr(kept[0], k)).all() for k in ("ids", "groups"))
+    assert len(found[0].ids) == len(pack.rows("train", "unlabelled"))
+    gone = replace(settings, data=replace(settings.data, path=tmp_path / "gone"))
+    assert read_sources(run, gone, record["pack"], turned) is None
+    assert read_sources(run, settings, "another", turned) is None
+    record["run"]["data"]["path"] = str(tmp_path / "gone")
+    (run / "run.json").write_text(json.dumps(record))
+    # The model's own header still names the pack; without it on disk nothing is known.
+    (run / "log.jsonl").unlink()
+    result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False), turned)
+    assert {r["leak"] for r in result["records"]} == {"unknown"} and "unknown" in result["leaks"][0]
+    assert with_interval(0.5, 0.4, 0.6, "unknown") == "50.0 [40.0, 60.0] LEAK?"
+
+
+def test_a_damaged_list_is_told(run: Path, pack: Pack, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / FILE).write_bytes(b"no tensors")
+    assert main(["probe", str(run), "--on", str(pack.path)]) == 2
+    assert f"{FILE} is damaged" in capsys.readouterr().err
+
+
+def test_groups_leak_where_no_row_does(pack: Pack) -> None:
+    first, second = (pack.rows("train")[i::2] for i in range(2))
+    assert Scored(pack).leak([source_of(pack, first)], second) == (
+        f"0 of {len(second)} test rows and {len(np.unique(pack.column('group')[second]))} of"
+        f" {len(np.unique(pack.column('group')[second]))} test instances were trained on (toy)"
+    )
+
+
+def test_every_source_of_a_run_counts(pack: Pack, tmp_path: Path) -> None:
+    """A run may have several: its own rows, and those of a run whose weights it started from."""
+    settings = smoke(pack)
+    own, other = source_of(pack, pack.rows("train")), replace(source_of(pack, pack.rows("test")), name="before")
+    write_sources(tmp_path, [own, other])
+    read = read_sources(tmp_path, settings, None, pack)
+    assert read and [source.name for source in read] == ["toy", "before"]
+    leak = Scored(pack).leak(read, pack.rows("test"))
+    assert leak.endswith("were trained on (before)") and "(toy)" not in leak
+    assert leaks_of([{"source": "a", "task": "t", "leak": leak}] * 2) == [f"a, t: {leak}"]
+
+
+def test_numbers_mean_nothing_outside_their_dataset(pack: Pack) -> None:
+    """Ids of the striped pairs are numbers; those of its groups are names."""
+    elsewhere = Pack(pack.path)
+    elsewhere.spec = replace(pack.spec, name="other")
+    leak = Scored(elsewhere).leak([source_of(pack, pack.rows("train"))], pack.rows("train"))
+    assert leak.startswith(f"0 of {len(pack.rows('train'))} test rows and ")
+    again = Pack(pack.path)
+    again.spec = replace(pack.spec, name="toy (another split)")
+    assert Scored(again).leak([source_of(pack, pack.rows("train"))], pack.rows("train")).startswith("72 of 72 test")
+
+
+def test_rows_of_two_joined_packs_keep_their_ids(pack: Pack, turned: Pack) -> None:
+    joined = JoinedPack(pack, pack)
+    assert (joined.own_ids == np.tile(pack.column("id"), 2)).all()
+    assert Scored(joined).leak([source_of(pack, pack.rows("train"))], joined.rows("test")) == ""
+
+
+def test_summaries_and_folds_keep_the_leak() -> None:
+    record = {"source": "a", "seed": 0, "task": "t", "modality": "touch", "probe": "linear", "num_test": 2}
+    record |= {"group_sizes": [1, 1], "group_correct": [1, 0], "confusion": [[1, 0], [1, 0]]}
+    record |= {"balanced_accuracy": None, "macro_f1": None, "auroc": None}
+    (pooled,) = pool([[{**record, "leak": ""}], [{**record, "leak": "seen"}]])
+    assert pooled["leak"] == "seen" and "leak" not in pool([[record], [record]])[0]
+    assert summarise([pooled])["t"]["touch"]["a"]["leak"] == "seen"
+    assert unseen_groups("object", [pooled]) == "test objects" and unseen_groups("object", [record]) == "unseen objects"
