@@ -11,6 +11,7 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
+from mvitac.data.image_grid import pair
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
@@ -48,14 +49,17 @@ def test_pixels_lie_where_they_should(tmp_path: Path, touch_channels: int) -> No
     pack = build(Toy(touch_channels=touch_channels), tmp_path / "p", size=32, quiet=True)
     found, num_all = contact_sheet.strips(pack, num=3)
     picture = np.asarray(contact_sheet.to_image(pack, found, num_all, side=32))
-    wide = 32 * (1 + touch_channels // 3) + contact_sheet.GAP
-    for line, strip in enumerate(found):
-        top = contact_sheet.LINE + 4 + line * (32 + contact_sheet.LINE + contact_sheet.GAP) + contact_sheet.LINE
-        for place, row in enumerate(strip.rows):
-            left = contact_sheet.GAP + place * wide
-            sensors = [pack.images["vision"][row], *np.split(pack.images["touch"][row], touch_channels // 3, axis=2)]
-            for k, image in enumerate(sensors):
-                assert (picture[top : top + 32, left + 32 * k : left + 32 * (k + 1)] == image).all()
+    positions = np.lib.stride_tricks.sliding_window_view(picture, (32, 32, 3))[:, :, 0]
+    places = []
+    for strip in found:
+        for row in strip.rows:
+            images = [pack.images["vision"][row], *np.split(pack.images["touch"][row], touch_channels // 3, axis=2)]
+            there = [np.argwhere((positions == image).all((2, 3, 4))).tolist() for image in images]
+            assert all(len(hits) == 1 for hits in there)
+            (top, left), *others = (hits[0] for hits in there)
+            assert others == [[top, left + 32 * k] for k in range(1, len(images))]
+            places.append((top, left))
+    assert places == sorted(places) and len({top for top, _ in places}) == 3  # a line per class
 
 
 @dataclass
@@ -68,7 +72,7 @@ class Holes(Toy):
 
 def test_a_gap_is_crossed_out(tmp_path: Path) -> None:
     pack = build(Holes(), tmp_path / "p", size=32, quiet=True)
-    gap, whole = (np.asarray(contact_sheet.pair(pack, row, 32))[:, 32:] for row in (4, 5))
+    gap, whole = (pair(pack, row, 32)[:, 32:] for row in (4, 5))
     assert (gap[1, 15] == 225).all() and (gap[16, 16] < 200).all()
     assert (whole == pack.images["touch"][5]).all()
 
