@@ -36,7 +36,8 @@ canvas:focus-visible, button:focus-visible { outline: 3px solid #4fb0e2; outline
 .tip img { width: 112px; height: 112px; object-fit: contain; image-rendering: pixelated; display: inline; }
 .legend { max-height: 14em; overflow-y: auto; margin-top: 4px; }
 .legend button { margin: 2px 2px 2px 0; padding: 2px 8px 2px 4px; font-size: 13px; font-weight: 400;
-                 color: var(--body-text-color); border: 1px solid transparent; border-radius: 4px; background: none; cursor: pointer; opacity: .7; }
+                 color: var(--body-text-color); border: 1px solid transparent; border-radius: 4px;
+                 background: none; cursor: pointer; opacity: .7; }
 .legend button[aria-pressed=true] { border-color: var(--border-color-primary); opacity: 1; }
 .legend i { display: inline-block; width: 10px; height: 10px; margin-right: 5px; }
 .count { font-size: 12px; opacity: .7; }
