@@ -262,11 +262,12 @@ def test_the_page_in_a_browser(
 
 def check_marks(browser: Browser, land: ExplorerData, row: int) -> None:
     """Every neighbour says whether it has the class of the clicked point, below its image and not over it."""
+    labels = land.labels["pattern"]
     marks = (
         "[...document.querySelectorAll('.found')].map((f) => [...f.querySelectorAll('b')].map((b) => b.textContent))"
     )
     expected = [
-        ["✓ same pattern" if land.same_class(row, i, "pattern") else "✕ other pattern" for i, _ in found]
+        [f"{'✓' if labels[i] == labels[row] else '✕'} {land.classes['pattern'][labels[i]]}" for i, _ in found]
         for found in (land.neighbours(land.x[m][row : row + 1], m, 6, without=row) for m in land.x)
     ]
     assert browser.run(marks) == expected and {"✓", "✕"} >= {mark[0] for found in expected for mark in found}

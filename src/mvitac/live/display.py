@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageOps
 
 from mvitac.data.image_grid import font
+from mvitac.data.spec import task_title
 from mvitac.live.predictor import Live
 from mvitac.system.files import brief
 
@@ -42,7 +43,8 @@ def draw(loop: Live) -> np.ndarray:
     for row, (task, (name, confidence)) in enumerate(answers.items()):
         top, sure = SIDE + LINE * (1 + row), confidence >= loop.config.min_confidence
         pen.rectangle((width // 2, top + 5, width // 2 + round(confidence * (width // 2 - 60)), top + LINE - 5), FAINT)
-        pen.text((EDGE, top + 3), f"{task}: {name}{'' if sure else ' (unsure)'}", TEXT if sure else FAINT, face)
+        answer = f"{task_title(task, loop.engine.classes[task])}: {name}{'' if sure else ' (unsure)'}"
+        pen.text((EDGE, top + 3), answer, TEXT if sure else FAINT, face)
         pen.text((width - 50, top + 3), f"{100 * confidence:.0f} %", TEXT if sure else FAINT, face)
     if touch and touch.known:
         pen.text((EDGE, picture.height - LINE + 3), "like: " + "; ".join(touch.known), TEXT, face)

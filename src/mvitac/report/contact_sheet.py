@@ -14,6 +14,7 @@ from PIL import Image
 
 from mvitac.data.image_grid import Block, Tile, contents, draw, pair
 from mvitac.data.pack import SPLITS, Pack
+from mvitac.data.spec import task_title
 from mvitac.registry import unknown
 
 TASK = "label_"
@@ -108,7 +109,7 @@ def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128
     names = {name: pack.column(name).astype(str) for name in ("id", "group", "split")}
 
     def caption(row: int) -> str:
-        labels = [f"{t}: {classes[v[row]]}" for t, (classes, v) in tasks.items() if v[row] >= 0]
+        labels = [f"{task_title(t, classes)}: {classes[v[row]]}" for t, (classes, v) in tasks.items() if v[row] >= 0]
         return "; ".join([*(found[row] for found in names.values()), *labels])
 
     sections = []

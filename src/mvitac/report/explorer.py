@@ -13,6 +13,7 @@ import gradio as gr
 import numpy as np
 from gradio.themes import Base
 
+from mvitac.data.spec import task_title
 from mvitac.report import html
 from mvitac.report.explorer_data import ExplorerData
 from mvitac.report.palette import colour
@@ -130,8 +131,10 @@ def _on_click(land: ExplorerData) -> Callable[[gr.EventData], list[Any]]:
 
     def click(task: str | None, event: gr.EventData) -> list[str]:
         i = int(event.row)
+        title = task_title(task, land.classes[task]) if task else ""
+        legend = f"; ✓ same {title}, ✕ another" if task and land.labels[task][i] >= 0 else ""
         lists = [
-            _found(land, f"nearest by {m}", land.neighbours(x[i : i + 1], m, K, without=i), m, i, task)
+            _found(land, f"nearest by {m}" + legend, land.neighbours(x[i : i + 1], m, K, without=i), m, i, task)
             for m, x in land.x.items()
         ]
         return [f"**{land.describe(i)}**", *lists]
@@ -147,11 +150,13 @@ def _found(
     asked: int | None = None,
     task: str | None = None,
 ) -> str:
-    """Similar rows as HTML. Each is marked whether it has the class of row ``asked`` in ``task``, if there is one."""
+    """Similar rows as HTML. Each is marked by its class in ``task``, and whether that is the class of row ``asked``."""
     cells = []
     for i, score in pairs:
         same = None if asked is None else land.same_class(asked, i, task)
-        css, mark = {None: ("", ""), True: ("right", f"✓ same {task}"), False: ("wrong", f"✕ other {task}")}[same]
+        css, mark = {None: ("", ""), True: ("right", "✓"), False: ("wrong", "✕")}[same]
+        if task and mark:
+            mark += f" {land.classes[task][land.labels[task][i]]}"
         image = html.picture(land.picture(i, modality), f"{modality} of {land.name(i)}", 224)
         cells.append(html.cell(css, image, mark, f"{land.name(i)} · {score:.2f}"))
     return f'<h4>{escape(title)}</h4><div class="found">{"".join(cells)}</div>'
@@ -179,7 +184,9 @@ def _query(land: ExplorerData, image: np.ndarray | None, modality: str) -> tuple
     lines = []
     for name, probabilities in answers.items():
         best = sorted(probabilities.items(), key=lambda item: -item[1])[:3]
-        lines.append(f"- **{name}**: " + ", ".join(f"{c} {100 * p:.0f} %" for c, p in best))
+        lines.append(
+            f"- **{task_title(name, tuple(probabilities))}**: " + ", ".join(f"{c} {100 * p:.0f} %" for c, p in best)
+        )
     found = _found(land, "most similar", pairs, modality)
     return "\n".join(lines) or "This run has no labels to classify by.", found
 
