@@ -73,7 +73,7 @@ def main() -> None:
         shown = [pictures[CLASSES.index(SHOWN)].repeat(ZOOM, axis=0).repeat(ZOOM, axis=1) for pictures in (*made, true)]
         blocks.append(Block(name, [Tile(picture) for picture in shown]))
     if options.picture:
-        title = f"{SHOWN} pressed into each simulated sensor; the mirrored touch is the true one"
+        title = f"One {SHOWN} in every simulated sensor. Right: the simulator pressed the mirrored object"
         draw(title, blocks, heads=COLUMNS).save(options.picture, optimize=True)
 
 
