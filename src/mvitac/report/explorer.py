@@ -126,7 +126,7 @@ def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
         )
 
 
-def _on_click(land: ExplorerData) -> Callable[[gr.EventData], list[Any]]:
+def _on_click(land: ExplorerData) -> Callable[[str | None, gr.EventData], list[Any]]:
     """A handler that shows the neighbours of the clicked point by each modality."""
 
     def click(task: str | None, event: gr.EventData) -> list[str]:
