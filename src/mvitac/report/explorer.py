@@ -92,11 +92,13 @@ def _controls(land: ExplorerData) -> list[Any]:
     tasks, splits = list(land.classes), ["all", *sorted(set(land.split))]
     with gr.Row():
         return [
-            gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of"),
-            gr.Dropdown(["label", "error", "split"], value="label" if tasks else "split", label="colour by"),
-            gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task"),
-            gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split"),
-            gr.Checkbox(False, label="mistakes only"),
+            gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of", min_width=120),
+            gr.Dropdown(
+                ["label", "error", "split"], value="label" if tasks else "split", label="colour by", min_width=120
+            ),
+            gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task", min_width=120),
+            gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split", min_width=120),
+            gr.Checkbox(False, label="mistakes only", min_width=120),
         ]
 
 

@@ -212,6 +212,6 @@ canvas.addEventListener("wheel", (e) => {
 }, { passive: false });
 function reset() { view = { x: 0, y: 0, zoom: 1 }; hide(); }
 canvas.addEventListener("dblclick", reset);
-new ResizeObserver(draw).observe(canvas);
+new ResizeObserver(hide).observe(canvas);
 watch("value", load);
 load();
