@@ -47,8 +47,11 @@ docs: .venv/ready  ## build the documentation in site/ (open site/index.html); w
 notebooks: .venv/ready  ## generate the notebooks of the tutorials from their pages
 	$(BIN)/jupytext --quiet --update --to ipynb docs/tutorials/[!i]*.md
 
-pictures: .venv/ready  ## generate the picture of the simulator in the documentation
-	$(BIN)/mvitac data sheet materials --out docs/materials.png
+pictures: .venv/ready  ## draw the pictures of the simulators in the documentation
+	$(BIN)/mvitac data sheet materials --side 56 --out docs/materials.png
+	$(BIN)/mvitac data sheet grasps --side 56 --out docs/grasps.png
+	$(BIN)/python -c 'from PIL import Image; [Image.open(f).quantize(256, kmeans=2).save(f, optimize=True) \
+	  for f in ("docs/materials.png", "docs/grasps.png")]'
 
 clean:
 	rm -rf .venv build dist site .pytest_cache .ruff_cache

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
 
+from mvitac.data.image_grid import Block, Tile, draw
 from mvitac.data.pack import Pack
 from mvitac.sim.gel import press, render
 from mvitac.sim.materials import CLASSES, draw_instance
@@ -48,7 +48,7 @@ def main() -> None:
     pack = Pack(options.pack)
     mirror, sensors = GelMirror(pack, torch.device("cpu")), pack.column("sensor").astype(str)
     imprints = [imprint(options.world, category, 2 * pack.size) for category in range(len(CLASSES))]
-    lines = []
+    blocks = []
     print("| sensor | no flip | plain flip | colour flip | gain, smallest to largest |\n|---|---:|---:|---:|---:|")
     for name in sorted(set(sensors)):
         clean = replace(SENSORS[name], marker_pitch_mm=0, dirt=0, scratches=0, noise=0)
@@ -70,14 +70,11 @@ def main() -> None:
         ratio = plain / colour
         means = " | ".join(f"{errors.mean():.1f}" for errors in (none, plain, colour))
         print(f"| {name} | {means} | {ratio.min():.1f} to {ratio.max():.1f} |")
-        lines.append(np.concatenate([picture[CLASSES.index(SHOWN)] for picture in (*made, true)], axis=1))
+        shown = [pictures[CLASSES.index(SHOWN)].repeat(ZOOM, axis=0).repeat(ZOOM, axis=1) for pictures in (*made, true)]
+        blocks.append(Block(name, [Tile(picture) for picture in shown]))
     if options.picture:
-        sheet = np.concatenate(lines).repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
-        whole = Image.new("RGB", (sheet.shape[1], sheet.shape[0] + 14), "white")
-        whole.paste(Image.fromarray(sheet), (0, 14))
-        for i, words in enumerate(COLUMNS):
-            ImageDraw.Draw(whole).text((i * ZOOM * pack.size + 2, 1), words, fill="black")
-        whole.save(options.picture, optimize=True)
+        title = f"One {SHOWN} in every simulated sensor. Right: the simulator pressed the mirrored object"
+        draw(title, blocks, heads=COLUMNS).save(options.picture, optimize=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from PIL import Image
 
 import mvitac
 from mvitac.cli.main import main
+from mvitac.data.images import fit
 from mvitac.data.pack import Pack
 from mvitac.deploy.search import Index, build, nearest
 from mvitac.model import Model
@@ -91,7 +92,12 @@ def test_find_command_draws_what_it_found(
     shown = capsys.readouterr().out
     assert "1.000" in shown and pack.column("id")[11] in shown
     with Image.open(tmp_path / "found.png") as sheet:
-        assert sheet.size == (640, 160)
+        pixels = np.asarray(sheet)
+    asked = fit(pack.images["touch"][11], 160)
+    corners = np.argwhere((pixels[:-159, :-159] == asked[0, 0]).all(2))
+    there = [(pixels[y : y + 160, x : x + 160] == asked).all() for y, x in corners]
+    assert sum(there) == 2  # the query, and the row that it is
+    assert pixels.shape[1] < 4 * 180 and pixels.shape[0] > 160 + 2 * 17  # one line, with captions
     (tmp_path / "bad.png").write_text("no picture")
     assert main(["find", str(tmp_path / "bad.png"), "--in", str(index)]) == 2
     assert "cannot be read as a picture" in capsys.readouterr().err

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
+import re
 import shutil
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +19,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from mvitac.cli.live import _engine, sources, view
+from mvitac.cli.live import _engine, _print_touch, _run, sources, view
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
@@ -626,3 +629,43 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
     assert main([*command, "--json", str(tmp_path)]) == 2 and "is a folder" in capsys.readouterr().err
     for wrong in (["--stale", "0"], ["--seconds", "-1"]):
         assert main([*command, *wrong]) == 2 and "more than 0" in capsys.readouterr().err
+
+
+# -- the terminal -------------------------------------------------------------------------------------------------------
+
+
+def touched(known: list[str]) -> SimpleNamespace:
+    """A loop whose first touch has ended, with answers to two tasks."""
+    touch = SimpleNamespace(number=1, start=0.0, end=2.1, known=known)
+    answers = {"category": ("rubber", 0.23), "soft": ("soft", 0.8149)}
+    return SimpleNamespace(
+        last=touch,
+        answers=lambda touch: answers,
+        config=LiveConfig(),
+        engine=SimpleNamespace(classes={"category": ("rubber", "knit", "cloth"), "soft": ("hard", "soft")}),
+    )
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_touch_is_told_without_breaking_a_word(terminal: bool) -> None:
+    console = Console(width=80, force_terminal=terminal, file=io.StringIO(), color_system=None)
+    known = ["14-0007-02 (leaf, soft, rough)", "06-0007-01 (tile, hard, rough)", "10-0002-04 (laminate, soft)"]
+    assert _print_touch(touched(known), console, 0) == 1  # type: ignore[arg-type]
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    told = "touch 1 (2.1 s): category: rubber (23 %, unsure); hard/soft: soft (81 %); like: " + "; ".join(known)
+    assert " ".join(line.rstrip() for line in lines) == told
+    assert max(map(len, lines)) <= 80 if terminal else len(lines) == 1
+
+
+def test_a_low_terminal_is_left_clean(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is drawn that is higher than the terminal: what scrolls out of it cannot be erased."""
+    idle = {"ended": True, "fault": "", "num_frames": 0, "num_dropped": 0, "rate": lambda: 0.0}
+    loop = touched([])
+    loop.all = [SimpleNamespace(name=f"touch {i}", **idle) for i in range(12)]
+    loop.streams, loop.touch, loop.last, loop.answers = {}, None, None, lambda touch: {}
+    loop.state, loop.summary, loop.finish = lambda s: "waiting", lambda: {"age_ms": {"p50": None}}, lambda: None
+    monkeypatch.setattr("mvitac.cli.live._capture", lambda *a: contextlib.nullcontext(threading.Event()))
+    console = Console(width=80, height=6, force_terminal=True, file=io.StringIO())
+    _run(loop, console, None, None)  # type: ignore[arg-type]
+    drawn = re.split(r"\x1b\[\d*[AK]", console.file.getvalue())  # type: ignore[attr-defined]
+    assert "touch 3" in "".join(drawn) and max(part.count("\n") for part in drawn) < 6

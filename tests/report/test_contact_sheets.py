@@ -11,9 +11,12 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
+from mvitac.data.image_grid import Block, Tile, draw, font, pair, wrap
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
+from mvitac.report.simulated_sheet import materials_sheet
+from mvitac.sim.materials import touch
 from support.toy import Toy
 
 
@@ -43,19 +46,25 @@ def test_strips_by_column_and_split(pack: Pack) -> None:
             contact_sheet.strips(pack, **options)
 
 
+def places(picture: np.ndarray, image: np.ndarray) -> list[tuple[int, int]]:
+    """Where ``image`` is in ``picture``: (top, left)."""
+    height, width = image.shape[:2]
+    corners = np.argwhere((picture[: 1 - height, : 1 - width] == image[0, 0]).all(2)).tolist()
+    return [(y, x) for y, x in corners if np.array_equal(picture[y : y + height, x : x + width], image)]
+
+
 @pytest.mark.parametrize("touch_channels", [3, 6])
 def test_pixels_lie_where_they_should(tmp_path: Path, touch_channels: int) -> None:
     pack = build(Toy(touch_channels=touch_channels), tmp_path / "p", size=32, quiet=True)
     found, num_all = contact_sheet.strips(pack, num=3)
     picture = np.asarray(contact_sheet.to_image(pack, found, num_all, side=32))
-    wide = 32 * (1 + touch_channels // 3) + contact_sheet.GAP
-    for line, strip in enumerate(found):
-        top = contact_sheet.LINE + 4 + line * (32 + contact_sheet.LINE + contact_sheet.GAP) + contact_sheet.LINE
-        for place, row in enumerate(strip.rows):
-            left = contact_sheet.GAP + place * wide
-            sensors = [pack.images["vision"][row], *np.split(pack.images["touch"][row], touch_channels // 3, axis=2)]
-            for k, image in enumerate(sensors):
-                assert (picture[top : top + 32, left + 32 * k : left + 32 * (k + 1)] == image).all()
+    tops = []
+    for strip in found:
+        for row in strip.rows:
+            sensors = np.split(pack.images["touch"][row], touch_channels // 3, axis=2)
+            ((top, _),) = places(picture, np.concatenate([pack.images["vision"][row], *sensors], axis=1))
+            tops.append(top)
+    assert tops == sorted(tops) and len(set(tops)) == 3  # a line per class
 
 
 @dataclass
@@ -68,7 +77,7 @@ class Holes(Toy):
 
 def test_a_gap_is_crossed_out(tmp_path: Path) -> None:
     pack = build(Holes(), tmp_path / "p", size=32, quiet=True)
-    gap, whole = (np.asarray(contact_sheet.pair(pack, row, 32))[:, 32:] for row in (4, 5))
+    gap, whole = (pair(pack, row, 32)[:, 32:] for row in (4, 5))
     assert (gap[1, 15] == 225).all() and (gap[16, 16] < 200).all()
     assert (whole == pack.images["touch"][5]).all()
 
@@ -102,3 +111,31 @@ def test_mistakes_in_one_line(
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_text_is_broken_between_words_and_never_wider_than_its_room() -> None:
+    face = font(12)
+    text = "look: constant frames of object_0001/a-very-long-name-without-any-space-000123.png and others"
+    lines = wrap(text, 120, face)
+    assert max(map(face.getlength, lines)) <= 120 and len(lines) > 3
+    assert "".join(lines).replace(" ", "") == text.replace(" ", "")
+    assert lines[0] == "look: constant" and lines[-1].endswith("others")
+
+
+def test_a_grid_wraps_its_pictures_and_keeps_captions_below_them() -> None:
+    colours = np.random.default_rng(0).integers(0, 200, (8, 3), np.uint8)
+    tiles = [Tile(np.tile(colour, (40, 100, 1)), "one caption") for colour in colours]
+    picture = np.asarray(draw("title", [Block("heading", tiles)], width=640))
+    corners = [tuple(np.argwhere((picture == colour).all(2))[0]) for colour in colours]
+    tops, lefts = zip(*corners, strict=True)
+    assert picture.shape[1] <= 640 and sorted(set(tops)) == sorted(tops)[::4] and len(set(lefts)) == 4
+    for top, left in corners[4:]:  # the lower row
+        assert picture[top + 40 :, left : left + 100].min() < 100  # text
+
+
+def test_the_sheet_of_the_simulator_shows_every_class() -> None:
+    picture = np.asarray(materials_sheet(0, 16))
+    for category in (0, 7, 19):
+        made = touch(0, category, 2, 0, size=16)
+        expected = np.concatenate([made["vision"], made["touch"]], axis=1)
+        assert places(picture, expected)

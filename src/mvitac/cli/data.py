@@ -123,20 +123,23 @@ class _SheetOptions:
     """The picture (default: KIND.png here)."""
     seed: int = 0
     """World seed."""
+    side: int = 72
+    """Height of a picture in pixels."""
 
 
 def sheet(argv: list[str]) -> None:
     """mvitac data sheet materials|grasps [--out FILE.png]"""
     options = parse(_SheetOptions, argv, "data sheet")
-    from mvitac.sim import contact_sheet, grasps
+    from mvitac.report.simulated_sheet import grasps_sheet, materials_sheet
 
-    draw = {"materials": contact_sheet.contact_sheet, "grasps": grasps.contact_sheet}[options.kind]
+    draw = {"materials": materials_sheet, "grasps": grasps_sheet}[options.kind]
     out = options.out or Path(f"{options.kind}.png")
     if out.suffix.lower() != ".png":
         raise ValueError(f"--out {out}: the sheet is a PNG, give a name that ends in .png")
     if options.seed < 0:
         raise ValueError(f"--seed {options.seed}: give a number >= 0")
-    write_atomic(out, lambda file: draw(file, seed=options.seed))
+    picture = draw(options.seed, options.side)
+    write_atomic(out, lambda file: picture.save(file, "PNG"))
     print(out)
 
 

@@ -12,9 +12,9 @@ from rich.text import Text
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json, selectors, short
-from mvitac.data.checks.contact_sheet import draw
 from mvitac.data.checks.examine import examine_pack, examine_source
 from mvitac.data.checks.finding import exit_code
+from mvitac.data.image_grid import Block, draw
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
@@ -33,7 +33,7 @@ class _Options:
     json: Path | None = None
     """Also write every finding to this file; - = stdout, and the table to stderr."""
     sheet: Path | None = None
-    """Also draw the suspicious rows into this PNG."""
+    """Also draw the suspicious rows into this PNG, or a sample if there are none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,10 +72,10 @@ def check(argv: list[str]) -> int:
     data: Any = options.data
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
-    findings, strips = examine_source(
+    findings, blocks = examine_source(
         source, num=options.items, size=options.thumbnail, workers=data.workers, quiet=options.quiet
     )
-    return _report(name, findings, strips, options)
+    return _report(name, findings, blocks, options)
 
 
 def _check_places(options: _Options) -> None:
@@ -86,7 +86,7 @@ def _check_places(options: _Options) -> None:
         check_place(options.sheet)
 
 
-def _report(what: str, findings: Sequence[Any], strips: Any, options: _Options) -> int:
+def _report(what: str, findings: Sequence[Any], blocks: Sequence[Block], options: _Options) -> int:
     """Print the findings, write the files that ``options`` name, and return the exit code."""
     code = exit_code(findings)
     table = Table(title=f"{what}: {('ok', 'look', 'broken')[code]}", title_justify="left")
@@ -99,6 +99,6 @@ def _report(what: str, findings: Sequence[Any], strips: Any, options: _Options) 
     say.print(table)
     save_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
     if options.sheet:
-        write_atomic(options.sheet, lambda file: draw(file, strips))
+        write_atomic(options.sheet, lambda file: draw(what, blocks).save(file, format="PNG"))
         say.print(f"written: {options.sheet}", soft_wrap=True)
     return code

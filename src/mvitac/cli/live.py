@@ -16,6 +16,7 @@ from rich.text import Text
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse
+from mvitac.data.spec import task_title
 from mvitac.live.contact import LiveConfig
 from mvitac.system.files import write_json
 
@@ -130,7 +131,7 @@ def _loop(engine: "Engine", streams: dict[str, Any], config: LiveConfig, console
 
     # Printed above the picture, so that events stay in the scrollback and in a log file.
     def tell(event: Any) -> None:
-        console.print(event.text, style="yellow", soft_wrap=True, highlight=False, markup=False)
+        _say(console, event.text, "yellow")
 
     return Live(engine, streams, config, tell=tell, **options)
 
@@ -143,18 +144,22 @@ def _run(loop: "Live", console: Console, window: "Window | None", seconds: float
     printed, drawn = 0, 0.0
     with (
         _capture(loop, window, console) as news,
-        Screen(view(loop), console=console, auto_refresh=False, transient=True) as screen,
+        Screen(view(loop), console=console, auto_refresh=False, transient=True, vertical_overflow="crop") as screen,
     ):
-        while time.monotonic() < end and not all(s.ended for s in loop.all):
-            news.wait(0.05)
-            news.clear()
-            loop.tick()
-            printed = _print_touch(loop, console, printed)
-            if time.monotonic() - drawn > _REDRAW:
-                screen.update(view(loop), refresh=True)
-                if window and not window.show(draw(loop)):
-                    break
-                drawn = time.monotonic()
+        try:
+            while time.monotonic() < end and not all(s.ended for s in loop.all):
+                news.wait(0.05)
+                news.clear()
+                loop.tick()
+                printed = _print_touch(loop, console, printed)
+                if time.monotonic() - drawn > _REDRAW:
+                    screen.update(view(loop), refresh=True)
+                    if window and not window.show(draw(loop)):
+                        break
+                    drawn = time.monotonic()
+        finally:
+            # rich draws the last picture in full, and cannot erase what scrolls out of a low terminal.
+            screen.update(Text(), refresh=True)
     loop.finish()
     _print_touch(loop, console, printed)
 
@@ -242,17 +247,22 @@ def _print_touch(loop: "Live", console: Any, printed: int) -> int:
     touch = loop.last
     if touch is None or touch.number <= printed or touch.end is None:
         return printed
-    answers = ", ".join(_answer(loop, *item) for item in loop.answers(touch).items())
+    answers = "; ".join(_answer(loop, *item) for item in loop.answers(touch).items())
     like = f"; like: {'; '.join(touch.known)}" if touch.known else ""
     text = f"touch {touch.number} ({touch.end - touch.start:.1f} s): {answers}{like}"
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
+    _say(console, text)
     return touch.number
+
+
+def _say(console: Console, text: str, style: str = "") -> None:
+    """Print above the picture: broken between words on a terminal, in one line in a file."""
+    console.print(text, style=style, soft_wrap=not console.is_terminal, highlight=False, markup=False)
 
 
 def _answer(loop: "Live", task: str, answer: tuple[str, float]) -> str:
     name, confidence = answer
     sure = "" if confidence >= loop.config.min_confidence else ", unsure"
-    return f"{task} {name} ({100 * confidence:.0f} %{sure})"
+    return f"{task_title(task, loop.engine.classes[task])}: {name} ({100 * confidence:.0f} %{sure})"
 
 
 def view(loop: "Live") -> Any:
@@ -264,9 +274,13 @@ def view(loop: "Live") -> Any:
         state = f"{'CONTACT' if contact.touched else 'free   '} {bar}"
         lines.append(Text(f"{s.name:8} {'unknown' if s.fault else state}"))
     touch = loop.touch or loop.last
+    titles = {task: task_title(task, classes) for task, classes in loop.engine.classes.items()}
+    wide = max([10, *map(len, titles.values())])
     for task, (name, confidence) in loop.answers(touch).items():
         sure = "" if confidence >= loop.config.min_confidence else "  unsure"
-        lines.append(Text(f"{task:10} {name:18} {'#' * round(20 * confidence):20} {100 * confidence:3.0f} %{sure}"))
+        lines.append(
+            Text(f"{titles[task]:{wide}} {name:18} {'#' * round(20 * confidence):20} {100 * confidence:3.0f} %{sure}")
+        )
     if touch and touch.known:
         lines.append(Text("like: " + "; ".join(touch.known)))
     age = loop.summary()["age_ms"]

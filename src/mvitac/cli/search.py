@@ -6,7 +6,7 @@ What needs torch is imported after the options are parsed, so that --help is qui
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +18,10 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json
+from mvitac.data.image_grid import GAP, Block, Tile, draw, side_by_side
+from mvitac.data.images import fit
 from mvitac.data.pack import Pack
+from mvitac.report.palette import colour
 from mvitac.system.files import brief, check_place, write_atomic
 from mvitac.system.progress import shown
 
@@ -156,7 +159,7 @@ def find(argv: list[str]) -> None:
     console(options.json).print(table)
     save_json(options.json, {"from": options.source, "to": options.target, "found": found})
     if options.picture:
-        _draw(options.picture, query, index, options.target, [one["row"] for one in found])
+        _draw(options.picture, query, index, options, found)
 
 
 def _picture(files: Sequence[Path]) -> np.ndarray:
@@ -171,13 +174,16 @@ def _picture(files: Sequence[Path]) -> np.ndarray:
     return np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
 
 
-def _draw(out: Path, query: np.ndarray, index: "Index", target: str, rows: Sequence[int]) -> None:
-    """A PNG of the query and the ``target`` images in ``rows`` of the indexed pack, side by side."""
+def _draw(out: Path, query: np.ndarray, index: "Index", options: _FindOptions, found: Sequence[dict[str, Any]]) -> None:
+    """A PNG of the query and of what was ``found`` in the indexed pack, side by side."""
     pack = Pack(index.meta["pack"], verify=False)
     if pack.digest != index.meta["pack_digest"]:
         raise ValueError(f"{pack.path} is another pack than the one that was indexed: index it again")
-    sheet = Image.new("RGB", (_SIDE * (len(rows) + 1), _SIDE), "white")
-    for i, tile in enumerate([query, *(pack.images[target][row] for row in rows)]):
-        picture = Image.fromarray(np.ascontiguousarray(tile[..., :3])).resize((_SIDE - 4, _SIDE - 4))
-        sheet.paste(picture, (i * _SIDE, 2))
+    tiles = [Tile(side_by_side(fit(query, _SIDE)), f"query: {options.source}", colour("blue"))]
+    for number, one in enumerate(found, 1):
+        image = side_by_side(fit(np.asarray(pack.images[options.target][one["row"]]), _SIDE))
+        caption = f"{number}. cosine {one['cosine']:.2f}: {', '.join(one['labels'].values())}, {one['id']}"
+        tiles.append(Tile(image, caption))
+    title = f"The nearest {options.target} images to a {options.source} image"
+    sheet = draw(title, [Block("", tiles)], width=(len(tiles) + 1) * (_SIDE + GAP))
     write_atomic(out, lambda file: sheet.save(file, "PNG"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -24,6 +25,11 @@ class Task:
     """Column -> value that a row must have to belong to the task, e.g. {"phase": "during"} for grasp success."""
     split: str = "split"
     """Column with the split of this task, if it differs from that of pre-training."""
+
+
+def task_title(name: str, classes: Sequence[str]) -> str:
+    """The name of a task for people: "hard/soft" for a task "soft" of these two classes, otherwise the name itself."""
+    return "/".join(classes) if len(classes) == 2 and name in classes else name
 
 
 @dataclass(frozen=True, kw_only=True)

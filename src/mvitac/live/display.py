@@ -10,8 +10,10 @@ import sys
 from types import ModuleType
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont, ImageOps
+from PIL import Image, ImageDraw, ImageOps
 
+from mvitac.data.image_grid import font
+from mvitac.data.spec import task_title
 from mvitac.live.predictor import Live
 from mvitac.system.files import brief
 
@@ -27,7 +29,7 @@ def draw(loop: Live) -> np.ndarray:
     touch = loop.touch or loop.last
     answers = loop.answers(touch)
     picture = Image.new("RGB", (width, SIDE + LINE * (2 + len(loop.engine.classes))), BACK)
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(14)
+    pen, face = ImageDraw.Draw(picture), font(13)
     for i, stream in enumerate(loop.all):
         left, state = i * SIDE, loop.state(stream)
         touched = stream.name in loop.contacts and loop.contacts[stream.name].touched
@@ -37,14 +39,15 @@ def draw(loop: Live) -> np.ndarray:
             inner = (SIDE - 2 * EDGE, SIDE - 2 * EDGE)
             picture.paste(ImageOps.pad(Image.fromarray(newest.image), inner, color=BACK), (left + EDGE, EDGE))
         text = f"{stream.name}  {stream.rate():.0f} fps  {'CONTACT' if touched and not stream.fault else state}"
-        pen.text((left + EDGE, SIDE + 3), text, frame if stream.fault else TEXT, font)
+        pen.text((left + EDGE, SIDE + 3), text, frame if stream.fault else TEXT, face)
     for row, (task, (name, confidence)) in enumerate(answers.items()):
         top, sure = SIDE + LINE * (1 + row), confidence >= loop.config.min_confidence
         pen.rectangle((width // 2, top + 5, width // 2 + round(confidence * (width // 2 - 60)), top + LINE - 5), FAINT)
-        pen.text((EDGE, top + 3), f"{task}: {name}{'' if sure else ' (unsure)'}", TEXT if sure else FAINT, font)
-        pen.text((width - 50, top + 3), f"{100 * confidence:.0f} %", TEXT if sure else FAINT, font)
+        answer = f"{task_title(task, loop.engine.classes[task])}: {name}{'' if sure else ' (unsure)'}"
+        pen.text((EDGE, top + 3), answer, TEXT if sure else FAINT, face)
+        pen.text((width - 50, top + 3), f"{100 * confidence:.0f} %", TEXT if sure else FAINT, face)
     if touch and touch.known:
-        pen.text((EDGE, picture.height - LINE + 3), "like: " + "; ".join(touch.known), TEXT, font)
+        pen.text((EDGE, picture.height - LINE + 3), "like: " + "; ".join(touch.known), TEXT, face)
     return np.asarray(picture)
 
 

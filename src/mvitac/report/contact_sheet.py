@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
+from mvitac.data.image_grid import Block, Tile, contents, draw, pair
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
+from mvitac.data.spec import task_title
 from mvitac.registry import unknown
 
-GAP, LINE = 6, 22
-"""Pixels between pairs, and of a line of text."""
 TASK = "label_"
 
 
@@ -88,59 +88,18 @@ def _spread(rows: np.ndarray, groups: np.ndarray, num: int, rng: np.random.Gener
     return rows[order[np.argsort(keys, kind="stable")][:num]]
 
 
-def pair(pack: Pack, row: int, side: int) -> Image.Image:
-    """One row as an image: camera, then each tactile sensor. A missing image is a crossed-out tile."""
-    tiles = []
-    for modality in pack.spec.modalities:
-        image, there = pack.images[modality][row], bool(pack.has(modality)[row])
-        for sensor in np.split(image, image.shape[2] // 3, axis=2):
-            tile = Image.fromarray(np.ascontiguousarray(sensor)) if there else _nothing(pack.size)
-            tiles.append(tile.resize((side, side), Image.Resampling.LANCZOS))
-    joined = Image.new("RGB", (side * len(tiles), side))
-    for place, tile in enumerate(tiles):
-        joined.paste(tile, (place * side, 0))
-    return joined
-
-
-def _nothing(side: int) -> Image.Image:
-    tile = Image.new("RGB", (side, side), (225, 225, 225))
-    draw = ImageDraw.Draw(tile)
-    draw.line([(0, 0), (side, side)], fill=(150, 150, 150), width=max(1, side // 40))
-    draw.line([(0, side), (side, 0)], fill=(150, 150, 150), width=max(1, side // 40))
-    return tile
-
-
 def heading(strip: Strip, pack: Pack) -> str:
     """Heading such as ``wood: 48 rows, 12 objects``."""
     groups = f", {strip.num_groups} {pack.spec.group_by}s" * (strip.num_groups > 1)
     return f"{strip.name}: {strip.num_rows} row{'s' * (strip.num_rows > 1)}{groups}"
 
 
-def contents(pack: Pack) -> str:
-    """The images of a pair, from left to right."""
-    sensors = pack.spec.touch_channels // 3
-    touch = {0: [], 1: ["touch"], 2: ["left touch", "right touch"]}.get(sensors, [f"{sensors} touch images"])
-    return ", ".join([*(["camera"] if pack.spec.vision_channels else []), *touch])
-
-
 def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96) -> Image.Image:
     """All strips in one image."""
-    font = ImageFont.load_default(size=14)
-    first = pair(pack, int(found[0].rows[0]), side)
-    width = max(480, max(len(strip.rows) for strip in found) * (first.width + GAP) + GAP)
     left_out = f"; {num_all - len(found)} more not shown" * (num_all > len(found))
-    height = LINE + 4 + len(found) * (side + LINE + GAP) + GAP
-    sheet = Image.new("RGB", (width, height), "white")
-    draw = ImageDraw.Draw(sheet)
     title = f"{pack.spec.name}, {pack.num} rows at {pack.size} px; each pair: {contents(pack)}{left_out}"
-    draw.text((GAP, 4), title, fill=(90, 90, 90), font=font)
-    top = LINE + 4
-    for strip in found:
-        draw.text((GAP, top + 2), heading(strip, pack), fill="black", font=font)
-        for place, row in enumerate(strip.rows):
-            sheet.paste(pair(pack, int(row), side), (GAP + place * (first.width + GAP), top + LINE))
-        top += side + LINE + GAP
-    return sheet
+    blocks = [Block(heading(strip, pack), [Tile(pair(pack, int(row), side)) for row in strip.rows]) for strip in found]
+    return draw(title, blocks)
 
 
 def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128) -> str:
@@ -151,13 +110,13 @@ def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128
     names = {name: pack.column(name).astype(str) for name in ("id", "group", "split")}
 
     def caption(row: int) -> str:
-        labels = [f"{t}: {classes[v[row]]}" for t, (classes, v) in tasks.items() if v[row] >= 0]
+        labels = [f"{task_title(t, classes)}: {classes[v[row]]}" for t, (classes, v) in tasks.items() if v[row] >= 0]
         return "; ".join([*(found[row] for found in names.values()), *labels])
 
     sections = []
     for number, strip in enumerate(found):
         cards = [
-            html.figure(html.picture(np.asarray(pair(pack, int(r), side)), caption(int(r)), side), caption(int(r)))
+            html.figure(html.picture(pair(pack, int(r), side), caption(int(r)), side), caption(int(r)))
             for r in strip.rows
         ]
         sections.append((f"s{number}", heading(strip, pack), html.grid(cards)))

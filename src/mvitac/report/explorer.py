@@ -2,57 +2,62 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import gradio as gr
 import numpy as np
 from gradio.themes import Base
-from PIL import Image
 
+from mvitac.data.spec import task_title
+from mvitac.report import html
 from mvitac.report.explorer_data import ExplorerData
+from mvitac.report.palette import colour
 
 os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # no telemetry from a local page; read on import
 
 K = 6
+KEYS = "Arrow keys go from point to point, Enter shows its neighbours, + and - zoom, 0 resets."
 MAP = (
-    '<div class="map"><canvas></canvas><div class="tip"></div></div><div class="legend"></div><div class="count"></div>'
+    f'<div class="map"><canvas tabindex="0" role="application" aria-label="Map of features. {KEYS}"></canvas>'
+    '<div class="tip" aria-live="polite"></div></div>'
+    '<div class="legend" role="group" aria-label="Shown in colour"></div><div class="count"></div>'
 )
 STYLE = """
 .map { position: relative; width: 100%; height: min(70vh, 560px, 110vw); }
 canvas { width: 100%; height: 100%; border: 1px solid var(--border-color-primary); touch-action: none; cursor: crosshair;
          background: var(--background-fill-primary); color: var(--body-text-color); }
+canvas:focus-visible, button:focus-visible { outline: 3px solid #4fb0e2; outline-offset: 1px; }
 .tip { position: absolute; display: none; max-width: 260px; padding: 6px; font-size: 12px; pointer-events: none;
        background: var(--background-fill-primary); color: var(--body-text-color); border: 1px solid #888; z-index: 5; }
 .tip img { width: 112px; height: 112px; object-fit: contain; image-rendering: pixelated; display: inline; }
-.legend span { display: inline-block; margin: 2px 10px 2px 0; font-size: 12px; }
-.legend i { display: inline-block; width: 10px; height: 10px; margin-right: 4px; }
+.legend { max-height: 14em; overflow-y: auto; margin-top: 4px; }
+.legend button { margin: 2px 2px 2px 0; padding: 2px 8px 2px 4px; font-size: 13px; font-weight: 400;
+                 color: var(--body-text-color); border: 1px solid transparent; border-radius: 4px;
+                 background: none; cursor: pointer; opacity: .7; }
+.legend button[aria-pressed=true] { border-color: var(--border-color-primary); opacity: 1; }
+.legend i { display: inline-block; width: 10px; height: 10px; margin-right: 5px; }
 .count { font-size: 12px; opacity: .7; }
 """
-CAPTIONS = """
-.caption-label { white-space: normal !important; max-width: 100% !important; line-height: 1.2 !important; }
-@media (max-width: 600px) { .caption-label { font-size: 10px !important; padding: 1px 3px !important; } }
+FOUND = f"""
+h4 {{ margin: 0 0 6px; font-size: 14px; font-weight: 600; }}
+.found {{ display: grid; grid-template-columns: repeat({K}, minmax(0, 170px)); gap: 12px; }}
+@media (max-width: 700px) {{ .found {{ grid-template-columns: repeat(3, 1fr); gap: 8px; }} }}
+.found img {{ width: 100%; height: auto; border: 3px solid transparent; border-radius: 6px; image-rendering: pixelated; }}
+.found b, .found span {{ display: block; font-size: 12px; line-height: 1.35; overflow-wrap: anywhere; }}
+.found .right img {{ border-color: {colour("green")}; }}
+.found .wrong img {{ border: 3px dashed {colour("vermilion")}; }}
 """
-"""Show the captions of galleries in full."""
-Found = list[tuple[np.ndarray, str]]
-"""Images with captions."""
 
 
 def tip(land: ExplorerData, i: int) -> str:
     """The tooltip of a point as HTML: the pair's two images and a line of text."""
-    pictures = []
-    for modality in land.x:
-        data = io.BytesIO()
-        Image.fromarray(land.picture(i, modality)).save(data, "PNG")
-        text = base64.b64encode(data.getvalue()).decode()
-        pictures.append(f'<img alt="{modality}" src="data:image/png;base64,{text}">')
-    return "".join(pictures) + f"<div>{html.escape(land.describe(i))}</div>"
+    pictures = [html.picture(land.picture(i, m), m) for m in land.x]
+    return "".join(pictures) + f"<div>{escape(land.describe(i))}</div>"
 
 
 def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
@@ -70,16 +75,15 @@ def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
         with gr.Row():
             views = [_map(name, land, s, len(lands) > 1) for (name, land), s in zip(lands.items(), start, strict=True)]
         chosen = gr.Markdown(
-            "Click a point for its nearest neighbours; scroll or pinch to zoom, drag to pan, double-click to reset."
+            "Click a point for its nearest neighbours; scroll or pinch to zoom, drag to pan, double-click to reset. "
+            f"Choose in the legend what is shown in colour. With the map in focus: {KEYS[0].lower()}{KEYS[1:]}"
         )
-        galleries = [
-            gr.Gallery(label=f"nearest by {m}", columns=K, rows=1, height=220, object_fit="contain") for m in first.x
-        ]
+        galleries = [gr.HTML(css_template=FOUND) for _ in first.x]
         _query_form(first, f" by {next(iter(lands))}" if len(lands) > 1 else "")
         for control in controls:
             control.change(draw, controls, views)
         for view, land in zip(views, lands.values(), strict=True):
-            view.click(_on_click(land), None, [chosen, *galleries])
+            view.click(_on_click(land), controls[2], [chosen, *galleries])
     return blocks
 
 
@@ -88,18 +92,20 @@ def _controls(land: ExplorerData) -> list[Any]:
     tasks, splits = list(land.classes), ["all", *sorted(set(land.split))]
     with gr.Row():
         return [
-            gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of"),
-            gr.Dropdown(["label", "error", "split"], value="label" if tasks else "split", label="colour by"),
-            gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task"),
-            gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split"),
-            gr.Checkbox(False, label="mistakes only"),
+            gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of", min_width=120),
+            gr.Dropdown(
+                ["label", "error", "split"], value="label" if tasks else "split", label="colour by", min_width=120
+            ),
+            gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task", min_width=120),
+            gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split", min_width=120),
+            gr.Checkbox(False, label="mistakes only", min_width=120),
         ]
 
 
 def _maps(
-    lands: Sequence[ExplorerData], modality: str, colour: str, task: str | None, split: str, mistakes: bool
+    lands: Sequence[ExplorerData], modality: str, by: str, task: str | None, split: str, mistakes: bool
 ) -> list[str]:
-    return [land.points(modality, colour, split, task, mistakes=mistakes) for land in lands]
+    return [land.points(modality, by, split, task, mistakes=mistakes) for land in lands]
 
 
 def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
@@ -122,19 +128,40 @@ def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
         )
 
 
-def _on_click(land: ExplorerData) -> Callable[[gr.EventData], list[Any]]:
+def _on_click(land: ExplorerData) -> Callable[[str | None, gr.EventData], list[Any]]:
     """A handler that shows the neighbours of the clicked point by each modality."""
 
-    def click(event: gr.EventData) -> list[Any]:
+    def click(task: str | None, event: gr.EventData) -> list[str]:
         i = int(event.row)
-        lists = [_found(land, land.neighbours(x[i : i + 1], m, K, without=i), m) for m, x in land.x.items()]
+        title = task_title(task, land.classes[task]) if task else ""
+        legend = f"; ✓ same {title}, ✕ another" if task and land.labels[task][i] >= 0 else ""
+        lists = [
+            _found(land, f"nearest by {m}" + legend, land.neighbours(x[i : i + 1], m, K, without=i), m, i, task)
+            for m, x in land.x.items()
+        ]
         return [f"**{land.describe(i)}**", *lists]
 
     return click
 
 
-def _found(land: ExplorerData, pairs: Sequence[tuple[int, float]], modality: str) -> Found:
-    return [(land.picture(i, modality), f"{land.name(i)} · {score:.2f}") for i, score in pairs]
+def _found(
+    land: ExplorerData,
+    title: str,
+    pairs: Sequence[tuple[int, float]],
+    modality: str,
+    asked: int | None = None,
+    task: str | None = None,
+) -> str:
+    """Similar rows as HTML. Each is marked by its class in ``task``, and whether that is the class of row ``asked``."""
+    cells = []
+    for i, score in pairs:
+        same = None if asked is None else land.same_class(asked, i, task)
+        css, mark = {None: ("", ""), True: ("right", "✓"), False: ("wrong", "✕")}[same]
+        if task and mark:
+            mark += f" {land.classes[task][land.labels[task][i]]}"
+        image = html.picture(land.picture(i, modality), f"{modality} of {land.name(i)}", 224)
+        cells.append(html.cell(css, image, mark, f"{land.name(i)} · {score:.2f}"))
+    return f'<h4>{escape(title)}</h4><div class="found">{"".join(cells)}</div>'
 
 
 def _query_form(land: ExplorerData, by: str) -> None:
@@ -147,24 +174,27 @@ def _query_form(land: ExplorerData, by: str) -> None:
             ask = gr.Button(f"Query and classify{by}")
         with gr.Column(min_width=240):
             answer = gr.Markdown()
-            alike = gr.Gallery(label="most similar", columns=3, height=320, object_fit="contain")
+            alike = gr.HTML(css_template=FOUND)
     ask.click(partial(_query, land), [given, kind], [answer, alike])
 
 
-def _query(land: ExplorerData, image: np.ndarray | None, modality: str) -> tuple[str, Found]:
+def _query(land: ExplorerData, image: np.ndarray | None, modality: str) -> tuple[str, str]:
     """Classify an image and find the rows most similar to it."""
     if image is None:
-        return "Give a picture first.", []
+        return "Give a picture first.", ""
     answers, pairs = land.query(image, modality, K)
     lines = []
     for name, probabilities in answers.items():
         best = sorted(probabilities.items(), key=lambda item: -item[1])[:3]
-        lines.append(f"- **{name}**: " + ", ".join(f"{c} {100 * p:.0f} %" for c, p in best))
-    return "\n".join(lines) or "This run has no labels to classify by.", _found(land, pairs, modality)
+        lines.append(
+            f"- **{task_title(name, tuple(probabilities))}**: " + ", ".join(f"{c} {100 * p:.0f} %" for c, p in best)
+        )
+    found = _found(land, "most similar", pairs, modality)
+    return "\n".join(lines) or "This run has no labels to classify by.", found
 
 
 def serve(blocks: gr.Blocks, *, host: str = "127.0.0.1", port: int | None = None, wait: bool = True) -> str:
     """Serve the page and return its address. Fonts come from the machine, nothing from the network."""
     theme = Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])
-    options: dict[str, Any] = {"share": False, "quiet": True, "theme": theme, "css": CAPTIONS}
+    options: dict[str, Any] = {"share": False, "quiet": True, "theme": theme}
     return blocks.launch(server_name=host, server_port=port, prevent_thread_lock=not wait, **options)[1]

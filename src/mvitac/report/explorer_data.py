@@ -13,19 +13,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvitac.data.image_grid import side_by_side
 from mvitac.data.pack import Pack
 from mvitac.deploy.publish import with_readouts
 from mvitac.deploy.search import check_pack, nearest
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.registry import unknown
-
-COLOURS = (
-    *("#2490fc", "#fc783c", "#008400", "#a80048", "#fc54fc", "#604800", "#00f000", "#6c00a8", "#e4cc90", "#0c8490"),
-    *("#0000f0", "#fc0c78", "#54c078", "#9c7830", "#6cccfc", "#c000c0", "#004878", "#fcb4fc", "#7848fc", "#b484b4"),
-)
-"""Twenty colours, legible on white and black. A search kept them far apart in OKLab: distance .165 or more, .067 as
-seen without green cones. Classes beyond the twentieth repeat them."""
+from mvitac.report.palette import COLOURS, MAP_HUES
 
 
 class ExplorerData:
@@ -64,19 +59,32 @@ class ExplorerData:
                 names = self.classes[task] = tuple(dict.fromkeys((*self.classes[task], *known)))
                 found = readout(torch.from_numpy(joined)).argmax(1).numpy()
                 self.guess[task] = np.array([names.index(name) for name in known])[found]
-        self._planes: dict[str, np.ndarray] = {}
+        self._planes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def plane(self, modality: str) -> np.ndarray:
         """The first two principal components of the unit features, scaled to [0, 1]: [N, 2]."""
+        return self._components(modality)[0]
+
+    def axes(self, modality: str) -> list[str]:
+        """What the two axes of the plane are, with their shares of the variance."""
+        names = "vision and touch" if modality == "both" else modality
+        return [
+            f"principal component {number} of {names} ({100 * share:.0f} % of the variance)"
+            for number, share in enumerate(self._components(modality)[1].tolist(), 1)
+        ]
+
+    def _components(self, modality: str) -> tuple[np.ndarray, np.ndarray]:
+        """The plane [N, 2], and the share of the variance along each of its axes [2]."""
         if modality not in self.modalities:
             raise unknown("modality", modality, self.modalities)
         if modality not in self._planes:
             x = np.concatenate([self.x[m] for m in self.x], axis=1) if modality == "both" else self.x[modality]
             x = x - x.mean(0)
-            _, vectors = np.linalg.eigh(x.T @ x)
+            variances, vectors = np.linalg.eigh(x.T @ x)
             xy = x @ vectors[:, -2:][:, ::-1]
             low, high = np.percentile(xy, [0.5, 99.5], axis=0)  # ignore outliers
-            self._planes[modality] = np.clip((xy - low) / np.maximum(high - low, 1e-9), 0, 1)
+            plane = np.clip((xy - low) / np.maximum(high - low, 1e-9), 0, 1)
+            self._planes[modality] = plane, variances[-2:][::-1] / max(variances.sum(), 1e-12)
         return self._planes[modality]
 
     def shown(self, split: str, task: str | None, *, mistakes: bool = False) -> np.ndarray:
@@ -99,16 +107,22 @@ class ExplorerData:
         else:
             names = (*self.classes[task], "unlabelled")
             values = np.where(self.labels[task] < 0, len(names) - 1, self.labels[task])
-        used = np.unique(values[index])
-        palette = {"right": "#9ecae1", "wrong": "#d62728", "unlabelled": "#bbbbbb"}
-        legend = [[str(names[v]), palette.get(names[v], COLOURS[v % len(COLOURS)])] for v in used.tolist()]
+        used, counts = np.unique(values[index], return_counts=True)
+        hues = ("sky", "vermilion", "amber") if colour == "error" else MAP_HUES
+        largest = [u for u in np.argsort(-counts, kind="stable") if names[used[u]] != "unlabelled"][: len(hues)]
+        first = [names[0], names[1]] if colour == "error" else [names[used[u]] for u in sorted(largest)]
         xy = (65535 * self.plane(modality)[index].T).astype("<u2")
         return json.dumps(
             {
                 "xy": _base64(xy),
-                "colour": _base64(np.searchsorted(used, values[index]).astype("<u2")),
+                "group": _base64(np.searchsorted(used, values[index]).astype("<u2")),
                 "row": _base64(index.astype("<i4")),
-                "legend": legend,
+                "legend": [str(names[v]) for v in used.tolist()],
+                "coloured": first,
+                "hues": [COLOURS[hue] for hue in hues],
+                "gray": COLOURS["grey4"],
+                "by": task if colour == "label" else colour,
+                "axes": self.axes(modality),
             }
         )
 
@@ -117,6 +131,12 @@ class ExplorerData:
         index, scores = nearest(self.x[modality], queries, k + 1)
         pairs = zip(index[0].tolist(), scores[0].tolist(), strict=True)
         return [(i, s) for i, s in pairs if i != without][:k]
+
+    def same_class(self, i: int, j: int, task: str | None) -> bool | None:
+        """Whether rows ``i`` and ``j`` have the same label of ``task``; None where one has no label."""
+        if task is None or self.labels[task][i] < 0 or self.labels[task][j] < 0:
+            return None
+        return bool(self.labels[task][i] == self.labels[task][j])
 
     def describe(self, i: int) -> str:
         """One line about row ``i``: id, split, labels, and wrong predictions."""
@@ -137,8 +157,7 @@ class ExplorerData:
 
     def picture(self, i: int, modality: str) -> np.ndarray:
         """uint8 [S, S, 3], or [S, 2 S, 3] for two sensors."""
-        image = self.pack.images[modality][int(self.rows[i])]
-        return np.concatenate([image[..., c : c + 3] for c in range(0, image.shape[2], 3)], axis=1)
+        return side_by_side(self.pack.images[modality][int(self.rows[i])])
 
     def query(self, image: np.ndarray, modality: str, k: int) -> tuple[dict[str, Any], list[tuple[int, float]]]:
         """Task -> class -> probability, and the neighbours, of a new uint8 image [H, W, 3]."""

@@ -13,6 +13,7 @@ from html import escape
 import numpy as np
 from PIL import Image
 
+from mvitac.data.image_grid import side_by_side
 from mvitac.report.palette import COLOURS
 
 _STYLE = """
@@ -181,8 +182,7 @@ def table(
 
 def picture(image: np.ndarray, alt: str, side: int = 112) -> str:
     """An <img> with uint8 ``image`` [H, W, C] embedded. Six channels are two sensors, shown side by side."""
-    sensors = np.split(image, image.shape[2] // 3, axis=2)
-    joined = Image.fromarray(np.ascontiguousarray(np.concatenate(sensors, axis=1)))
+    joined = Image.fromarray(np.ascontiguousarray(side_by_side(image)))
     if joined.height > side:
         joined = joined.resize((joined.width * side // joined.height, side), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()

@@ -16,6 +16,7 @@ COLOURS: dict[str, tuple[str, str]] = {
     "sky": ("#4fb0e2", "#a5dbf9"),
     "olive": ("#8d8a1e", "#d9d45a"),
     "brown": ("#7b5334", "#bd936d"),
+    "indigo": ("#5b21d6", "#7c5cff"),
     "grey1": ("#6d7783", "#99a3af"),
     "grey2": ("#8c95a0", "#7c8692"),
     "grey3": ("#a8b0b9", "#626c78"),
@@ -23,6 +24,8 @@ COLOURS: dict[str, tuple[str, str]] = {
 }
 """Name -> colour on a light page and on a dark page. Hues after Okabe and Ito, distinct with any colour vision."""
 HUES = ("blue", "vermilion", "green", "amber", "purple", "sky", "olive", "brown")
+MAP_HUES = (*HUES, "ink", "indigo")
+"""Ten colours for the explorer's map: as many as an eye can tell apart."""
 MODALITY_HUES = {"touch": "blue", "vision": "vermilion", "both": "green"}
 CONTROL_GREYS = {"imagenet": "grey1", "untrained": "grey2", "pixels": "grey3", "border": "grey4"}
 

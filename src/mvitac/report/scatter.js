@@ -1,8 +1,12 @@
-// The explorer's map: a canvas of points to pan, zoom, hover and click. `props.value` is the JSON of ExplorerData.points.
-// 100,000 points are drawn as small squares in one pass. The nearest to the pointer is found by a linear search.
-const canvas = element.querySelector("canvas"), tip = element.querySelector(".tip"), legend = element.querySelector(".legend");
+// The explorer's map: a canvas of points to pan, zoom, hover and click, or to walk through by keyboard. `props.value` is
+// the JSON of ExplorerData.points. 100,000 points are drawn as small squares in one pass per colour, gray ones first.
+// The nearest to the pointer is found by a linear search.
+const canvas = element.querySelector("canvas"), tip = element.querySelector(".tip");
+const legend = element.querySelector(".legend");
 const count = element.querySelector(".count"), context = canvas.getContext("2d");
-let data = { x: [], y: [], colour: [], row: [], legend: [] }, view = { x: 0, y: 0, zoom: 1 }, hovered = -1, drag = null;
+const left = 30, right = 12, top = 12, bottom = 30;  // margins around the points, in CSS pixels
+let data = { x: [], y: [], group: [], row: [], legend: [] }, view = { x: 0, y: 0, zoom: 1 }, hovered = -1, drag = null;
+let slots = [], ages = [], clock = 0;  // name and time of choice of the group in each colour
 
 function bytes(text) { return Uint8Array.from(atob(text), (c) => c.charCodeAt(0)); }
 
@@ -10,23 +14,61 @@ function load() {
   const given = JSON.parse(props.value || "{}");
   if (given.row === undefined) return;
   const xy = new Uint16Array(bytes(given.xy).buffer);
-  data = { x: xy.subarray(0, xy.length / 2), y: xy.subarray(xy.length / 2),
-           colour: new Uint16Array(bytes(given.colour).buffer), row: new Int32Array(bytes(given.row).buffer), legend: given.legend };
-  legend.replaceChildren(...given.legend.map(([name, colour]) => {
-    const item = document.createElement("span"), dot = document.createElement("i");
-    dot.style.background = colour;
-    item.append(dot, name);
+  if (given.by !== data.by) {  // another colouring; a filter keeps what was chosen
+    slots = given.hues.map((_, k) => given.coloured[k] ?? null);
+    ages = slots.map(() => clock++);
+  }
+  data = { ...given, x: xy.subarray(0, xy.length / 2), y: xy.subarray(xy.length / 2),
+           group: new Uint16Array(bytes(given.group).buffer), row: new Int32Array(bytes(given.row).buffer) };
+  legend.replaceChildren(...given.legend.map((name) => {
+    const item = document.createElement("button");
+    item.type = "button";
+    item.append(document.createElement("i"), name);
+    item.addEventListener("click", () => choose(name));
     return item;
   }));
-  count.textContent = data.row.length ? `${data.row.length} pairs` : "nothing to show: choose another split or filter";
   element.dataset.points = data.row.length;
-  hovered = -1;
+  hide();
+  paint();
+}
+
+function choose(name) {  // in colour or in gray; if all colours are taken, in that of the group chosen first
+  let k = slots.indexOf(name);
+  if (k >= 0) slots[k] = null;
+  else {
+    k = slots.findIndex((taken) => !data.legend.includes(taken));
+    if (k < 0) k = ages.indexOf(Math.min(...ages));
+    slots[k] = name;
+    ages[k] = clock++;
+  }
   draw();
+  paint();
+}
+
+function colour(pair) { return pair[document.body.classList.contains("dark") ? 1 : 0]; }
+
+function paint() {  // the legend
+  const shown = data.legend.filter((name) => slots.includes(name)).length;
+  data.legend.forEach((name, g) => {
+    const item = legend.children[g], k = slots.indexOf(name);
+    item.setAttribute("aria-pressed", k >= 0);
+    item.firstChild.style.background = colour(k >= 0 ? data.hues[k] : data.gray);
+  });
+  count.textContent = !data.row.length ? "nothing to show: choose another split or filter"
+    : `${data.row.length} pairs; ${shown} of ${data.legend.length} in colour, at most ${slots.length}`;
 }
 
 function place(i) {  // canvas position of point i, in CSS pixels
-  return [canvas.clientWidth / 2 + (data.x[i] / 65535 - 0.5 + view.x) * side(),
-          canvas.clientHeight / 2 + (data.y[i] / 65535 - 0.5 + view.y) * side()];
+  return [left + wide() * (0.5 + (data.x[i] / 65535 - 0.5 + view.x) * view.zoom),
+          top + high() * (0.5 + (data.y[i] / 65535 - 0.5 + view.y) * view.zoom)];
+}
+
+function wide() { return Math.max(1, canvas.clientWidth - left - right); }
+
+function high() { return Math.max(1, canvas.clientHeight - top - bottom); }
+
+function inside(x, y) {
+  return x >= 0.7 * left && y >= 0 && x <= canvas.clientWidth && y <= canvas.clientHeight - 0.7 * bottom;
 }
 
 function draw() {
@@ -34,28 +76,42 @@ function draw() {
   canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   const size = data.row.length > 20000 ? 2 : data.row.length > 3000 ? 4 : 6;
-  data.legend.forEach(([, colour], c) => {
-    context.fillStyle = colour;
+  const slot = data.legend.map((name) => slots.indexOf(name));
+  for (let k = -1; k < slots.length; k++) {
+    context.fillStyle = colour(k < 0 ? data.gray : data.hues[k]);
     for (let i = 0; i < data.row.length; i++) {
-      if (data.colour[i] !== c) continue;
+      if (slot[data.group[i]] !== k) continue;
       const [x, y] = place(i);
-      context.fillRect(x - size / 2, y - size / 2, size, size);
+      if (inside(x, y)) context.fillRect(x - size / 2, y - size / 2, size, size);
     }
-  });
+  }
+  context.strokeStyle = context.fillStyle = getComputedStyle(canvas).color;
   if (hovered >= 0) {
     const [x, y] = place(hovered);
-    context.strokeStyle = getComputedStyle(canvas).color; context.lineWidth = 2;
+    context.lineWidth = 2;
     context.strokeRect(x - size, y - size, 2 * size, 2 * size);
   }
+  if (data.axes) title(data.axes);
 }
 
-function side() { return Math.min(canvas.clientWidth, canvas.clientHeight) * 0.92 * view.zoom; }
+function title([across, down]) {  // what the axes are, as far as there is room
+  context.font = "12px system-ui, sans-serif";
+  context.textAlign = "center";
+  const short = (text) => text.replace("principal component", "PC").replace("of the variance", "of variance");
+  const fit = (text, room) => context.measureText(text).width <= room - 20 ? text : short(text);
+  context.fillText(fit(across, wide()) + " \u2192", left + wide() / 2, canvas.clientHeight - 9);
+  context.save();
+  context.translate(16, top + high() / 2);
+  context.rotate(-Math.PI / 2);
+  context.fillText("\u2190 " + fit(down, high()), 0, 0);
+  context.restore();
+}
 
 function zoom(factor, event) {  // the point under the pointer stays there
-  const box = canvas.getBoundingClientRect(), before = side();
-  const px = event.clientX - box.left - canvas.clientWidth / 2, py = event.clientY - box.top - canvas.clientHeight / 2;
+  const box = canvas.getBoundingClientRect(), before = view.zoom;
+  const px = (event.clientX - box.left - left) / wide() - 0.5, py = (event.clientY - box.top - top) / high() - 0.5;
   view.zoom = Math.max(0.5, Math.min(200, view.zoom * factor));
-  view.x += px / side() - px / before; view.y += py / side() - py / before;
+  view.x += px / view.zoom - px / before; view.y += py / view.zoom - py / before;
   hide();
 }
 
@@ -71,8 +127,9 @@ function nearest(event) {
   return best;
 }
 
-async function show(event) {
-  const now = nearest(event);
+function show(event) { return reveal(nearest(event)); }
+
+async function reveal(now) {
   if (now === hovered) return;
   hovered = now;
   draw();
@@ -85,6 +142,35 @@ async function show(event) {
   tip.style.left = `${Math.max(0, Math.min(x + 12, canvas.clientWidth - tip.offsetWidth))}px`;
   tip.style.top = `${y > canvas.clientHeight / 2 ? y - tip.offsetHeight - 12 : y + 12}px`;
 }
+
+function beside(dx, dy) {  // the point next to the current one in a direction, or the one nearest to the middle
+  const here = hovered >= 0 ? place(hovered) : [left + wide() / 2, top + high() / 2];
+  let best = hovered, least = Infinity;
+  for (let i = 0; i < data.row.length; i++) {
+    const [x, y] = place(i), along = (x - here[0]) * dx + (y - here[1]) * dy;
+    const aside = Math.abs((x - here[0]) * dy) + Math.abs((y - here[1]) * dx);
+    if (i === hovered || !inside(x, y) || (hovered >= 0 && (along <= 0 || aside > along))) continue;
+    const distance = hovered >= 0 ? along + 2 * aside : Math.hypot(x - here[0], y - here[1]);
+    if (distance < least) { least = distance; best = i; }
+  }
+  return best;
+}
+
+canvas.addEventListener("keydown", (e) => {
+  const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[e.key];
+  const factor = { "+": 1.5, "=": 1.5, "-": 1 / 1.5 }[e.key], kept = hovered;
+  if (arrow) reveal(beside(...arrow));
+  else if (factor) {
+    const box = canvas.getBoundingClientRect();
+    const [x, y] = kept >= 0 ? place(kept) : [left + wide() / 2, top + high() / 2];
+    zoom(factor, { clientX: box.left + x, clientY: box.top + y });
+    reveal(kept);
+  } else if (e.key === "0") reset();
+  else if (e.key === "Escape") hide();
+  else if ((e.key === "Enter" || e.key === " ") && kept >= 0) trigger("click", { row: data.row[kept] });
+  else return;
+  e.preventDefault();
+});
 
 // Active pointers. The mouse or one finger drags; two fingers also zoom about the point between them.
 const fingers = new Map();
@@ -105,7 +191,7 @@ canvas.addEventListener("pointermove", (e) => {
   const now = grip(), dx = now.clientX - drag.at.clientX, dy = now.clientY - drag.at.clientY;
   if (drag.moved || Math.abs(dx) + Math.abs(dy) > 4) {
     drag.moved = true;
-    view.x += dx / side(); view.y += dy / side();
+    view.x += dx / wide() / view.zoom; view.y += dy / high() / view.zoom;
     zoom(now.spread && drag.at.spread ? now.spread / drag.at.spread : 1, now);
     drag.at = now;
   }
@@ -119,11 +205,13 @@ canvas.addEventListener("pointerup", (e) => {
   if (clicked >= 0) { show(e); trigger("click", { row: data.row[clicked] }); }
 });
 canvas.addEventListener("pointerleave", () => { if (!drag) hide(); });
+canvas.addEventListener("blur", hide);
 canvas.addEventListener("wheel", (e) => {
   e.preventDefault();
   zoom(Math.exp(-e.deltaY / 400), e);
 }, { passive: false });
-canvas.addEventListener("dblclick", () => { view = { x: 0, y: 0, zoom: 1 }; draw(); });
-new ResizeObserver(draw).observe(canvas);
+function reset() { view = { x: 0, y: 0, zoom: 1 }; hide(); }
+canvas.addEventListener("dblclick", reset);
+new ResizeObserver(hide).observe(canvas);
 watch("value", load);
 load();

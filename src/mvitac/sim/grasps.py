@@ -23,18 +23,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import mujoco
 import numpy as np
-from PIL import Image
 
 from mvitac.sim import camera, gel, objects, physics, skin
 from mvitac.sim.objects import object_name
 from mvitac.sim.physics import PHASES
 
-__all__ = ["NUM_GRASPS", "NUM_OBJECTS", "PHASES", "VERSION", "contact_sheet", "grasp", "object_name"]
+__all__ = ["NUM_GRASPS", "NUM_OBJECTS", "PHASES", "VERSION", "grasp", "object_name"]
 
 VERSION = 2
 NUM_OBJECTS = 106
@@ -250,29 +248,3 @@ def _imprint(
         dome_radius_mm=objects.DOME_RADIUS_MM,
     )
     return np.minimum(imprint, np.float32(2.5))  # thickness of the gel; only corners at the rim come near it
-
-
-def contact_sheet(path: str | Path | BinaryIO, size: int = 132, seed: int = 0) -> None:
-    """Write a PNG: one row per shape, with a failed (red frame) and a successful (green frame) grasp.
-
-    Each grasp has its three phases, and each phase camera, left gel and right gel.
-    """
-    edge = 3
-    size = min(size, (1600 - 4 * edge) // 18)
-    sheet = []
-    for kind in range(len(objects.KINDS)):
-        found: dict[int, list[dict[str, Any]]] = {}
-        for index in range(40):
-            obj = kind + len(objects.KINDS) * (index % 4)
-            rows = grasp(seed, obj, index, size=size)
-            found.setdefault(rows[0]["success"], rows)
-            if len(found) == 2:
-                break
-        row = []
-        for success, frame in ((0, (200, 30, 30)), (1, (30, 160, 60))):
-            strip = np.full((size, 9 * size, 3), 255, np.uint8)
-            if success in found:
-                strip = np.hstack([r[k] for r in found[success] for k in ("vision", "touch_left", "touch_right")])
-            row.append(np.stack([np.pad(strip[..., c], edge, constant_values=frame[c]) for c in range(3)], -1))
-        sheet.append(np.hstack(row))
-    Image.fromarray(np.vstack(sheet)).save(path, format="PNG")

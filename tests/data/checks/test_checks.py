@@ -13,11 +13,12 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.checks.contact_sheet import MISSING, strips_of
+from mvitac.data.checks.contact_sheet import blocks_of
 from mvitac.data.checks.examine import examine, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
 from mvitac.data.checks.image_stats import area_means, look_at
+from mvitac.data.image_grid import MISSING, pair
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Sample, Source
 from mvitac.data.spec import DataSpec, Task
@@ -191,11 +192,11 @@ def test_each_fault_is_named_and_nothing_else(fault: str, tmp_path: Path) -> Non
 
 def test_a_source_is_examined_as_it_came(tmp_path: Path) -> None:
     """Only the source knows how large the images were; the pack made of it does not, and says so."""
-    findings, strips = examine_source(Presses("sizes"), size=SIDE, quiet=True)
+    findings, blocks = examine_source(Presses("sizes"), size=SIDE, quiet=True)
     found = {f.item: f for f in findings}["sensors and resolutions"]
     assert found.verdict == "look" and "vision_size: 32 x 32 75 %, 64 x 64 25 %" in found.evidence
     assert "vision_size 32 x 32 75 %" not in check("sizes", tmp_path)["sensors and resolutions"].evidence
-    assert not strips
+    assert [block.heading[:18] for block in blocks] == ["No suspicious rows"]
 
 
 def test_images_that_a_reader_shrinks_keep_their_size(tmp_path: Path) -> None:
@@ -275,7 +276,10 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert found["verdict"] == "look" and found["rows"] == [3, 53, 103, 153, 203, 253, 303]
     with Image.open(tmp_path / "constant.png") as sheet:
         pixels = np.asarray(sheet)
-    assert (pixels[60, 110] == 7).all() and (pixels[60, 300] == 7).all()  # the touch halves of the first two rows
+    assert (pixels == 7).all(2).sum() == 7 * 96 * 96  # the touch halves of the seven rows
+    assert pixels.shape[1] <= 1280 and pixels.shape[0] > 2 * 96  # several rows of pairs
+    with Image.open(tmp_path / "fine.png") as sheet:
+        assert sheet.height > 4 * 96  # a sample of 24 pairs
 
 
 def test_the_command_on_a_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -382,8 +386,17 @@ def test_a_gap_is_gray_on_the_sheet(tmp_path: Path) -> None:
             return [replace(sample, vision=sample.vision if item != 3 else None, columns=columns)]
 
     pack = build(Blind("constant"), tmp_path / "p", size=SIDE, quiet=True)
-    ((_, first), *_), *_ = strips_of(pack, examine(pack)).values()
-    assert (first[:, :96] == MISSING).all() and (first[:, 96:] == 7).all()
+    first = blocks_of(pack, examine(pack))[0].tiles[0].image
+    assert (first[48, 5] == MISSING).all() and (first[:, 96:] == 7).all()
+
+
+def test_without_suspicious_rows_the_sheet_is_a_sample(tmp_path: Path) -> None:
+    pack = build(Presses(), tmp_path / "p", size=SIDE, quiet=True)
+    (block,) = blocks_of(pack, examine(pack))
+    assert block.heading.startswith("No suspicious rows. 24 of 320 rows, drawn at random (each pair: camera, touch)")
+    rows = [pack.column("id").tolist().index(tile.caption.split()[0]) for tile in block.tiles]
+    assert len(set(rows)) == 24 and set(pack.column("split")[rows]) == {"train", "val", "test"}
+    assert all((tile.image == pair(pack, row, 96)).all() for row, tile in zip(rows, block.tiles, strict=True))
 
 
 def test_a_task_is_judged_by_its_own_split(tmp_path: Path) -> None:

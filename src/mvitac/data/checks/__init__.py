@@ -5,7 +5,7 @@
     image_checks.py    checks of images: constant, grayscale, red and blue swapped, modalities swapped, time offset
     table_checks.py    checks of the table: labels, classes, leaks between splits, sensors, numbers, published counts
     duplicates.py      exact and near duplicates across splits
-    contact_sheet.py   an image of the suspicious rows
+    contact_sheet.py   the suspicious rows, or a sample, for a sheet
 
 A check returns a ``Finding`` and changes nothing. Heuristics give the verdict "look", facts "broken".
 """

@@ -1,58 +1,34 @@
-"""An image of the suspicious rows: one strip per finding, vision next to touch, the row's id below."""
+"""The doctor's contact sheet: the suspicious rows of each finding, or a sample of the data if there are none."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import BinaryIO
 
 import numpy as np
-from PIL import Image, ImageDraw
 
 from mvitac.data.checks.finding import Finding
-from mvitac.data.images import fit
+from mvitac.data.image_grid import Block, Tile, contents, pair
 from mvitac.data.pack import Pack
 
-SIDE, NUM_SHOWN, LINE = 96, 8, 14
-MISSING = 225
-"""Gray level shown for a missing image."""
-Strips = dict[str, list[tuple[str, np.ndarray]]]
-"""Finding -> (caption, uint8 [SIDE, width, 3]) of its first rows."""
+SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24
+"""Pixels; rows shown of a finding; rows shown if nothing is suspicious."""
 
 
-def strips_of(pack: Pack, findings: Sequence[Finding]) -> Strips:
-    """Return the strips of the findings that list rows."""
-    ids, splits = pack.column("id").astype(str), pack.column("split").astype(str)
-    strips: Strips = {}
-    for finding in findings:
-        if finding.rows and finding.verdict in ("look", "broken"):
-            title = f"{finding.verdict}: {finding.item} - {finding.evidence}"
-            strips[title] = [(f"{ids[row]} {splits[row]}", _row(pack, row)) for row in finding.rows[:NUM_SHOWN]]
-    return strips
-
-
-def _row(pack: Pack, row: int) -> np.ndarray:
-    images = [
-        fit(np.asarray(pack.images[m][row]), SIDE)
-        if pack.has(m)[row]
-        else np.full((SIDE, SIDE, pack.spec.channels(m)), MISSING, np.uint8)
-        for m in pack.spec.modalities
+def blocks_of(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
+    """Return a block per finding that lists rows. Without any, one block of rows drawn at random."""
+    order = f"each pair: {contents(pack)}"
+    blocks = [
+        Block(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN]))
+        for f in findings
+        if f.rows and f.verdict in ("look", "broken")
     ]
-    return np.concatenate([part for image in images for part in np.split(image, image.shape[2] // 3, axis=2)], axis=1)
+    if blocks:
+        return blocks
+    num = min(NUM_SAMPLE, pack.num)
+    rows = np.sort(np.random.default_rng(0).choice(pack.num, num, replace=False))
+    return [Block(f"No suspicious rows. {num} of {pack.num} rows, drawn at random ({order})", _tiles(pack, rows))]
 
 
-def draw(file: BinaryIO, strips: Strips) -> None:
-    """Write ``strips`` as a PNG; without any, write a note that nothing is suspicious."""
-    width = max([720, *(sum(image.shape[1] + 6 for _, image in strip) for strip in strips.values())])
-    height = (SIDE + 2 * LINE + 12) * len(strips) or 2 * LINE
-    sheet = Image.new("RGB", (width, height), "white")
-    pen = ImageDraw.Draw(sheet)
-    if not strips:
-        pen.text((4, 4), "nothing suspicious to show", fill="black")
-    for number, (title, strip) in enumerate(strips.items()):
-        top, left = number * (SIDE + 2 * LINE + 12), 0
-        pen.text((4, top), title[: width // 6], fill="black")
-        for caption, image in strip:
-            sheet.paste(Image.fromarray(image), (left, top + LINE + 2))
-            pen.text((left, top + LINE + 2 + SIDE), caption[-(image.shape[1] // 6) :], fill="black")
-            left += image.shape[1] + 6
-    sheet.save(file, format="PNG")
+def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:
+    ids, splits = pack.column("id").astype(str), pack.column("split").astype(str)
+    return [Tile(pair(pack, int(row), SIDE), f"{ids[row]} {splits[row]}") for row in rows]

@@ -11,9 +11,10 @@ import numpy as np
 
 from mvitac.data.build import build
 from mvitac.data.checks import duplicates, image_checks, table_checks
-from mvitac.data.checks.contact_sheet import Strips, strips_of
+from mvitac.data.checks.contact_sheet import blocks_of
 from mvitac.data.checks.finding import Finding
 from mvitac.data.checks.image_stats import look_at
+from mvitac.data.image_grid import Block
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Lost, Sample, Source
 from mvitac.data.spec import DataSpec
@@ -91,8 +92,8 @@ def examine(pack: Pack, counts: list[Count] | None = None, *, part: bool = False
     ]
 
 
-def examine_pack(path: Path) -> tuple[list[Finding], Strips]:
-    """Check the pack at ``path``; return the findings and the images of suspicious rows."""
+def examine_pack(path: Path) -> tuple[list[Finding], list[Block]]:
+    """Check the pack at ``path``; return the findings and the blocks of the contact sheet."""
     try:
         pack = Pack(path)
     except ValueError as error:
@@ -101,15 +102,15 @@ def examine_pack(path: Path) -> tuple[list[Finding], Strips]:
         found = Finding(
             item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it, too"
         )
-        return [found], {}
+        return [found], [Block(f"broken: pack. {error}")]
     whole = Finding(item="pack", verdict="ok", evidence=f"{pack.num} rows, every digest matches")
     findings = [whole, *examine(pack)]
-    return findings, strips_of(pack, findings)
+    return findings, blocks_of(pack, findings)
 
 
 def examine_source(
     source: Source, *, num: int = 0, size: int = 64, workers: int = 1, quiet: bool = False
-) -> tuple[list[Finding], Strips]:
+) -> tuple[list[Finding], list[Block]]:
     """Check ``source``, which is read into a temporary pack of ``size`` px.
 
     Damaged items are a finding; it is an error only if nothing can be read.
@@ -122,7 +123,7 @@ def examine_source(
         quiet: Show no progress.
 
     Returns:
-        The findings, and the images of suspicious rows.
+        The findings, and the blocks of the contact sheet.
     """
     thumbnails = ThumbnailSource(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
@@ -131,4 +132,4 @@ def examine_source(
         findings = examine(pack, thumbnails.expected(), part=len(thumbnails.items()) < len(source.items()))
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
-        return findings, strips_of(pack, findings)
+        return findings, blocks_of(pack, findings)
