@@ -2,10 +2,10 @@
 
     python -m benchmarks.speed [--quick] [--device cpu|cuda] [--json FILE]     (make bench)
 
-Sections: the step on random tensors in memory, the input, both together (end to end), the probe, and gradient caching.
-Variants are interleaved and medians are compared. A step is compared with the bare networks in the same precision
-(`benchmarks/floor.py`), with the measured peak arithmetic of the machine, with typical research code
-(`benchmarks/typical.py`) and, if lightly is installed, with a step built from its components
+Sections: the step on random tensors in memory, the same compiled (on a GPU), the input, both together (end to end), the
+probe, and gradient caching. Variants are interleaved and medians are compared. A step is compared with the bare
+networks in the same precision (`benchmarks/floor.py`), with the measured peak arithmetic of the machine, with typical
+research code (`benchmarks/typical.py`) and, if lightly is installed, with a step built from its components
 (`benchmarks/lightly_parts.py`).
 
 For several GPUs: torchrun --nproc-per-node N -m benchmarks.scaling
@@ -50,7 +50,7 @@ from mvitac.recipes import recipe
 from mvitac.run import Run
 from mvitac.system.device import describe
 from mvitac.system.distributed import World
-from mvitac.system.files import write_json
+from mvitac.system.files import brief, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training.step import Step
@@ -59,7 +59,7 @@ from mvitac.transforms import random_views
 from mvitac.transforms.random_views import ViewAugment, draw
 
 PAPER_PAIRS, PAPER_EPOCHS = 91_982, 240
-SECTIONS = ("step", "input", "whole", "probe", "caching")
+SECTIONS = ("step", "compiled", "input", "whole", "probe", "caching")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,6 @@ class Scale:
     batch: int = 32
     rounds: int = 5
     num_pairs: int = 128
-    compile: bool = False
 
 
 class Jpegs(Source):
@@ -96,28 +95,50 @@ class Jpegs(Source):
         return [Sample(vision=pair[0], touch=pair[1], columns={"id": path.stem, "group": path.stem, "split": "train"})]
 
 
-def interleave(variants: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, float]:
+def interleave(
+    variants: dict[str, Callable[[], object]],
+    rounds: int,
+    device: torch.device,
+    lost: dict[str, str] | None = None,
+) -> dict[str, float]:
     """Return the median seconds per call of each variant.
 
     Variants are called in turn, so that other load on the machine affects all of them. The value is NaN if a variant
-    runs out of GPU memory or torch cannot compile it; the error is printed.
+    runs out of GPU memory or torch cannot compile it; the error is printed, and kept in ``lost`` by the variant's name.
     """
+    lost = {} if lost is None else lost
     seconds: dict[str, list[float]] = {name: [] for name in variants}
-    lost: dict[str, str] = {}
     for turn in range(1 + rounds):  # the first call fills caches, prepares kernels and compiles
         for name, run in variants.items():
             if name in lost:
                 continue
             try:
                 value = clock(run, device)
-            except (torch.OutOfMemoryError, torch._dynamo.exc.TorchDynamoException) as error:
-                lost[name] = str(error).split(". ")[0].splitlines()[0]
+            except RuntimeError as error:  # out of memory, not compiled, or not possible as a CUDA graph
+                lost[name] = brief(error)
                 print(f"{name}: {lost[name]}")
                 torch.cuda.empty_cache()
                 continue
             if turn:
                 seconds[name].append(value)
     return {name: float("nan") if name in lost else median(values) for name, values in seconds.items()}
+
+
+def steady(
+    variants: dict[str, Callable[[], object]], workers: int, rounds: int, device: torch.device
+) -> dict[str, float]:
+    """Return the seconds per call of each variant that reads an input, by itself, over many calls.
+
+    Inputs work ahead of the network, so after a pause a call would only take what is ready. The batches that were made
+    ahead are used up before the clock starts.
+    """
+    seconds = {}
+    for name, run in variants.items():
+        ahead, num = (3 * workers, max(workers, rounds)) if "typical" in name else (4, 4 * rounds)
+        for _ in range(ahead):
+            run()
+        seconds[name] = clock(lambda run=run, num=num: [run() for _ in range(num)], device) / num
+    return seconds
 
 
 def peak_memory(run: Callable[[], object], device: torch.device) -> dict[str, float]:
@@ -157,8 +178,16 @@ def our_step(scale: Scale, precision: str, spec: DataSpec, device: torch.device,
     return Step(run, method.train(), device)
 
 
-def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[str, Any]:
-    """Measure pairs/s of each step, and its share of the floor and of the measured peak in the same precision."""
+def typical_step(scale: Scale, device: torch.device) -> Callable[..., object]:
+    """Return the typical step under torch's defaults: on a GPU, its fp32 convolutions round to TF32."""
+    return with_cudnn(TypicalStep(scale.trunk, device), allow_tf32=True)
+
+
+def measure_steps(scale: Scale, spec: DataSpec, device: torch.device, *, compiled: bool = False) -> dict[str, Any]:
+    """Measure pairs/s of each step, and its share of the floor and of the measured peak in the same precision.
+
+    ``compiled``: measure what may make the step in bf16 faster, instead of the other steps.
+    """
     torch.manual_seed(0)
     images = [torch.randn(scale.batch, 3, scale.size, scale.size, device=device) for _ in range(4)]
     close = [image.contiguous(memory_format=torch.channels_last) for image in images]
@@ -173,23 +202,25 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
         batch = Views(images=views, labels={}, rows=torch.arange(scale.batch))
         return lambda: step([lambda: batch], lr=1e-3, seed=0, progress=0.5)
 
-    typical = TypicalStep(scale.trunk, device)
     floors = {p: Floor(scale.trunk, device, p) for p in ("fp32", "bf16")}
-    variants: dict[str, Callable[[], object]] = {
-        "typical fp32": lambda: typical((images[0], images[2]), (images[1], images[3])),
-        "floor fp32": lambda: floors["fp32"](close),
-        "ours fp32": ours("fp32"),
-        "floor bf16": lambda: floors["bf16"](small),
-        "ours bf16": ours("bf16"),
-    }
-    if lightly_parts.INSTALLED:
+    variants: dict[str, Callable[[], object]] = {"floor bf16": lambda: floors["bf16"](small), "ours bf16": ours("bf16")}
+    graphs: dict[str, Callable[[], object]] = {}
+    if compiled:
+        # A graph keeps its memory, so that large batches of the others would no longer fit: it comes last.
+        graphs["ours bf16 compiled, CUDA graphs"] = ours("bf16", mode="reduce-overhead")
+        variants["ours bf16 compiled"] = ours("bf16", compile=True)
+        variants["ours bf16, cuDNN tuned"] = with_cudnn(ours("bf16"), benchmark=True)
+    else:
+        typical = typical_step(scale, device)
+        variants["typical fp32"] = lambda: typical((images[0], images[2]), (images[1], images[3]))
+        variants |= {"floor fp32": lambda: floors["fp32"](close), "ours fp32": ours("fp32")}
+    if lightly_parts.INSTALLED and not compiled:
         moco = lightly_parts.LightlyStep(scale.trunk, device)
         variants["lightly's parts, fp32"] = lambda: moco((images[0], images[2]), (images[1], images[3]))
-    if scale.compile:
-        variants["ours bf16 compiled"] = ours("bf16", compile=True)
-        variants["ours bf16 compiled, CUDA graphs"] = ours("bf16", mode="reduce-overhead")
-        variants["ours bf16, cuDNN tuned"] = tuned(ours("bf16"))
-    seconds = interleave(variants, scale.rounds, device)
+    lost: dict[str, str] = {}
+    seconds = interleave(variants, scale.rounds, device, lost)
+    memory = {name: peak_memory(run, device) for name, run in variants.items() if name not in lost}
+    seconds |= interleave(graphs, scale.rounds, device, lost)
     flop = floors["fp32"].flop([image[:8] for image in close]) * scale.batch // 8
     peaks = {p: peak(device, p) for p in ("fp32", "bf16")}
     rows = {}
@@ -197,14 +228,14 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device) -> dict[st
         precision = "bf16" if "bf16" in name else "fp32"
         rows[name] = {
             "pairs_per_s": scale.batch / value,
-            "of_floor": seconds[f"floor {precision}"] / value,
+            "of_floor": seconds.get(f"floor {precision}", float("nan")) / value,
             "tflop_per_s": flop / value / 1e12,
             "of_matmul_peak": flop / value / peaks[precision]["matmul"],
             "of_conv_peak": flop / value / peaks[precision]["conv"],
-            "over_typical": seconds["typical fp32"] / value,
-            **peak_memory(variants[name], device),
+            "over_typical": seconds.get("typical fp32", float("nan")) / value,
+            **memory.get(name, {}),
         }
-    return {"flop_per_pair": flop / scale.batch, "peak_flop_per_s": peaks, "variants": known(rows)}
+    return {"flop_per_pair": flop / scale.batch, "peak_flop_per_s": peaks, "variants": known(rows), "lost": lost}
 
 
 def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
@@ -221,19 +252,28 @@ def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
         if device.type == "cpu" and random_views.fused():
             ours |= {f"{name}, without numba": in_torch(call) for name, call in ours.items()}
         variants |= ours
-    seconds = interleave(variants, scale.rounds, device)
+    cuda = device.type == "cuda"
+    seconds = steady(variants, workers, scale.rounds, device) if cuda else interleave(variants, scale.rounds, device)
     speeds = {n: (1 if "alone" in n else 4) * scale.batch / s for n, s in seconds.items()}  # a pair is four images
     return known({n: {"images_per_s": v, "over_typical": v / speeds["typical, JPEG files"]} for n, v in speeds.items()})
 
 
-def tuned(call: Callable[[], object]) -> Callable[[], object]:
-    """Wrap ``call`` with cuDNN benchmark mode, which ``mvitac`` does not use."""
+def with_cudnn(call: Callable[..., object], **flags: bool) -> Callable[..., object]:
+    """Wrap ``call`` so that ``torch.backends.cudnn`` has these flags while it runs."""
 
-    def trying() -> object:
-        with torch.backends.cudnn.flags(enabled=True, benchmark=True):
-            return call()
+    def put(values: dict[str, bool]) -> None:
+        for name, value in values.items():
+            setattr(torch.backends.cudnn, name, value)
 
-    return trying
+    def wrapped(*given: object) -> object:
+        before = {name: getattr(torch.backends.cudnn, name) for name in flags}
+        try:
+            put(flags)
+            return call(*given)
+        finally:
+            put(before)
+
+    return wrapped
 
 
 def in_torch(call: Callable[[], object]) -> Callable[[], object]:
@@ -253,7 +293,7 @@ def feed(run: Run, pack: Pack, device: torch.device) -> Any:
 
 def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
     """Measure pairs/s from stored data to updated weights, also as a share of the step alone."""
-    loader, old = typical_batches(folder, scale.size, scale.batch, workers), TypicalStep(scale.trunk, device)
+    loader, old = typical_batches(folder, scale.size, scale.batch, workers), typical_step(scale, device)
 
     def typical() -> None:
         a, b, c, d = (views.to(device) for views in next(loader))
@@ -266,7 +306,8 @@ def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
         "ours bf16, step alone": lambda: step([lambda: alone], lr=1e-3, seed=0, progress=0.5),
         "ours bf16, pack to weights": lambda: step(next(parts), lr=1e-3, seed=0, progress=0.5),
     }
-    seconds = interleave(variants, scale.rounds, device)
+    cuda = device.type == "cuda"
+    seconds = steady(variants, workers, scale.rounds, device) if cuda else interleave(variants, scale.rounds, device)
     first, only = seconds["typical, JPEG files to weights"], seconds["ours bf16, step alone"]
     rows = {
         n: {"pairs_per_s": scale.batch / s, "over_typical": first / s, "of_step_alone": only / s}
@@ -323,6 +364,53 @@ def show(console: Console, title: str, rows: dict[str, dict[str, float]]) -> Non
     console.print(table)
 
 
+def measure(options: argparse.Namespace, scale: Scale, batches: list[int], save: Callable[[dict], object]) -> dict:
+    """Run the sections that were asked for. ``save`` is called with all results after each."""
+    device, console, workers = torch.device(options.device), Console(), options.workers
+    result: dict[str, Any] = {
+        "date": datetime.now(UTC).isoformat(timespec="minutes"),
+        "device": describe(device),
+        "load": os.getloadavg()[0],
+        "scale": asdict(scale),
+        **provenance(),
+    }
+
+    def keep(place: dict[str, Any], name: str, title: str, found: dict[str, Any]) -> None:
+        place[name] = found
+        show(console, title, found.get("variants", found))
+        save(result)
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        needs = {"input", "whole", "probe"} & set(options.sections)
+        write_jpegs(folder / "jpegs", max(scale.num_pairs, *batches) if needs else 1)
+        stored = round(scale.size * 8 / 7)  # 256 for 224 px; above 1.5 times, torch makes the views
+        pack = build(Jpegs(folder / "jpegs"), folder / "pack", size=stored, quiet=True)
+        given = folder / "jpegs", pack, device, workers
+        for batch in batches:
+            at = replace(scale, batch=batch)
+            part = result.setdefault(f"batch {batch}", {})
+            if "step" in options.sections:
+                title = f"step, batch {batch}, {scale.size} px, {scale.trunk}"
+                keep(part, "step", title, measure_steps(at, pack.spec, device))
+            if "compiled" in options.sections and batch == batches[0]:  # takes minutes
+                keep(part, "compiled", "compiled", measure_steps(at, pack.spec, device, compiled=True))
+            if "input" in options.sections:
+                keep(part, "input", "input", measure_input(at, *given))
+            if "whole" in options.sections:
+                keep(part, "whole", "end to end", measure_whole(at, *given))
+                hours = part["whole"]["hours_for_the_papers_pretraining"]
+                console.print(f"the paper's pre-training (92k pairs x 240 epochs) at this speed: {hours:.1f} h")
+        if "probe" in options.sections:
+            found = measure_probe(scale, pack, device, 500 if options.quick else 5000)
+            keep(result, "probe", "the paper's probe: 5 seeds x 3 tasks x 3 modalities", found)
+    if "caching" in options.sections:
+        sizes = (16, 64, 8) if options.quick else (256, 4096, 256) if device.type == "cuda" else (64, 256, 32)
+        keep(result, "caching", "gradient caching, bf16", measure_caching(scale, device, *sizes))
+    console.print(f"{result['device']}, load {result['load']:.1f}, commit {result['commit']}", highlight=False)
+    return result
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small trunk at 64 px, under a minute")
@@ -332,57 +420,22 @@ def main() -> None:
     )
     parser.add_argument("--rounds", type=int, help="measurements per variant; default 5 on a CPU, 10 on a GPU")
     parser.add_argument(
-        "--workers", type=int, help="processes of the typical DataLoader; default 0 on a CPU, up to 8 on a GPU"
+        "--workers", type=int, help="processes of the typical DataLoader; default 0 on a CPU, up to 16 on a GPU"
     )
-    parser.add_argument("--sections", nargs="+", default=list(SECTIONS), choices=SECTIONS, help="default: all")
-    parser.add_argument("--json", type=Path, help="write the results to this file")
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, help="default: all; on a CPU without compiled")
+    parser.add_argument("--json", type=Path, help="write the results to this file, after each section")
     options = parser.parse_args()
-    device, console = torch.device(options.device), Console()
-    cuda = device.type == "cuda"
-    scale = Scale(compile=cuda, rounds=10 if cuda else 5, num_pairs=1024 if cuda else 128)
-    workers = min(8, os.cpu_count() or 1) if cuda else 0
-    workers = workers if options.workers is None else options.workers
+    cuda = options.device.startswith("cuda")
+    options.sections = options.sections or [s for s in SECTIONS if cuda or s != "compiled"]
+    scale = Scale(rounds=10 if cuda else 5, num_pairs=512 if cuda else 128)
+    if options.workers is None:
+        options.workers = min(16, os.cpu_count() or 1) if cuda else 0
     if options.quick:
         scale = Scale(trunk="resnet10t", size=64, batch=16, rounds=3, num_pairs=32)
     scale = replace(scale, rounds=options.rounds or scale.rounds)
-    batches = options.batch or ([256, 1024] if cuda and not options.quick else [scale.batch])
     keep_freed_memory()
-    result: dict[str, Any] = {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "device": describe(device),
-        "load": os.getloadavg()[0],
-        "scale": asdict(scale),
-        **provenance(),
-    }
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        write_jpegs(folder / "jpegs", max(scale.num_pairs, *batches))
-        stored = round(scale.size * 8 / 7)  # 256 for 224 px; above 1.5 times, torch makes the views
-        pack = build(Jpegs(folder / "jpegs"), folder / "pack", size=stored, quiet=True)
-        for batch in batches:
-            at = replace(scale, batch=batch, compile=scale.compile and batch == batches[0])  # compiling takes a minute
-            part = result.setdefault(f"batch {batch}", {})
-            if "step" in options.sections:
-                part["step"] = measure_steps(at, pack.spec, device)
-                show(console, f"step, batch {batch}, {scale.size} px, {scale.trunk}", part["step"]["variants"])
-            if "input" in options.sections:
-                part["input"] = measure_input(at, folder / "jpegs", pack, device, workers)
-                show(console, "input", part["input"])
-            if "whole" in options.sections:
-                part["whole"] = measure_whole(at, folder / "jpegs", pack, device, workers)
-                show(console, "end to end", part["whole"]["variants"])
-                hours = part["whole"]["hours_for_the_papers_pretraining"]
-                console.print(f"the paper's pre-training (92k pairs x 240 epochs) at this speed: {hours:.1f} h")
-        if "probe" in options.sections:
-            result["probe"] = measure_probe(scale, pack, device, 500 if options.quick else 5000)
-            show(console, "the paper's probe: 5 seeds x 3 tasks x 3 modalities", result["probe"])
-    if "caching" in options.sections:
-        sizes = (64, 1024, 32) if cuda else (16, 64, 8) if options.quick else (64, 256, 32)
-        result["caching"] = measure_caching(scale, device, *sizes)
-        show(console, "gradient caching, bf16", result["caching"])
-    console.print(f"{result['device']}, load {result['load']:.1f}, commit {result['commit']}", highlight=False)
-    if options.json:
-        write_json(options.json, result)
+    batches = options.batch or ([256, 1024] if cuda and not options.quick else [scale.batch])
+    measure(options, scale, batches, lambda result: options.json and write_json(options.json, result))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, RandomSampler
 from torchvision.transforms import v2
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -111,6 +111,7 @@ def write_jpegs(folder: Path, num: int) -> None:
 def typical_batches(folder: Path, size: int, batch: int, workers: int) -> Iterator[list[Tensor]]:
     """Yield shuffled batches of four views [B, 3, S, S], without end."""
     random.seed(0)
-    loader = DataLoader(TypicalDataset(folder, size), batch, shuffle=True, num_workers=workers, drop_last=True)
-    while True:
-        yield from loader
+    dataset = TypicalDataset(folder, size)
+    # One long epoch: between short ones, most workers would wait, and all would start again.
+    order = RandomSampler(dataset, replacement=True, num_samples=1_000_000 * batch)
+    yield from DataLoader(dataset, batch, sampler=order, num_workers=workers)

@@ -45,6 +45,15 @@ def ctrl_c() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture
+def forked_pools(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pools of processes begin at once (``support.processes``); new ones would import torch, 5 s of CPU each."""
+    from mvitac.system import processes
+    from support.processes import CONTEXT
+
+    monkeypatch.setattr(processes, "_Context", lambda: CONTEXT)
+
+
 @pytest.fixture(scope="session")
 def smoke_run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of eight steps on the striped pairs."""

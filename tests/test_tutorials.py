@@ -6,8 +6,8 @@ So does the how-to page docs/encoders.md, on the files that a tutorial leaves.
 from __future__ import annotations
 
 import csv
+import os
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 from mvitac.data.pack import Pack
+from support.processes import begin, finish
 
 PAGES = sorted(p for p in (Path(__file__).parents[1] / "docs/tutorials").glob("*.md") if p.name != "index.md")
 
@@ -27,10 +28,11 @@ def cells(file: Path) -> list[tuple[str, str]]:
     return [(cell.cell_type, cell.source) for cell in jupytext.read(file).cells]
 
 
-def run(page: Path) -> None:
-    """Run the code cells of ``page``. Its commands run in this process, which spares each the import of torch."""
+def run(page: Path, folder: Path) -> None:
+    """Run the code cells of ``page`` in ``folder``. Its commands run in this process: each would import torch."""
     from mvitac.cli.main import main
 
+    os.chdir(folder)
     names = vars(sys.modules["__main__"])  # where a notebook's cells define their names, too
     for kind, source in cells(page):
         if kind != "code":
@@ -47,8 +49,8 @@ def run(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
 def test_every_cell_runs(page: Path, tmp_path: Path) -> None:
     """In a process of its own: a tutorial may register a method that the other tests must not see."""
-    ended = subprocess.run([sys.executable, __file__, page], cwd=tmp_path, capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
+    (folder := tmp_path / "folder").mkdir()
+    finish(begin(run, page, folder, output=tmp_path / "output"), tmp_path / "output")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
@@ -82,7 +84,3 @@ def test_encoders_page_runs(artifact: Path, pack: Pack, tmp_path: Path, monkeypa
     assert np.allclose(
         names["theirs"](Image.open(names["touches"][0])), names["prepare"](names["touches"][0]), atol=1e-5
     )
-
-
-if __name__ == "__main__":
-    run(Path(sys.argv[1]))

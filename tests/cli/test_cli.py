@@ -158,12 +158,13 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.usefixtures("forked_pools")
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = [
         "--data.num",
-        "800",
+        "240",
         "--data.touches",
         "2",
         "--data.size",
@@ -173,6 +174,7 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
         "--augment.whole",
         "32",
     ]
+    small += ["--data.workers", "1"]
     tiny = ["--encoder.trunk", "mvitac_tiny", "--steps", "2", "--batch-size", "16", "--precision", "fp32"]
     command = ["demo", "--out", str(tmp_path / "demo"), "--seeds", "2", *small, *tiny]
     assert main(command) == 0

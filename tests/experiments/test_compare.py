@@ -341,7 +341,7 @@ def test_a_run_that_diverges_is_told_and_the_rest_goes_on(pack: Pack, tmp_path: 
         gather(lost, tmp_path, ProbeConfig(controls=False))
 
 
-@pytest.mark.usefixtures("ctrl_c")
+@pytest.mark.usefixtures("ctrl_c", "forked_pools")
 def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_path: Path) -> None:
     work = lay_out(
         small(pack, seeds=3, set={"steps": 30000, "eval_every": 0}), pack, tmp_path, ProbeConfig(controls=False)
@@ -363,6 +363,7 @@ def test_ctrl_c_saves_the_runs_under_way_and_begins_no_other(pack: Pack, tmp_pat
     assert 2 <= len(steps) <= 4 and 0 < min(steps) <= max(steps) < 30000
 
 
+@pytest.mark.usefixtures("forked_pools")
 @pytest.mark.parametrize("num_jobs", [1, 2])
 def test_a_run_that_fails_is_told_and_the_others_go_on(
     done: tuple[Path, dict], pack: Pack, tmp_path: Path, num_jobs: int

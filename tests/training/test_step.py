@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -191,3 +192,11 @@ def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyP
 def test_networks_with_dropout_are_not_side_by_side() -> None:
     assert draws_random_numbers(build())
     assert not draws_random_numbers(build(replace(RUN, method=MViTacConfig())))
+
+
+def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As ``--compile`` asks torch for it; without machine code, which takes a minute."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    run = replace(RUN, method=MViTacConfig())
+    plain, compiled = (take(replace(run, compile=c), build(run).train(), [views])["loss"] for c in (False, True))
+    assert torch.equal(plain, compiled)

@@ -110,8 +110,9 @@ def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dic
     Returns:
         The tensors of all branches in one dict.
     """
-    threads = torch.get_num_threads()
-    if threads < 2 or len(branches) < 2 or torch.compiler.is_compiling() or torch.distributed.is_initialized():
+    one = torch.compiler.is_compiling() or len(branches) < 2 or torch.distributed.is_initialized()
+    threads = 1 if one else torch.get_num_threads()  # torch.compile cannot ask for it
+    if threads < 2:
         return {name: tensor for branch in branches for name, tensor in branch().items()}
     cpu = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu"), torch.is_grad_enabled()
 

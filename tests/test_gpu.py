@@ -1,0 +1,150 @@
+"""benchmarks/gpu.sh: a rehearsal on a CPU, its time limit, and the tables that it fills."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from benchmarks import gpu, gpu_tables, speed
+
+from mvitac.cli.main import main as mvitac
+from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.experiments.plan import Plan
+from mvitac.registry import from_json
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def commands(monkeypatch):
+    """The commands of the script, which run in this process: four new ones would import torch for 25 s."""
+    ran: list[list[str]] = []
+
+    def here(self: gpu.Session, name: str, command: list[str], seconds: float, tick: Any = lambda: None) -> int:
+        ran.append(command)
+        module, *rest = command
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", command)
+            speed.main() if module == "benchmarks.speed" else mvitac(rest)
+        tick()
+        return 0
+
+    monkeypatch.setattr(gpu.Session, "child", here)
+    monkeypatch.setenv("MVITAC_CACHE", "")  # the script sets it
+    return ran
+
+
+def test_a_rehearsal_measures_all_and_goes_on_elsewhere(commands, tmp_path, monkeypatch):
+    def call(out: str, work: str, *more: str) -> dict[str, Any]:
+        folders = ["--out", str(tmp_path / out), "--work", str(tmp_path / work)]
+        gpu.main(["--smoke", "--device", "cpu", *folders, *more])
+        return json.loads((tmp_path / out / "gpu.json").read_text())
+
+    first = call("first", "first-work", "--minutes", "0.5")  # too short for anything but data
+    assert first["data"]["num"] in gpu.SMOKE.pairs and not commands
+    first = call("first", "first-work", "--minutes", "10")
+    steps = first["speed"]["4"]["batch 4"]["step"]
+    assert first["speed"]["4"]["finished"] and not steps["lost"]
+    assert {"typical fp32", "floor bf16", "ours fp32", "ours bf16"} <= steps["variants"].keys()
+    rows = [row["label"] for row in gpu.plan(gpu.SMOKE)["rows"]]
+    assert first["table"]["rows"] == rows and not first["table"]["unfinished"] and len(first["runs"]) == len(rows)
+    assert {"untrained", *rows} <= {cell["row"] for cell in first["table"]["cells"]}
+    assert [module for module, *_ in commands] == ["benchmarks.speed", "mvitac"]
+
+    commands.clear()
+    again = call("again", "again-work", "--minutes", "10", "--resume", str(tmp_path / "first"))
+    assert [module for module, *_ in commands] == ["mvitac"] and again["table"] == first["table"]
+    assert again["data"]["digest"] == first["data"]["digest"] and len(again["sessions"]) == 3
+    assert not list(tmp_path.glob("again-work/table/runs/*/*/model.safetensors"))  # nothing was trained again
+
+    monkeypatch.setattr(gpu, "SMOKE", gpu.Size())
+    with pytest.raises(ValueError, match="measured with other settings: give another --out"):
+        call("again", "again-work")
+
+
+def test_a_part_is_stopped_at_its_limit(tmp_path):
+    options = {"out": tmp_path / "out", "work": tmp_path / "work", "device": "cpu", "minutes": 1.0}
+    session = gpu.Session(gpu.argparse.Namespace(**options, smoke=True, resume=None, commit="abc"))
+    assert session.child("quick", ["timeit", "-n1", "-r1", "pass"], 60) == 0
+    assert session.child("wrong", ["timeit", "-n1", "-r1", "nothing"], 60) == 1
+    start = time.monotonic()
+    assert session.child("slow", ["timeit", "-n1", "-r1", "-s", "import time", "time.sleep(60)"], 0.5) is None
+    assert time.monotonic() - start < gpu.GRACE
+    assert "NameError" in (tmp_path / "out" / "log").read_text()
+    assert session.found["sessions"][-1]["commit"] == "abc"
+
+
+def test_the_plan_of_a_gpu_is_the_rows_of_table_1():
+    plan: Plan = from_json(Plan, json.loads(json.dumps(gpu.plan(gpu.Size()))), "plan")
+    data = MaterialsConfig(num=2000, size=256)
+    runs = {row.label: plan.run(row, data, 0) for row in plan.rows}
+    assert all((run.encoder.trunk, run.augment.size, run.batch_size) == ("resnet18", 224, 256) for run in runs.values())
+    paper, modern, ssvtp, *_ = runs.values()
+    assert (paper.method.keys, paper.positives, paper.method.temperature) == ("momentum", "same-image", 0.07)
+    assert (modern.method.keys, modern.positives) == ("end-to-end", "same-touch")
+    assert ssvtp.steps == 2 * modern.steps and ssvtp.method.name == "ssvtp"
+
+
+def test_every_call_of_speed_is_valid(monkeypatch):
+    asked = []
+    monkeypatch.setattr(speed, "measure", lambda options, scale, batches, save: asked.append((options, batches)))
+    monkeypatch.setattr(speed, "keep_freed_memory", lambda: None)
+    for _, given in gpu.Size().speed:
+        monkeypatch.setattr(sys, "argv", ["speed", "--device", "cuda", *shlex.split(given)])
+        speed.main()
+    batches = {"step": set(), "compiled": set()}
+    for options, sizes in asked:
+        for section in batches.keys() & set(options.sections):
+            batches[section] |= set(sizes)
+    assert batches == {"step": {64, 256, 1024, 4096}, "compiled": {64, 256, 1024, 4096}}
+
+
+def test_the_script_starts_anywhere():
+    made = subprocess.run(
+        [ROOT / "benchmarks" / "gpu.sh", "--help"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHON": sys.executable},
+    )
+    assert made.returncode == 0 and "--minutes" in made.stdout, made.stderr
+
+
+def test_docs_show_the_figures_that_are_kept():
+    found = json.loads(gpu_tables.KEPT.read_text()) if gpu_tables.KEPT.exists() else {}
+    for page, names in gpu_tables.PAGES.items():
+        assert page.read_text() == gpu_tables.filled(page.read_text(), names, found), "python -m benchmarks.gpu_tables"
+
+
+def test_figures_reach_their_cells():
+    row = {"pairs_per_s": 2900.0, "of_floor": 0.97, "of_matmul_peak": 0.31, "over_typical": 9.25, "peak_gib": 7.5}
+    lost = {"ours bf16 compiled, CUDA graphs": "out of memory"}
+    compiled = {"variants": {"ours bf16 compiled": {**row, "pairs_per_s": 3456.0}}, "lost": lost}
+    whole = {"variants": {}, "hours_for_the_papers_pretraining": 0.62}
+    label = gpu.plan(gpu.Size())["rows"][1]["label"]
+    cell = {"row": label, "task": "soft", "modality": "both", "mean": 0.712, "low": 0.7, "high": 0.724}
+    found = {
+        "speed": {
+            "256": {"batch 256": {"step": {"variants": {"ours bf16": row}, "lost": {}}, "whole": whole}},
+            "256 compiled": {"batch 256": {"compiled": compiled}},
+        },
+        "table": {
+            "cells": [cell],
+            "cost": [{"row": label, "seeds": 2, "seconds": 131.0}],
+            "retrieval": [{"source": label, "direction": "vision -> touch", "R@5": r} for r in (0.2, 0.3)],
+        },
+    }
+    steps = gpu_tables.step_table(found)
+    assert "| 256 | `mvitac`, bf16 | 2,900 | 0.97 | 0.31 | 9.25 | 7.5 |" in steps
+    assert "| 256 | the same, compiled | 3,456 |" in steps
+    assert "| 256 | the same, compiled, CUDA graphs | not possible |" in steps
+    assert "| 64 | `mvitac`, bf16 |  |  |  |  |  |" in steps
+    assert "| the paper's pre-training, hours |  | 0.62 |  |" in gpu_tables.input_table(found)
+    line = next(line for line in gpu_tables.rows_table(found).splitlines() if label in line)
+    assert line == f"| {label} | 2 |  |  |  |  |  | 71.2 [70.0, 72.4] |  |  |  | 25.0 |  | 131 |"
