@@ -98,12 +98,13 @@ class Run:
     sampler: Literal["shuffle", "one-per-touch"] = "shuffle"
     """Order of the rows. shuffle: random permutation (paper). one-per-touch: rows of one touch group go to different
     batches, so that near-duplicates are not used as negatives of each other."""
-    positives: Literal["same-image", "same-touch", "same-touch-pairs"] = "same-image"
-    """Which image is the positive. same-image: another view of the same row (paper). same-touch: a view of another row of
-    the same touch group (another frame of the contact, or another press of the object). Lamp, background, sensor and
-    position then differ between the two views and do not reveal the match. A row without others in its group is its own
-    partner. For one-view methods (ssvtp, cmc) both mean the vision and touch of one row. same-touch-pairs gives one-view
-    methods the vision of one row and the touch of another."""
+    positives: Literal["same-image", "same-press", "same-touch", "same-touch-pairs"] = "same-image"
+    """Which image is the positive. same-image: another view of the same row (paper). same-press: a view of another moment
+    of the same press (rows with the same value in column press). same-touch: a view of another row of the same touch group:
+    another press of the same instance in the simulator, another frame of the same contact in Touch and Go. Only between
+    presses do lamp, background, sensor and position differ, so that they do not reveal the match. A row without others is
+    its own partner. For one-view methods (ssvtp, cmc) all three mean the vision and touch of one row. same-touch-pairs
+    gives one-view methods the vision of one row and the touch of another."""
     precision: Literal["auto", "fp32", "tf32", "bf16"] = "fp32"
     """Arithmetic of the networks. Losses, weights and the optimiser stay in fp32. auto: bf16 where the hardware computes it
     (GPUs from Ampere, CPUs with AVX512-BF16 or AMX), else fp32; run.json says which. fp32 never uses TF32. tf32 lets a GPU

@@ -188,13 +188,34 @@ class Pack:
         return np.unique(self.column(name).astype(str), return_inverse=True)[1]
 
     @functools.cached_property
+    def presses(self) -> np.ndarray:
+        """int64 [N], number of each row's press (column press): its rows are moments of one press.
+
+        Raises:
+            ValueError: If the pack has no such column.
+        """
+        if "press" not in self.table.column_names:
+            raise ValueError(
+                "same-press positives need a column 'press', which says which rows are moments of one press: simulate"
+                " with --data.moments 2, or use same-touch where a touch group is the frames of one press"
+            )
+        return np.unique(self.column("press").astype(str), return_inverse=True)[1]
+
+    @functools.cached_property
+    def _rows_by_press(self) -> list[np.ndarray]:
+        return _rows_by(self.presses)
+
+    @functools.cached_property
     def _rows_by_touch_group(self) -> list[np.ndarray]:
-        order = np.argsort(self.touch_groups, kind="stable")
-        return np.split(order, np.cumsum(np.bincount(self.touch_groups))[:-1])
+        return _rows_by(self.touch_groups)
 
     def rows_of(self, touch_group: int) -> np.ndarray:
         """Return the row numbers of touch group number ``touch_group``, ascending."""
         return self._rows_by_touch_group[touch_group]
+
+    def rows_of_press(self, press: int) -> np.ndarray:
+        """Return the row numbers of press number ``press``, ascending."""
+        return self._rows_by_press[press]
 
     @functools.cached_property
     def shards(self) -> np.ndarray:
@@ -269,6 +290,11 @@ class Pack:
             held = f"{images.dtype} {images.shape}" if isinstance(images, np.ndarray) else "no array"
             raise ValueError(f"{path} holds {held}, pack.json promises uint8 {expected}")
         return images
+
+
+def _rows_by(numbers: np.ndarray) -> list[np.ndarray]:
+    """The rows that have number 0, 1, ... of ``numbers`` [N], each ascending."""
+    return np.split(np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1])
 
 
 def check_table(table: pa.Table, spec: DataSpec) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from mvitac.system.distributed import World
 
 def training_rows(run: Run, pack: Pack) -> np.ndarray:
     """Pack rows to train on: train and unlabelled, with both modalities, and with a label if the method needs labels."""
+    if run.positives == "same-press":
+        _ = pack.presses  # the ValueError comes before anything is written
     rows = pack.rows("train", "unlabelled", having=pack.spec.modalities)
     tasks = run.method.labels_needed(pack.spec)
     if not tasks:
@@ -145,17 +148,20 @@ def shard_order(
     return lanes
 
 
-def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
-    """For each of ``rows`` a random other row of the same touch group, split and shard.
+def partners(
+    pack: Pack, rows: np.ndarray, generator: torch.Generator, of: Literal["touch group", "press"] = "touch group"
+) -> np.ndarray:
+    """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
     A row without such others is its own partner.
     """
-    groups, split, shards = pack.touch_groups, pack.column("split"), pack.shards
+    groups, rows_of = (pack.presses, pack.rows_of_press) if of == "press" else (pack.touch_groups, pack.rows_of)
+    split, shards = pack.column("split"), pack.shards
     whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
-        others = pack.rows_of(int(groups[row]))
+        others = rows_of(int(groups[row]))
         others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         others = others[shards[others] == shards[row]]
         if len(others):
