@@ -21,7 +21,7 @@ from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.probe import score_rows, split_rows
-from mvitac.evaluation.scores import cell_text, columns_of, resampled, sources_of, summarise, tested_on
+from mvitac.evaluation.scores import cell_text, columns_of, covered, sources_of, summarise, tested_on
 from mvitac.model import Model, load
 from mvitac.nn.encoders import SCRATCH, build_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
@@ -248,7 +248,7 @@ def _score_tables(scores: dict[str, Any]) -> list[str]:
     by = scores["group_by"]
     lines = [
         f"Accuracy in percent of linear probes, on {by}s that neither encoders nor probes saw. The rows below the first are"
-        f" controls. 95 % intervals: {resampled(by, 1)}.",
+        f" controls. 95 % intervals: {covered(by, scores['records'])}.",
         "",
     ]
     for name, task in scores["summary"].items():

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mvitac.evaluation.scores import cell_text, columns_of, interval, percent, resampled, sources_of, tested_on
+from mvitac.evaluation.scores import cell_text, columns_of, covered, interval, percent, sources_of, tested_on
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
@@ -17,7 +17,6 @@ RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
     """Print one table per task: accuracy in percent, mean and 95 % interval."""
-    seeds = 0
     for name, task in result["summary"].items():
         modalities = columns_of(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
@@ -32,7 +31,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         for source in sources_of(task):
             table.add_row(source, *(cell_text(task, source, m) for m in modalities))
         console.print(table)
-    console.print(f"95 % intervals: {resampled(result['group_by'], seeds)}.", style="dim")
+    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
 

@@ -243,7 +243,12 @@ def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -
 
 
 def _look(
-    thing: Instance, rng: np.random.Generator, angle: float, place: NDArray[np.float64], size: int, motion: Motion | None
+    thing: Instance,
+    rng: np.random.Generator,
+    angle: float,
+    place: NDArray[np.float64],
+    size: int,
+    motion: Motion | None,
 ) -> NDArray[np.uint8]:
     """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
     x, y, pixel = _grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
