@@ -12,7 +12,7 @@ from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.recipes import RECIPES, recipe
+from mvitac.recipes import RECIPES, recipe, with_method
 from mvitac.registry import from_json, to_json
 from mvitac.run import Run
 
@@ -42,7 +42,8 @@ def test_authors_constants() -> None:
     method = run.method
     assert isinstance(method, MViTacConfig)
     assert (method.momentum, method.lambda_inter, method.hidden, method.dropout) == (0.99, 1, 2048, 0.5)
-    assert (run.optim.lr, run.optim.weight_decay, run.optim.eps, run.optim.schedule) == (1e-3, 1e-6, 1e-8, "step")
+    assert (run.optim.lr, run.optim.weight_decay, run.optim.eps, run.optim.schedule) == (1e-3, 1e-6, 1e-8, "late-step")
+    assert (run.encoder.stem, run.augment.eval_size, run.optim.decay_norms) == ("random", 256, True)
     assert run.augment.touch.independent_sensors and run.augment.touch.flip == 0.25
     assert run.augment.touch.grayscale == 0.2
     assert (run.batch_size, run.epochs) == (256, 240)
@@ -133,3 +134,23 @@ def test_a_new_dataset_says_itself_that_its_rows_are_phases() -> None:
 
 def test_a_recipe_takes_an_open_pack(pack: Pack) -> None:
     assert recipe("smoke", pack) == recipe("smoke", PackConfig(path=pack.path))
+
+
+def test_records_without_later_fields_mean_what_they_meant() -> None:
+    """Runs before these fields: nearly frozen prototypes, all of CMC's negatives, decayed norms. Digests are unchanged."""
+    for name in ("dino", "cmc"):
+        run = with_method(recipe("modern"), name)
+        old = to_json(run)
+        for inner, key in (("method", "prototype_norm"), ("method", "negatives_per_row"), ("optim", "decay_norms")):
+            old[inner].pop(key, None)
+        loaded = Run.load(old)
+        assert loaded.optim.decay_norms and loaded.digest() != run.digest()
+        method = loaded.method
+        assert method == (
+            replace(run.method, prototype_norm=16.0) if name == "dino" else replace(run.method, negatives_per_row=0.0)
+        )
+        written = to_json(loaded, for_digest=True)
+        assert (
+            not {"prototype_norm", "negatives_per_row"} & set(written["method"])
+            and "decay_norms" not in written["optim"]
+        )

@@ -74,6 +74,11 @@ LATER_IN_DIGEST = {"later in digest": True}
 """Metadata of a field that is always written, but is omitted from digests at its default, so that old digests stay valid."""
 
 
+def later_in_digest(before: Any) -> dict[str, Any]:
+    """``LATER_IN_DIGEST`` for a field whose default is new: files without it, and digests, mean the value ``before``."""
+    return {**LATER_IN_DIGEST, "before": before}
+
+
 def to_json(config: Any, *, for_digest: bool = False) -> Any:
     """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``.
 
@@ -82,9 +87,14 @@ def to_json(config: Any, *, for_digest: bool = False) -> Any:
         for_digest: Leave out the fields of ``LATER_IN_DIGEST`` that have their default.
     """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        omitted = (LATER, LATER_IN_DIGEST) if for_digest else (LATER,)
+        omitted = ("later", "later in digest") if for_digest else ("later",)
         all_fields = dataclasses.fields(config)
-        written = [f for f in all_fields if f.metadata not in omitted or getattr(config, f.name) != f.default]
+        written = [
+            f
+            for f in all_fields
+            if not any(f.metadata.get(kind) for kind in omitted)
+            or getattr(config, f.name) != f.metadata.get("before", f.default)
+        ]
         fields = {f.name: to_json(getattr(config, f.name), for_digest=for_digest) for f in written}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
@@ -154,6 +164,7 @@ def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in given:
             raise ValueError(f"{where}: field {field.name!r} is missing")
+    given |= {f.name: f.metadata["before"] for f in fields if "before" in f.metadata and f.name not in given}
     return cls(**{key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()})
 
 

@@ -15,7 +15,7 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import LATER
+from mvitac.registry import LATER_IN_DIGEST
 from mvitac.sim import grasps, materials
 
 LICENCE = "Apache-2.0 (made by this package)"
@@ -54,7 +54,7 @@ class MaterialsConfig(SimulatedConfig):
 
     touches: int = 5
     """Touches per instance, each with its own position, force, sensor and lamp."""
-    moments: int = field(default=1, metadata=LATER)
+    moments: int = field(default=1, metadata=LATER_IN_DIGEST)
     """Rows per touch: moments of one press, which differ in a little movement, force and noise (for same-press)."""
     difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
     """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
