@@ -27,7 +27,7 @@ from mvitac.run import Optim
 from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
-from mvitac.training.sampler import epoch_order, partners, spread_order, training_rows
+from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order, training_rows
 from mvitac.training.validation import evaluate
 from mvitac.training.views import make_views
 from support.processes import begin, finish
@@ -244,15 +244,36 @@ def test_spread_has_no_tail_of_duplicates() -> None:
     assert not np.array_equal(spread_order(len(groups), groups, 1), spread_order(len(groups), groups, 2))
 
 
+def test_the_spread_sampler_spreads(pack: Pack) -> None:
+    run, rows = smoke(pack, sampler="spread"), pack.rows("train")
+    order = spread_order(len(rows), pack.touch_groups[rows], mix(run.seed, 1, 0))
+    per_epoch = run.steps_per_epoch(len(rows))
+    found = np.concatenate(list(batches(run, pack, rows, 0, per_epoch)))
+    assert np.array_equal(found, rows[order[: len(found)]])
+
+
 def test_partners_of_the_same_press(tmp_path: Path) -> None:
     pack = build(MaterialsConfig(num=40, touches=2, moments=3, size=16).source(), tmp_path / "p", size=16, quiet=True)
     rows = np.arange(pack.num)
-    found = partners(pack, rows, torch.Generator().manual_seed(0), "press")
+    found = partners(pack, rows, torch.Generator().manual_seed(0), "presses")
     assert (found != rows).all() and np.array_equal(pack.presses[found], pack.presses[rows])
     wide = partners(pack, rows, torch.Generator().manual_seed(0))
     assert (pack.presses[wide] != pack.presses[rows]).mean() > 0.3
     run = replace(recipe("smoke", PackConfig(path=pack.path)), positives="same-press")
     assert np.array_equal(training_rows(run, pack), pack.rows("train"))
+    asked: list[np.ndarray] = []
+
+    class Spy(Feed):
+        def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
+            asked.append(rows)
+            return super().__call__(modality, rows)
+
+    cpu = torch.device("cpu")
+    make_views(
+        replace(run, augment=replace(run.augment, size=16)), pack, rows, 2, torch.Generator(), cpu, Spy(pack, cpu)
+    )
+    assert [bool((found == rows).all()) for found in asked] == [True, False, True, False]
+    assert all(np.array_equal(pack.presses[found], pack.presses[rows]) for found in asked)
 
 
 def test_same_press_needs_to_know_the_press(pack: Pack) -> None:

@@ -202,20 +202,16 @@ class Pack:
         return np.unique(self.column("press").astype(str), return_inverse=True)[1]
 
     @functools.cached_property
-    def _rows_by_press(self) -> list[np.ndarray]:
-        return _rows_by(self.presses)
+    def _rows_by(self) -> dict[str, list[np.ndarray]]:
+        return {}
 
-    @functools.cached_property
-    def _rows_by_touch_group(self) -> list[np.ndarray]:
-        return _rows_by(self.touch_groups)
-
-    def rows_of(self, touch_group: int) -> np.ndarray:
-        """Return the row numbers of touch group number ``touch_group``, ascending."""
-        return self._rows_by_touch_group[touch_group]
-
-    def rows_of_press(self, press: int) -> np.ndarray:
-        """Return the row numbers of press number ``press``, ascending."""
-        return self._rows_by_press[press]
+    def rows_of(self, number: int, of: Literal["touch_groups", "presses"] = "touch_groups") -> np.ndarray:
+        """Return the row numbers of a touch group (or press), ascending."""
+        if of not in self._rows_by:
+            numbers = getattr(self, of)
+            order = np.argsort(numbers, kind="stable")
+            self._rows_by[of] = np.split(order, np.cumsum(np.bincount(numbers))[:-1])
+        return self._rows_by[of][number]
 
     @functools.cached_property
     def shards(self) -> np.ndarray:
@@ -290,11 +286,6 @@ class Pack:
             held = f"{images.dtype} {images.shape}" if isinstance(images, np.ndarray) else "no array"
             raise ValueError(f"{path} holds {held}, pack.json promises uint8 {expected}")
         return images
-
-
-def _rows_by(numbers: np.ndarray) -> list[np.ndarray]:
-    """The rows that have number 0, 1, ... of ``numbers`` [N], each ascending."""
-    return np.split(np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1])
 
 
 def check_table(table: pa.Table, spec: DataSpec) -> None:

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mvitac.sim.coordinates import Motion, grid, turn
 from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
-from mvitac.sim.motion import Motion
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS
 
@@ -209,20 +209,6 @@ def _check_request(seed: int, category: int, instance: int, touch: int, size: in
         raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
 
 
-def _grid(size: int, width_mm: float) -> tuple[F, F, float]:
-    """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
-    n = 2 * size if size <= 96 else max(192, size)
-    pixel = width_mm / n
-    axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
-    x, y = np.meshgrid(axis, axis)
-    return x, y, pixel
-
-
-def _turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
-    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-    return cos * x + sin * y + np.float32(place[0]), cos * y - sin * x + np.float32(place[1])
-
-
 def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -> F:
     """Return the approximate distance in mm [n, n] inside an outline (< 0 outside): corners for curl 0, lobes for curl 1."""
     cx, cy = rng.normal(0, 0.22 * radius, 2)
@@ -251,13 +237,13 @@ def _look(
     motion: Motion | None,
 ) -> NDArray[np.uint8]:
     """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
-    x, y, pixel = _grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
+    x, y, pixel = grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
     width = float(x.shape[0] * pixel)
     if motion:
         x, y = motion.seen(x, y, width)
     curl = thing.curl
     inside = _outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)
-    texture = thing.sight(*_turn(x, y, angle, place))
+    texture = thing.sight(*turn(x, y, angle, place))
     lines = marks(x, y, rng, curl=curl, extent_mm=width, count=int(rng.integers(2, 4)))
     steep = np.float32(np.exp(rng.uniform(*np.log((0.05, 0.11)))) * thing.sight.wavelength_mm)
     bevel = np.float32(0.06 * width)
@@ -305,8 +291,8 @@ def _table(x: F, y: F, rng: np.random.Generator, width: float, pixel: float) -> 
     """Draw the background [n, n, 3]: a patterned table, and objects with straight and with curved outlines."""
     ground, second = rng.uniform(0.12, 0.7, (2, 3)).astype(np.float32)
     table = rng.standard_normal((64, 64), np.float32)
-    stretch, scale, turn = rng.uniform(1, 5), width * rng.uniform(0.04, 0.15), rng.uniform(0, np.pi)
-    u, v = _turn(x, y, turn, rng.uniform(0, 999, 2))
+    stretch, scale, slanted = rng.uniform(1, 5), width * rng.uniform(0.04, 0.15), rng.uniform(0, np.pi)
+    u, v = turn(x, y, slanted, rng.uniform(0, 999, 2))
     pattern = fractal(u / np.float32(scale * stretch), v / np.float32(scale), table, 3)
     mix = np.clip(np.float32(rng.uniform(0, 0.35)) * pattern + 0.5, 0, 1)[..., None]
     picture = ground * mix + second * (1 - mix)
@@ -337,10 +323,10 @@ def _feel(
     dome = float(rng.uniform(18.0, 40.0))
     tilt = rng.normal(0, 0.04, 2).astype(np.float32)
     shear = rng.normal(0, 0.25, 2)
-    x, y, pixel = _grid(size, _TOUCH_MM)
+    x, y, pixel = grid(size, _TOUCH_MM)
     if motion:
         x, y, force, shear = motion.felt(x, y, force, shear)
-    u, v = _turn(x, y, angle, place)
+    u, v = turn(x, y, angle, place)
     curl = thing.curl
     # Soft objects deform, which would make their imprints shallower, so their relief is higher.
     yielding = GEL_STIFFNESS / thing.stiffness

@@ -176,19 +176,19 @@ def shard_order(
 
 
 def partners(
-    pack: Pack, rows: np.ndarray, generator: torch.Generator, of: Literal["touch group", "press"] = "touch group"
+    pack: Pack, rows: np.ndarray, generator: torch.Generator, of: Literal["touch_groups", "presses"] = "touch_groups"
 ) -> np.ndarray:
     """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
     A row without such others is its own partner.
     """
-    groups, rows_of = (pack.presses, pack.rows_of_press) if of == "press" else (pack.touch_groups, pack.rows_of)
+    groups: np.ndarray = getattr(pack, of)
     split, shards = pack.column("split"), pack.shards
     whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
-        others = rows_of(int(groups[row]))
+        others = pack.rows_of(int(groups[row]), of)
         others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         others = others[shards[others] == shards[row]]
         if len(others):

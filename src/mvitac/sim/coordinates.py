@@ -1,7 +1,4 @@
-"""What changes between two moments of one press: the camera and the hand move a little, and the hand presses harder.
-
-Object, lamp, clutter and sensor stay. The sizes were set by eye, for frames of a video some tenths of a second apart.
-"""
+"""Coordinates of the pictures of materials, and how they change between two moments of one press."""
 
 from __future__ import annotations
 
@@ -13,9 +10,27 @@ from numpy.typing import NDArray
 from mvitac.sim.gel import F
 
 
+def grid(size: int, width_mm: float) -> tuple[F, F, float]:
+    """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
+    n = 2 * size if size <= 96 else max(192, size)
+    pixel = width_mm / n
+    axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
+    x, y = np.meshgrid(axis, axis)
+    return x, y, pixel
+
+
+def turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
+    """Turn x, y [n, n] by ``angle`` in radians, then shift them by ``place`` (x, y) in mm."""
+    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    return cos * x + sin * y + np.float32(place[0]), cos * y - sin * x + np.float32(place[1])
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """Displacement of a later moment of a press from moment 0."""
+    """What changes from moment 0 of a press to a later one: camera and hand move a little, and the hand presses harder.
+
+    Object, lamp, clutter and sensor stay. The sizes were set by eye, for frames of a video some tenths of a second apart.
+    """
 
     turn: float
     """Rotation of the camera in radians."""
