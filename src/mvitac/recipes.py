@@ -35,8 +35,8 @@ def authors(data: DatasetConfig) -> Run:
     dropout; a random first convolution for stacked gels; flips with an effective probability of 25 %; grayscale also for
     grasping; the two gels of a stacked image are augmented independently; whole images are probed at 256 px. Not repeated:
     key heads that are never updated, key towers that do not start as copies of the query towers, the last short batch of an
-    epoch, and the choice of a checkpoint. The authors also keep the tenth epoch with the best accuracy on its last
-    training batch; here the last epoch is kept.
+    epoch, and the choice of a checkpoint: here the last epoch is kept; the authors also keep, of every tenth epoch, the one
+    with the best accuracy on its last training batch.
     """
     views = ViewAugment(flip=0.25, grayscale=0.2)
     base = paper(data)
@@ -73,7 +73,8 @@ def modern(data: DatasetConfig) -> Run:
       No difference on simulated touches, which have no consecutive frames (one seed).
     - same-touch positives: two views of one image share lamp, background and sensor, which is enough to minimise L_vv and
       L_tt without the material (docs/simulator.md has the figures). Another row of the same touch group shares only the
-      object. The largest effect: after 1,150 steps 21 points of category, 7 of soft, 20 of rough; with end-to-end keys 31
+      object in the simulator, where it is another press of the same instance; in Touch and Go it is a neighbouring frame of
+      the same contact, which the figures say nothing about. The largest effect: after 1,150 steps 21 points of category, 7 of soft, 20 of rough; with end-to-end keys 31
       of category, and end-to-end keys gain nothing without it. Not used for grasps: the rows of a grasp differ in its
       phase (before, during, after), and the phases differ in the contact itself.
     - All four losses, also with same-image positives: on simulated grasps, training without the intra-modal losses gains
