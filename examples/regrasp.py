@@ -207,9 +207,8 @@ def show(found: dict[str, Any], console: Console) -> None:
         table.add_row(name, *cells, _range(best))
     console.print(table)
     for name, gain in found["gain"].items():
-        console.print(
-            f"re-grasp, {name}: {100 * gain['mean']:+.1f} points {_range(gain)}, p {gain['p']:.3f}", highlight=False
-        )
+        p = "" if gain["p"] is None else f", p {gain['p']:.3f}"  # none with one seed
+        console.print(f"re-grasp, {name}: {100 * gain['mean']:+.1f} points {_range(gain)}{p}", highlight=False)
 
 
 def _range(cell: dict[str, float]) -> str:

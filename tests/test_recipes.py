@@ -21,7 +21,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.recipes import RECIPES, recipe
+from mvitac.recipes import RECIPES, recipe, with_method
 from mvitac.registry import find, from_json, to_json
 from mvitac.run import Run, load_run
 
@@ -51,7 +51,8 @@ def test_authors_constants() -> None:
     method = run.method
     assert isinstance(method, MViTacConfig)
     assert (method.momentum, method.lambda_inter, method.hidden, method.dropout) == (0.99, 1, 2048, 0.5)
-    assert (run.optim.lr, run.optim.weight_decay, run.optim.eps, run.optim.schedule) == (1e-3, 1e-6, 1e-8, "step")
+    assert (run.optim.lr, run.optim.weight_decay, run.optim.eps, run.optim.schedule) == (1e-3, 1e-6, 1e-8, "late-step")
+    assert (run.encoder.stem, run.augment.eval_size, run.optim.decay_norms) == ("random", 256, True)
     assert run.augment.touch.independent_sensors and run.augment.touch.flip == 0.25
     assert run.augment.touch.grayscale == 0.2
     assert (run.batch_size, run.epochs) == (256, 240)
@@ -196,3 +197,23 @@ def test_rows_with_other_phases_are_no_grasps(pack: Pack) -> None:
         other.table = pack.table.append_column("phase", pa.array(values * (pack.num // 2)))
         assert other.phased is phased
     assert not pack.phased
+
+
+def test_records_without_later_fields_mean_what_they_meant() -> None:
+    """Runs before these fields: nearly frozen prototypes, all of CMC's negatives, decayed norms. Digests are unchanged."""
+    for name in ("dino", "cmc"):
+        run = with_method(recipe("modern"), name)
+        old = to_json(run)
+        for inner, key in (("method", "prototype_norm"), ("method", "negatives_per_row"), ("optim", "decay_norms")):
+            old[inner].pop(key, None)
+        loaded = Run.load(old)
+        assert loaded.optim.decay_norms and loaded.digest() != run.digest()
+        method = loaded.method
+        assert method == (
+            replace(run.method, prototype_norm=16.0) if name == "dino" else replace(run.method, negatives_per_row=0.0)
+        )
+        written = to_json(loaded, for_digest=True)
+        assert (
+            not {"prototype_norm", "negatives_per_row"} & set(written["method"])
+            and "decay_norms" not in written["optim"]
+        )

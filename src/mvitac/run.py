@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
-from mvitac.registry import from_json, to_json
+from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
 
@@ -38,9 +38,11 @@ class Optim:
     """Epsilon of Adam (paper: 1e-7)."""
     weight_decay: float = 0.0
     """L2 penalty (adam, sgd) or decoupled weight decay (adamw). The paper gives none."""
-    schedule: Literal["constant", "cosine", "step"] = "constant"
-    """constant; cosine, to zero; or step, x0.9 every 10 epochs from epoch 10 on (the authors' StepLR). The paper gives
-    none."""
+    decay_norms: bool = field(default=True, metadata=LATER_IN_DIGEST)
+    """Also decay biases and the parameters of BatchNorm. Current practice is not to."""
+    schedule: Literal["constant", "cosine", "step", "late-step"] = "constant"
+    """constant; cosine, to zero; step, x0.9 every 10 epochs from epoch 10 on; or late-step, the same from epoch 20 on (the
+    authors' StepLR, which is stepped from epoch 10 on). The paper gives none."""
     warmup: float = 0.0
     """Fraction of the steps during which the learning rate rises linearly from zero."""
 
@@ -65,6 +67,8 @@ class Optim:
             return self.lr * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, num_steps - warm)))
         if self.schedule == "step":
             return self.lr * 0.9 ** (epoch // 10)
+        if self.schedule == "late-step":
+            return self.lr * 0.9 ** max(0, epoch // 10 - 1)
         return self.lr
 
 
@@ -95,15 +99,17 @@ class Run:
     """Passes over the training rows (paper: 240)."""
     steps: int | None = None
     """Number of steps. If given, epochs is ignored."""
-    sampler: Literal["shuffle", "one-per-touch"] = "shuffle"
-    """Order of the rows. shuffle: random permutation (paper). one-per-touch: rows of one touch group go to different
-    batches, so that near-duplicates are not used as negatives of each other."""
-    positives: Literal["same-image", "same-touch", "same-touch-pairs"] = "same-image"
-    """Which image is the positive. same-image: another view of the same row (paper). same-touch: a view of another row of
-    the same touch group (another frame of the contact, or another press of the object). Lamp, background, sensor and
-    position then differ between the two views and do not reveal the match. A row without others in its group is its own
-    partner. For one-view methods (ssvtp, cmc) both mean the vision and touch of one row. same-touch-pairs gives one-view
-    methods the vision of one row and the touch of another."""
+    sampler: Literal["shuffle", "one-per-touch", "spread"] = "shuffle"
+    """Order of the rows. shuffle: random permutation (paper). The others keep near-duplicates from being negatives of each
+    other: spread distributes the rows of a touch group over the whole epoch. one-per-touch takes one row of each group,
+    then a second one, and so on; if groups differ in size, the rows of large ones gather at the end of the epoch."""
+    positives: Literal["same-image", "same-press", "same-touch", "same-touch-pairs"] = "same-image"
+    """Which image is the positive. same-image: another view of the same row (paper). same-press: a view of another moment
+    of the same press (rows with the same value in column press). same-touch: a view of another row of the same touch group:
+    another press of the same instance in the simulator, another frame of the same contact in Touch and Go. Only between
+    presses do lamp, background, sensor and position differ, so that they do not reveal the match. A row without others is
+    its own partner. For one-view methods (ssvtp, cmc) all three mean the vision and touch of one row. same-touch-pairs
+    gives one-view methods the vision of one row and the touch of another."""
     precision: Literal["auto", "fp32", "tf32", "bf16"] = "fp32"
     """Arithmetic of the networks. Losses, weights and the optimiser stay in fp32. auto: bf16 where the hardware computes it
     (GPUs from Ampere, CPUs with AVX512-BF16 or AMX), else fp32; run.json says which. fp32 never uses TF32. tf32 lets a GPU

@@ -153,7 +153,7 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert set(summary) == {"category", "soft", "rough"}
     mean = summary["category"]["touch"]["mvitac"]["mean"]
     assert f"{100 * mean:.1f} [" in shown
-    assert "95 % intervals: bootstrap over test instances; one seed, so they leave out" in shown
+    assert "95 % intervals: over test instances only, for this one seed" in shown
     assert main(["report", str(run), "--probe", str(scores), "--out", str(tmp_path / "report")]) == 0
     assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
 

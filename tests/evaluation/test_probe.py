@@ -25,7 +25,7 @@ from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_papers, train_heads
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, _places, probe_runs
 from mvitac.evaluation.probe import cross_modal, probe_all, probe_features, probe_model, split_rows
-from mvitac.evaluation.scores import interval, summarise
+from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh, load
 from mvitac.recipes import recipe
@@ -166,35 +166,6 @@ def test_untrained_is_this_runs_trunk_before_training(pack: Pack, tmp_path: Path
     for name, value in start.named_parameters():
         torch.testing.assert_close(value, begun[name], rtol=0, atol=1e-20)
     assert any(not torch.allclose(value, begun[name]) for name, value in seed1.named_parameters())
-
-
-def test_interval_of_one_seed_is_the_group_bootstrap() -> None:
-    """100 groups of 1 row, 70 right: the 95 % interval of a mean of 100 coin flips at .7, about +-1.96 sqrt(.21/100)."""
-    record = {"group_sizes": [1] * 100, "group_correct": [1] * 70 + [0] * 30}
-    mean, low, high = interval([record])
-    assert mean == pytest.approx(0.7)
-    assert (low, high) == (pytest.approx(0.61, abs=0.015), pytest.approx(0.79, abs=0.015))
-
-
-def test_interval_counts_groups_not_rows() -> None:
-    """Ten times the rows in the same groups say nothing new: the interval stays."""
-    few = {"group_sizes": [1] * 20, "group_correct": [1, 0] * 10}
-    many = {"group_sizes": [10] * 20, "group_correct": [10, 0] * 10}
-    assert interval([few]) == pytest.approx(interval([many]))
-
-
-def test_seeds_widen_the_interval() -> None:
-    same = {"group_sizes": [10] * 50, "group_correct": [5] * 50}
-    good = {"group_sizes": [10] * 50, "group_correct": [9] * 50}
-    _, low, high = interval([same])
-    assert low == high == 0.5
-    mean, low, high = interval([same, good])
-    assert mean == pytest.approx(0.7)
-    assert (low, high) == pytest.approx((0.7 - 0.2 * 2**0.5, 0.7 + 0.2 * 2**0.5))
-
-
-def test_one_group_says_nothing_about_others() -> None:
-    assert interval([{"group_sizes": [10], "group_correct": [9]}]) == (0.9, 0.0, 1.0)
 
 
 def test_summary_shows_a_controls_only_probe(result: dict) -> None:

@@ -22,7 +22,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import interval, paired_difference, pool
-from mvitac.evaluation.value_scores import mean_r2, score_values
+from mvitac.evaluation.value_scores import r2_without_each_group, score_values
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from support.toy import Toy
@@ -61,24 +61,25 @@ def test_scores_are_those_of_scikit_learn_over_the_rows_that_were_measured() -> 
     json.dumps(record, allow_nan=False)
 
 
-def test_r2_of_a_draw_is_that_of_its_rows() -> None:
+def test_r2_without_a_group_is_that_of_the_other_rows() -> None:
     y, guess, groups = drawn()
-    record = score_values(y, guess, groups, POSE)
-    weights = np.random.default_rng(1).integers(0, 3, (5, 12))
-    for found, times in zip(mean_r2(record, weights), weights, strict=True):
-        rows = np.repeat(np.arange(len(y)), times[groups])
-        assert found == pytest.approx(r2_score(y[rows], guess[rows]))
+    found = r2_without_each_group(score_values(y, guess, groups, POSE))
+    assert found == pytest.approx([r2_score(y[groups != g], guess[groups != g]) for g in range(12)])
 
 
 def test_the_interval_of_r2_holds_it_and_a_worse_method_is_told_apart() -> None:
     y, guess, groups = drawn(600)
     noise = np.random.default_rng(2).normal(0, 1, y.shape)
-    good, bad = ({**score_values(y, g, groups, POSE), "seed": 0} for g in (guess, guess + noise))
-    mean, low, high = interval([good])
+    good, bad = (
+        [{**score_values(y, g + shift, groups, POSE), "seed": seed} for seed, shift in enumerate((0.0, 0.01))]
+        for g in (guess, guess + noise)
+    )
+    mean, low, high = interval(good[:1])
     assert low < mean < high < 1
     assert mean == pytest.approx(r2_score(y, guess))
-    difference, low, high, p = paired_difference([good], [bad])
-    assert 0 < low < difference < high and p < 0.05
+    difference, low, high, p = paired_difference(good, bad)
+    assert 0 < low < difference < high and p is not None and p < 0.05
+    assert paired_difference(good[:1], bad[:1])[3] is None
 
 
 def test_error_by_range_finds_where_predictions_are_wrong() -> None:

@@ -33,7 +33,6 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.evaluation.evaluate import ProbeConfig
-from mvitac.evaluation.scores import interval, paired_difference
 from mvitac.experiments import collect, jobs
 from mvitac.experiments.collect import cost, forecast, gather, lay_out, leaks, pairs_of
 from mvitac.experiments.cross_validation import lay_out_folds
@@ -568,89 +567,6 @@ def test_peak_memory_is_of_training_on_its_own_gpu(pack: Pack, tmp_path: Path, m
 def test_a_row_is_not_named_as_a_control_of_the_data(pack: Pack, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="row 'noise only' has the name of a control of this data"):
         lay_out(small(pack, rows=(*ROWS, Row(label="noise only"))), pack, tmp_path, ProbeConfig())
-
-
-# -- significance -----------------------------------------------------------------------------------------------------
-
-
-def record(correct: list[int], seed: int, sizes: int = 10) -> dict:
-    return {"group_sizes": [sizes] * len(correct), "group_correct": correct, "seed": seed}
-
-
-def test_paired_difference_sees_a_small_steady_gain() -> None:
-    """Groups differ wildly, but ours has one more right in each: paired, that is certain."""
-    rng = np.random.default_rng(0)
-    theirs = rng.integers(0, 9, 40)
-    a, b = [record((theirs + 1).tolist(), 0)], [record(theirs.tolist(), 0)]
-    mean, low, high, p = paired_difference(a, b)
-    assert (mean, low, high) == pytest.approx((0.1, 0.1, 0.1)) and p < 0.002
-    assert paired_difference(b, a)[0] == pytest.approx(-0.1)
-
-
-def test_paired_difference_of_equals_is_not_significant() -> None:
-    """Of 100 pairs of equally good guessers, about 5 differ at p < .05."""
-    rng = np.random.default_rng(1)
-    significant = 0
-    for _ in range(100):
-        a, b = ([record(rng.binomial(10, 0.5, 30).tolist(), s) for s in range(1)] for _ in range(2))
-        significant += paired_difference(a, b)[3] < 0.05
-    assert significant <= 12
-    assert paired_difference(a, a) == (0.0, 0.0, 0.0, 1.0)
-
-
-def test_what_is_drawn_varies_as_much_as_what_it_stands_for() -> None:
-    """Of two things with .5 and .6 the mean has a standard error of .05, that of two drawn from them .05 / sqrt(2)."""
-    of_seeds = [record([5] * 40, 0), record([6] * 40, 1)]
-    of_groups = [record([5, 6], 0)]
-    for records in (of_seeds, of_groups):
-        assert interval(records) == pytest.approx((0.55, 0.55 - 0.05 * 2**0.5, 0.55 + 0.05 * 2**0.5))
-    shifted = [record([3] * 40, 0), record([3] * 40, 1)]
-    assert paired_difference(of_seeds, shifted)[1:3] == pytest.approx((0.25 - 0.05 * 2**0.5, 0.25 + 0.05 * 2**0.5))
-
-
-def test_few_seeds_that_scatter_are_no_certainty() -> None:
-    """Of 200 pairs of equally good methods whose seeds scatter more than groups, about 10 differ at p < .05; 18 do by a
-    bootstrap that is not stretched."""
-    rng = np.random.default_rng(2)
-    significant = 0
-    for _ in range(200):
-        rates = rng.normal(0.6, 0.15, 100)
-        ours, theirs = (
-            [
-                record(rng.binomial(10, np.clip(rates + mine + rng.normal(0, 0.03), 0, 1)).tolist(), seed)
-                for seed in range(3)
-            ]
-            for mine in (rng.normal(0, 0.07, 100) for _ in range(2))
-        )
-        significant += paired_difference(ours, theirs)[3] < 0.05
-    assert significant <= 13
-
-
-def test_p_is_no_less_than_a_sign_test_can_say() -> None:
-    ours, theirs = [record([6] * 4, 0)], [record([5] * 4, 0)]
-    assert paired_difference(ours, theirs)[3] == 2 / 2**4
-
-
-def test_intervals_end_where_accuracies_do() -> None:
-    assert interval([record([10] * 5 + [9], seed) for seed in range(2)])[2] == 1
-
-
-def test_equal_seeds_are_paired() -> None:
-    """Seeds differ by 50 points, but ours has one more right under each: certain where seeds are the same, not where not."""
-    theirs = [record([2] * 30, 0), record([7] * 30, 1)]
-    ours = [record([3] * 30, 0), record([8] * 30, 1)]
-    assert paired_difference(ours, theirs)[1:3] == pytest.approx((0.1, 0.1))
-    others = [{**r, "seed": r["seed"] + 5} for r in ours]
-    assert paired_difference(others, theirs)[1] < 0
-
-
-def test_paired_difference_doubts_seeds_too() -> None:
-    """Better by chance of one seed of two: the interval over seeds reaches below zero."""
-    a = [record([9] * 30, 0), record([3] * 30, 1)]
-    b = [record([5] * 30, 0), record([5] * 30, 1)]
-    mean, low, high, p = paired_difference(a, b)
-    assert mean == pytest.approx(0.1) and low < 0 < high and p > 0.05
-    assert paired_difference([record([3], 0)], [record([9], 0)])[1:] == (-1.0, 1.0, 1.0)  # one group
 
 
 # -- the command: killed and resumed, several at once -----------------------------------------------------------------

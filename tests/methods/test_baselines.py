@@ -19,7 +19,7 @@ from mvitac.evaluation.probe import probe_model, split_rows
 from mvitac.methods.byol import BYOLConfig, regression
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.cmc import CMC, CMCConfig, nce
-from mvitac.methods.dino import DINO, DINOConfig
+from mvitac.methods.dino import DINO, DINOConfig, Prototypes
 from mvitac.methods.mct import MCTConfig, hinge
 from mvitac.methods.moco import MoCo, MoCoConfig
 from mvitac.methods.mvitac import MViTacConfig
@@ -505,3 +505,19 @@ def test_momentum_zero_copies_the_queries() -> None:
 def test_impossible_settings(config: type, bad: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         config(**bad)
+
+
+def test_prototypes_start_with_the_owners_norm() -> None:
+    """weight_norm of torch's Linear(256, K): rows uniform in +-1/16, of norm sqrt(256 / 3) / 16."""
+    expected = torch.nn.Linear(256, 4096, bias=False).weight.norm(dim=1).mean().item()
+    config = DINOConfig(hidden=16)
+    found = Prototypes(8, 16, 4096, config.prototype_norm).directions.norm(dim=1).mean().item()
+    assert found == pytest.approx(expected, rel=0.01)
+
+
+def test_negatives_are_a_share_of_the_rows() -> None:
+    """TAG's 16,384 for its 91,982 rows, as many per row for fewer, and all of them for a run before the limit."""
+    assert CMCConfig().negatives(91_982) == 16_384
+    assert CMCConfig().negatives(3_900) == 702
+    assert CMCConfig().negatives(3) == 1
+    assert CMCConfig(negatives_per_row=0.0).negatives(3_900) == 16_384

@@ -42,6 +42,17 @@ def test_six_channels_keep_the_pretrained_stem(weights: Path) -> None:
     torch.testing.assert_close(six(torch.cat([image, image], 1)), three(image), atol=1e-4, rtol=1e-3)
 
 
+def test_a_random_stem_changes_nothing_else(weights: Path) -> None:
+    repeated, random = (
+        build_trunk(EncoderConfig(trunk="resnet10t", weights=str(weights), stem=stem), 6).state_dict()
+        for stem in ("repeat", "random")
+    )
+    changed = [name for name in repeated if not torch.equal(repeated[name], random[name])]
+    assert changed == ["conv1.0.weight"] and random["conv1.0.weight"].std() > 0
+    three = build_trunk(EncoderConfig(trunk="resnet10t", weights=str(weights), stem="random"), 3)
+    assert torch.equal(three.state_dict()["conv1.0.weight"], safetensors.torch.load_file(weights)["conv1.0.weight"])
+
+
 def test_imagenet_offline_says_what_to_do() -> None:
     with pytest.raises(ValueError, match=r"--encoder\.weights FILE.*scratch"):
         build_trunk(EncoderConfig(trunk="resnet18.tv_in1k"), 3)

@@ -47,6 +47,27 @@ def test_every_number_matters():
     assert len({digest(touch(*item, size=32)) for item in items}) == len(items)
 
 
+def test_moments_of_a_press_differ_a_little_and_press_harder():
+    """Far nearer to each other than another press of the instance is; the first moment is the press as always."""
+    away = {}
+    for moment in range(3):
+        assert digest(touch(0, 4, 1, 0, size=48, moment=moment)) == digest(touch(0, 4, 1, 0, size=48, moment=moment))
+    assert digest(touch(0, 4, 1, 0, size=48, moment=0)) == digest(touch(0, 4, 1, 0, size=48))
+    for category in range(4):
+        first, later = (touch(0, category, 1, 0, size=48, moment=moment) for moment in (0, 1))
+        other = touch(0, category, 1, 1, size=48)
+        assert later["sensor"] == first["sensor"] and later["force_n"] > first["force_n"]
+        for name in ("vision", "touch"):
+            gaps = [np.abs(pair[name].astype(float) - first[name]).mean() for pair in (later, other)]
+            away.setdefault(name, []).append(gaps)
+            assert gaps[0] > 1  # not the same picture with other noise
+    for gaps in away.values():
+        near, far = np.mean(gaps, axis=0)
+        assert near < far / 2
+    with pytest.raises(ValueError, match="moment must be >= 0"):
+        touch(0, 4, 1, 0, size=48, moment=-1)
+
+
 def test_touches_share_the_instance():
     first, second = touch(0, 4, 1, 0, size=32), touch(0, 4, 1, 1, size=32)
     shared = ("category", "soft", "rough", "stiffness", "wavelength_mm", "amplitude_mm", "asperity", "gloss")

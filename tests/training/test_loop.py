@@ -16,14 +16,18 @@ import pytest
 import torch
 
 from mvitac.cli.main import main
+from mvitac.data.build import build
 from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
+from mvitac.recipes import recipe
 from mvitac.run import Optim
 from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
-from mvitac.training.sampler import epoch_order, partners
+from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order, training_rows
 from mvitac.training.validation import evaluate
 from mvitac.training.views import make_views
 from support.processes import begin, finish
@@ -228,6 +232,67 @@ def test_one_per_touch_spreads_groups() -> None:
     assert sorted(plain) == list(range(len(groups)))
 
 
+def test_spread_has_no_tail_of_duplicates() -> None:
+    """With groups of unequal size, one-per-touch ends its epoch with rows of the large ones."""
+    rng = np.random.default_rng(0)
+    groups = rng.permutation(np.repeat(np.arange(300), np.ceil(5 * np.exp(rng.normal(0, 1, 300))).astype(int)))
+
+    def duplicates(order: np.ndarray) -> np.ndarray:
+        batches = groups[order[: len(order) // 64 * 64]].reshape(-1, 64)
+        return np.array([64 - len(set(batch)) for batch in batches])
+
+    spread, old, plain = (
+        duplicates(found)
+        for found in (
+            spread_order(len(groups), groups, 1),
+            epoch_order(len(groups), groups, 1),
+            epoch_order(len(groups), None, 1),
+        )
+    )
+    assert sorted(spread_order(len(groups), groups, 1)) == list(range(len(groups)))
+    tail = max(1, len(old) // 10)
+    assert old[-tail:].mean() > 2 * plain.mean()
+    assert spread.max() < plain.mean() and spread.mean() < plain.mean() / 2
+    assert not np.array_equal(spread_order(len(groups), groups, 1), spread_order(len(groups), groups, 2))
+
+
+def test_the_spread_sampler_spreads(pack: Pack) -> None:
+    run, rows = smoke(pack, sampler="spread"), pack.rows("train")
+    order = spread_order(len(rows), pack.touch_groups[rows], mix(run.seed, 1, 0))
+    per_epoch = run.steps_per_epoch(len(rows))
+    found = np.concatenate(list(batches(run, pack, rows, 0, per_epoch)))
+    assert np.array_equal(found, rows[order[: len(found)]])
+
+
+def test_partners_of_the_same_press(tmp_path: Path) -> None:
+    pack = build(MaterialsConfig(num=40, touches=2, moments=3, size=16).source(), tmp_path / "p", size=16, quiet=True)
+    rows = np.arange(pack.num)
+    found = partners(pack, rows, torch.Generator().manual_seed(0), "presses")
+    assert (found != rows).all() and np.array_equal(pack.presses[found], pack.presses[rows])
+    wide = partners(pack, rows, torch.Generator().manual_seed(0))
+    assert (pack.presses[wide] != pack.presses[rows]).mean() > 0.3
+    run = replace(recipe("smoke", PackConfig(path=pack.path)), positives="same-press")
+    assert np.array_equal(training_rows(run, pack), pack.rows("train"))
+    asked: list[np.ndarray] = []
+
+    class Spy(Feed):
+        def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
+            asked.append(rows)
+            return super().__call__(modality, rows)
+
+    cpu = torch.device("cpu")
+    make_views(
+        replace(run, augment=replace(run.augment, size=16)), pack, rows, 2, torch.Generator(), cpu, Spy(pack, cpu)
+    )
+    assert [bool((found == rows).all()) for found in asked] == [True, False, True, False]
+    assert all(np.array_equal(pack.presses[found], pack.presses[rows]) for found in asked)
+
+
+def test_same_press_needs_to_know_the_press(pack: Pack) -> None:
+    with pytest.raises(ValueError, match="same-press positives need a column 'press'"):
+        training_rows(smoke(pack, positives="same-press"), pack)
+
+
 def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, groups = np.arange(pack.num), pack.touch_groups
     found = partners(pack, rows, torch.Generator().manual_seed(0))
@@ -279,6 +344,20 @@ def test_same_touch_positives_train_and_repeat(pack: Pack, tmp_path: Path) -> No
     train(smoke(pack, positives="same-image"), tmp_path / "c", quiet=True)
     first = "encoders.touch.conv1.0.weight"
     assert not torch.equal(weights(tmp_path / "a")[first], weights(tmp_path / "c")[first])
+
+
+def test_late_step_is_the_authors_schedule() -> None:
+    """StepLR(10, .9), stepped after every epoch from epoch 10 on."""
+    theirs = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
+    schedule = torch.optim.lr_scheduler.StepLR(theirs, step_size=10, gamma=0.9)
+    theirs.step()
+    rates = []
+    for epoch in range(60):
+        rates.append(schedule.get_last_lr()[0])
+        if epoch >= 10:
+            schedule.step()
+    assert rates[19:21] == [1.0, 0.9]
+    assert [Optim(lr=1.0, schedule="late-step").rate(0, 1, epoch) for epoch in range(60)] == pytest.approx(rates)
 
 
 def test_learning_rate_schedules() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.methods.base import Method, MethodConfig
@@ -18,10 +18,10 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.encoders import draws_random_numbers
 from mvitac.recipes import recipe
-from mvitac.run import Run
+from mvitac.run import Optim, Run
 from mvitac.system import processes
 from mvitac.training.loop import train
-from mvitac.training.step import Step
+from mvitac.training.step import Step, build_optimiser
 from support.small_methods import small
 from support.small_steps import RUN, assert_close, build, gradients, split, views
 
@@ -200,3 +200,16 @@ def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     run = replace(RUN, method=MViTacConfig())
     plain, compiled = (take(replace(run, compile=c), build(run).train(), [views])["loss"] for c in (False, True))
     assert torch.equal(plain, compiled)
+
+
+def test_norms_and_biases_are_not_decayed_unless_asked() -> None:
+    """With zero gradients AdamW only decays."""
+    for decay_norms in (True, False):
+        network = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Flatten(), nn.Linear(4, 2))
+        for parameter in network.parameters():
+            nn.init.ones_(parameter)
+            parameter.grad = torch.zeros_like(parameter)
+        optim = Optim(name="adamw", lr=0.1, weight_decay=0.5, decay_norms=decay_norms)
+        build_optimiser(optim, network).step()  # type: ignore[arg-type]
+        kept = {name for name, p in network.named_parameters() if bool((p == 1).all())}
+        assert kept == (set() if decay_norms else {"0.bias", "1.weight", "1.bias", "3.bias"})

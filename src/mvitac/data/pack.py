@@ -221,13 +221,30 @@ class Pack:
         return "phase" in self.table.column_names and set(self.column("phase").astype(str)) <= set(PHASES)
 
     @functools.cached_property
-    def _rows_by_touch_group(self) -> list[np.ndarray]:
-        order = np.argsort(self.touch_groups, kind="stable")
-        return np.split(order, np.cumsum(np.bincount(self.touch_groups))[:-1])
+    def presses(self) -> np.ndarray:
+        """int64 [N], number of each row's press (column press): its rows are moments of one press.
 
-    def rows_of(self, touch_group: int) -> np.ndarray:
-        """Return the row numbers of touch group number ``touch_group``, ascending."""
-        return self._rows_by_touch_group[touch_group]
+        Raises:
+            ValueError: If the pack has no such column.
+        """
+        if "press" not in self.table.column_names:
+            raise ValueError(
+                "same-press positives need a column 'press', which says which rows are moments of one press: simulate"
+                " with --data.moments 2, or use same-touch where a touch group is the frames of one press"
+            )
+        return np.unique(self.column("press").astype(str), return_inverse=True)[1]
+
+    @functools.cached_property
+    def _rows_by(self) -> dict[str, list[np.ndarray]]:
+        return {}
+
+    def rows_of(self, number: int, of: Literal["touch_groups", "presses"] = "touch_groups") -> np.ndarray:
+        """Return the row numbers of a touch group (or press), ascending."""
+        if of not in self._rows_by:
+            numbers = getattr(self, of)
+            order = np.argsort(numbers, kind="stable")
+            self._rows_by[of] = np.split(order, np.cumsum(np.bincount(numbers))[:-1])
+        return self._rows_by[of][number]
 
     @functools.cached_property
     def shards(self) -> np.ndarray:

@@ -5,7 +5,7 @@ They are the default data: every experiment runs without a download. Results are
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
+from mvitac.registry import LATER_IN_DIGEST
 from mvitac.sim import grasps, materials
 
 LICENCE = "Apache-2.0 (made by this package)"
@@ -54,6 +55,8 @@ class MaterialsConfig(SimulatedConfig):
 
     touches: int = 5
     """Touches per instance, each with its own position, force, sensor and lamp."""
+    moments: int = field(default=1, metadata=LATER_IN_DIGEST)
+    """Rows per touch: moments of one press, which differ in a little movement, force and noise (for same-press)."""
     difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
     """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
 
@@ -61,6 +64,8 @@ class MaterialsConfig(SimulatedConfig):
         super().__post_init__()
         if self.touches < 1:
             raise ValueError(f"touches {self.touches}: give touches per instance, at least 1")
+        if not 1 <= self.moments <= 1000:
+            raise ValueError(f"moments {self.moments}: give moments per touch, 1 to 1000")
 
     def source(self) -> Source:
         return Materials(self)
@@ -94,15 +99,20 @@ class Materials(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         known = self.config._fingerprint(materials.VERSION)
-        # "difference" is omitted if False, to keep old digests valid.
-        return known if self.config.difference else {k: v for k, v in known.items() if k != "difference"}
+        later = {"difference": False, "moments": 1}  # omitted at their defaults, to keep old digests valid
+        return {k: v for k, v in known.items() if k not in later or v != later[k]}
+
+    def samples_per_item(self) -> list[int]:
+        return [self.config.moments] * self.config.num
 
     def _address(self, item: int) -> tuple[int, int, int]:
         num_classes, touches = len(materials.CLASSES), self.config.touches
         return item % num_classes, item // num_classes // touches, item // num_classes % touches
 
     def read(self, item: int) -> list[Sample]:
-        category, instance, touch = self._address(item)
+        return [self._moment(*self._address(item), moment) for moment in range(self.config.moments)]
+
+    def _moment(self, category: int, instance: int, touch: int, moment: int) -> Sample:
         made = materials.touch(
             self.config.seed,
             category,
@@ -111,16 +121,20 @@ class Materials(Source):
             size=self.config.size,
             held_out_sensor=self.config.held_out_sensor,
             background=self.config.difference,
+            moment=moment,
         )
         labels = {f"label_{task}": int(made.pop(task)) for task in ("category", "soft", "rough")}
         vision, pressed = made.pop("vision"), made.pop("touch")
         if self.config.difference:
             pressed = difference(pressed, made.pop("background"))
         group = f"{category:02d}-{instance:04d}"
+        name, press = f"{group}-{touch:02d}", {}
+        if self.config.moments > 1:
+            name, press = f"{name}-{moment:02d}", {"press": name}
         # Of 20 instances of a class, 4 are in test and 3 in val. Instances are independent, so any fixed rule is fair.
         split = "test" if instance % 20 in (2, 7, 12, 17) else "val" if instance % 20 in (5, 10, 15) else "train"
-        columns = {"id": f"{group}-{touch:02d}", "group": group, "touch_group": group, "split": split, **labels, **made}
-        return [Sample(vision=vision, touch=pressed, columns=columns)]
+        columns = {"id": name, "group": group, "touch_group": group, **press, "split": split, **labels, **made}
+        return Sample(vision=vision, touch=pressed, columns=columns)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from mvitac.evaluation.evaluate import check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, write_sources
 from mvitac.evaluation.probe import score_rows, split_rows
-from mvitac.evaluation.scores import cell_text, columns_of, resampled, sources_of, summarise, tested_on
+from mvitac.evaluation.scores import cell_text, columns_of, covered, sources_of, summarise, tested_on
 from mvitac.model import Model, load
 from mvitac.nn.encoders import SCRATCH, build_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
@@ -272,7 +272,7 @@ def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
         unseen = f"test rows. LEAK, what the encoders saw of them: {'; '.join(leaks)}"
     lines = [
         f"Accuracy in percent of linear probes, on {unseen}. The rows below the first are controls. 95 % intervals:"
-        f" {resampled(by, 1)}.",
+        f" {covered(by, [{'source': 'run', 'seed': 0}])}.",
         "",
     ]
     for name, task in scores["summary"].items():

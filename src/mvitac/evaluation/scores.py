@@ -1,23 +1,27 @@
 """Scores of predictions, their confidence intervals, and differences between methods.
 
-A record is one probe of one source on one task. ``score`` counts correct rows per test group. Every interval resamples
-these groups and the seeds: rows within a group are near-copies, groups are independent.
+A record is one probe of one source on one task. ``score`` counts correct rows per test group, ``score_values`` sums errors.
+Every interval is over these groups and, if there are several, the seeds: rows within a group are near-copies, groups are
+independent.
+
+Both levels' variances are added, and Student's t has the degrees of freedom of the sum (Satterthwaite 1946). This is too
+narrow when a few seeds happen to agree, so an interval is never narrower than that over seeds alone. Intervals then hold
+their level with few groups, few seeds and groups of unequal size (benchmarks/calibration.py), which a bootstrap does not.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import expit, logit, stdtr, stdtrit
 from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
 
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.value_scores import mean_r2, pool_values
-
-NUM_DRAWS = 2000
-"""Number of bootstrap draws of every interval."""
+from mvitac.evaluation.value_scores import pool_values, r2_without_each_group
 
 
 def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_classes: int) -> dict[str, Any]:
@@ -92,30 +96,35 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 
 def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
-    """Mean accuracy (R2 of values) over runs and its 95 % interval, by a two-level bootstrap over test groups and seeds.
+    """Mean accuracy (R2 of values) over runs and its 95 % interval.
 
-    Groups are drawn, not rows, since rows of a group are near-copies. With a single group the interval is 0 to 1.
+    With several records it covers other groups and other seeds; with one record, other groups for this one trained model.
+    With a single group the interval is that of all possible scores.
+
+    The interval of an accuracy is computed on the logit scale, which keeps it within 0 and 1, around
+    (correct + 1) / (rows + 2). Its variance is at least that of independent rows: a few groups that are all right say
+    little.
 
     Args:
         records: One record per seed, all on the same test groups.
 
     Returns:
-        Mean, lower end and upper end, in 0 .. 1.
+        Mean, lower end and upper end.
     """
-    records = _by_seed(records)
-    num_groups = num_groups_of(records[0])
-    mean = float(np.mean([mean_of(record) for record in records]))
-    if num_groups < 2:
+    sizes, correct = _counts(records)
+    rows = sizes.sum()
+    mean = float(correct.sum(1).mean() / rows)
+    if len(sizes) < 2:
         return mean, least_of(records[0]), 1.0
-    rng = np.random.default_rng(0)
-    seeds = rng.integers(0, len(records), (NUM_DRAWS, len(records)))
-    low, high = np.percentile(_draws(records, mean, seeds, _drawn_groups(num_groups, rng)), [2.5, 97.5])
-    return mean, max(least_of(records[0]), float(low)), min(1.0, float(high))
-
-
-def mean_of(record: dict[str, Any]) -> float:
-    """The score that tables show: R2, mean over targets, or accuracy."""
-    return record["r2"] if "group_sums" in record else sum(record["group_correct"]) / sum(record["group_sizes"])
+    groups, seeds = _over_groups(correct.mean(0), sizes), _over_seeds(correct, sizes)
+    if "group_sums" in records[0]:
+        margin = _margin(groups, seeds)
+        return mean, mean - margin, min(1.0, mean + margin)
+    centre = (mean * rows + 1) / (rows + 2)
+    per_point = centre * (1 - centre)  # derivative of a probability by its logit
+    margin = _margin(_Variance(max(groups.value, per_point / rows), groups.freedom), seeds)
+    low, high = expit(logit(centre) + np.array([-1, 1]) * margin / per_point)
+    return mean, min(mean, float(low)), max(mean, float(high))
 
 
 def least_of(record: dict[str, Any]) -> float:
@@ -123,92 +132,123 @@ def least_of(record: dict[str, Any]) -> float:
     return -math.inf if "group_sums" in record else 0.0
 
 
-def num_groups_of(record: dict[str, Any]) -> int:
-    """Number of test groups."""
-    return len(record["group_sums"]["n"][0]) if "group_sums" in record else len(record["group_sizes"])
-
-
 def paired_difference(
     ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]
-) -> tuple[float, float, float, float]:
-    """Difference in accuracy between two methods on the same test groups, by a paired bootstrap.
+) -> tuple[float, float, float, float | None]:
+    """Difference in accuracy (R2 of values) between two methods on the same test groups.
 
-    Test groups are drawn jointly for both methods. Seeds are drawn jointly if both have the same seeds, which share
-    batches and views, and independently otherwise.
+    Groups are paired. Seeds are paired if both methods have the same seeds, which share batches and views.
 
     Args:
         ours: Records of one method, one per seed.
         theirs: Records of the method to subtract.
 
     Returns:
-        Mean difference, lower and upper end of its 95 % interval, and the two-sided p: twice the fraction of draws on
-        the other side of zero, at least ``least_p``. With a single group p is 1.
+        Mean difference, lower and upper end of its 95 % interval, and the two-sided p, at least ``least_p``. p is None if
+        either method was trained with one seed: the variation between seeds is then unknown, and the interval leaves it
+        out. With a single group p is 1.
     """
     ours, theirs = _by_seed(ours), _by_seed(theirs)
-    num_groups = num_groups_of(ours[0])
-    assert len({_rows_of(record) for record in (*ours, *theirs)}) == 1, "scored on different test rows"
-    means = [float(np.mean([mean_of(record) for record in found])) for found in (ours, theirs)]
-    mean = means[0] - means[1]
-    if num_groups < 2:
-        return mean, -1.0, 1.0, 1.0
-    rng = np.random.default_rng(0)
-    drawn_ours = rng.integers(0, len(ours), (NUM_DRAWS, len(ours)))
-    together = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
-    drawn_theirs = drawn_ours if together else rng.integers(0, len(theirs), (NUM_DRAWS, len(theirs)))
-    weights = _drawn_groups(num_groups, rng)
-    draws = _draws(ours, means[0], drawn_ours, weights) - _draws(theirs, means[1], drawn_theirs, weights)
-    low, high = np.percentile(draws, [2.5, 97.5])
-    tail = min(int((draws <= 0).sum()), int((draws >= 0).sum()))
-    return mean, float(low), float(high), min(1.0, max(2 * (tail + 1) / (NUM_DRAWS + 1), least_p(num_groups)))
-
-
-def _rows_of(record: dict[str, Any]) -> str:
-    """Number of test rows of each group, and of each target."""
-    return str(record["group_sums"]["n"] if "group_sums" in record else list(record["group_sizes"]))
+    assert len({str(_sizes(r).tolist()) for r in (*ours, *theirs)}) == 1, "scored on different test rows"
+    (sizes, a), (_, b) = _counts(ours), _counts(theirs)
+    mean = float((a.sum(1).mean() - b.sum(1).mean()) / sizes.sum())
+    most = 1.0 - least_of(ours[0])
+    one_seed = any(len(records) == 1 and records[0]["seed"] is not None for records in (ours, theirs))
+    if len(sizes) < 2:
+        return mean, -most, most, None if one_seed else 1.0
+    paired = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
+    seeds = _over_seeds(a - b, sizes) if paired else _over_seeds(a, sizes) + _over_seeds(b, sizes)
+    groups = _over_groups(a.mean(0) - b.mean(0), sizes)
+    margin = _margin(groups, seeds)
+    p = None if one_seed else max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(len(sizes)))
+    return mean, max(-most, mean - margin), min(most, mean + margin), p
 
 
 def least_p(num_groups: int) -> float:
-    """Smallest p of ``paired_difference``: limited by a sign test over the groups and by the number of draws."""
-    return max(2 / (NUM_DRAWS + 1), 2.0 ** (1 - num_groups))
+    """Smallest p of ``paired_difference``: that of a sign test over the groups."""
+    return 2.0 ** (1 - num_groups)
+
+
+def num_groups_of(record: dict[str, Any]) -> int:
+    """Number of test groups that a record scored."""
+    return int(np.count_nonzero(_sizes(record)))
 
 
 def _by_seed(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """``records`` ordered by seed, because the draws depend on the order."""
+    """``records`` ordered by seed, because equal seeds are paired."""
     return sorted(records, key=lambda record: -1 if record.get("seed") is None else record["seed"])
 
 
-def _drawn_groups(num: int, rng: np.random.Generator) -> np.ndarray:
-    """How often each group is drawn, [draws, G]."""
-    return np.stack([np.bincount(g, minlength=num) for g in rng.integers(0, num, (NUM_DRAWS, num))])
+def _sizes(record: dict[str, Any]) -> np.ndarray:
+    """Rows of each group, [G]; of values, the measured ones of all targets."""
+    return np.array(record["group_sums"]["n"]).sum(0) if "group_sums" in record else np.array(record["group_sizes"])
 
 
-def _draws(records: Sequence[dict[str, Any]], mean: float, seeds: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Mean score over seeds of each draw, [draws].
+def _counts(records: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [G] and correct rows [S, G] of the groups that have any."""
+    sizes = _sizes(records[0]).astype(float)
+    there = sizes > 0
+    correct = [_shares(record, sizes) if "group_sums" in record else record["group_correct"] for record in records]
+    return sizes[there], np.array(correct, float)[:, there]
 
-    A bootstrap of n items underestimates their variance by the factor (n - 1) / n: little for 240 groups, a third for 3
-    seeds. So each level's deviations are scaled by sqrt(n / (n - 1)) (Davison and Hinkley 1997, section 3.8).
 
-    Args:
-        records: One record per seed.
-        mean: Their mean score.
-        seeds: Seeds of each draw, [draws, S].
-        weights: How often each draw has each group, [draws, G].
+def _shares(record: dict[str, Any], sizes: np.ndarray) -> np.ndarray:
+    """Each group's share in R2, times the number of rows: [G], with sum R2 * rows.
+
+    It comes from R2 without the group (the jackknife). For an accuracy the same formula gives the correct rows.
     """
-    per_seed = np.stack([_weighted(record, weights) for record in records], axis=1)  # [draws, S]
-    all_seeds, num_groups, num_seeds = per_seed.mean(1), weights.shape[1], len(records)
-    over_seeds = np.take_along_axis(per_seed, seeds, axis=1).mean(1) - all_seeds
-    stretched = (all_seeds - mean) * (num_groups / (num_groups - 1)) ** 0.5
-    if num_seeds > 1:
-        stretched += over_seeds * (num_seeds / (num_seeds - 1)) ** 0.5
-    return mean + stretched
+    if np.count_nonzero(sizes) < 2:
+        return record["r2"] * sizes
+    shares = sizes * record["r2"] + (sizes.sum() - sizes) * (record["r2"] - r2_without_each_group(record))
+    return shares - sizes * (shares.sum() / sizes.sum() - record["r2"])
 
 
-def _weighted(record: dict[str, Any], weights: np.ndarray) -> np.ndarray:
-    """Score of one record in each draw, [draws]."""
-    if "group_sums" in record:
-        return mean_r2(record, weights)
-    sizes, correct = np.array(record["group_sizes"], float), np.array(record["group_correct"], float)
-    return weights @ correct / np.maximum(weights @ sizes, 1)
+@dataclass(frozen=True)
+class _Variance:
+    """An estimated variance of a mean, and its degrees of freedom."""
+
+    value: float
+    freedom: float
+
+    def __add__(self, other: _Variance) -> _Variance:
+        """The variance of a sum of independent terms, with Satterthwaite's degrees of freedom."""
+        total, parts = self.value + other.value, [part for part in (self, other) if part.value]
+        return _Variance(total, total**2 / sum(p.value**2 / p.freedom for p in parts) if parts else self.freedom)
+
+
+def _over_groups(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
+    """Variance of sum(correct) / sum(sizes) over groups, from [G] and [G].
+
+    Unbiased, with the degrees of freedom of Bell and McCaffrey (2002), if groups vary alike: G - 1 if they are equally
+    large, fewer if not.
+    """
+    w = sizes / sizes.sum()
+    squares = float(w @ w)
+    share = w * w / np.maximum(1 - 2 * w + squares, 1e-12)
+    residuals = correct / sizes - correct.sum() / sizes.sum()
+    # freedom = trace(B)^2 / trace(B^2) of the quadratic form B of the rates; B is not built, as there may be many groups
+    zero, one, two = (float((share * w**power).sum()) for power in range(3))
+    off = (squares * zero) ** 2 + 2 * zero * two - 4 * squares * zero * one + 2 * one**2
+    trace = off + float((share**2 * (1 + 2 * squares - 4 * w)).sum())
+    return _Variance(float(share @ residuals**2), squares**2 / trace)
+
+
+def _over_seeds(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
+    """Variance of the mean accuracy over seeds, from [S, G] and [G]; 0 for one seed."""
+    means = correct.sum(1) / sizes.sum()
+    return _Variance(float(means.var(ddof=1)) / len(means), len(means) - 1) if len(means) > 1 else _Variance(0.0, 1)
+
+
+def _margin(groups: _Variance, seeds: _Variance) -> float:
+    """Half the width of the 95 % interval."""
+    return max(float(stdtrit(v.freedom, 0.975)) * v.value**0.5 for v in (groups + seeds, seeds))
+
+
+def _p(mean: float, variance: _Variance) -> float:
+    """Two-sided p of a mean by Student's t."""
+    if not variance.value:
+        return float(mean == 0)
+    return 2 * float(stdtr(variance.freedom, -abs(mean) / variance.value**0.5))
 
 
 Cell = tuple[str, str, str]
@@ -259,11 +299,18 @@ def with_interval(mean: float, low: float, high: float, leak: str = "") -> str:
     return f"{percent(mean)} [{percent(low)}, {percent(high)}]{leak_mark(leak)}"
 
 
-def resampled(group_by: str, num_seeds: int) -> str:
-    """What the 95 % intervals of ``num_seeds`` runs cover."""
-    if num_seeds > 1:
-        return f"bootstrap over test {group_by}s and seeds"
-    return f"bootstrap over test {group_by}s; one seed, so they leave out the variation between seeds"
+def covered(group_by: str, records: Sequence[dict[str, Any]]) -> str:
+    """What the 95 % intervals of ``records`` cover (``interval``)."""
+    seeds: dict[str, set[int]] = {}
+    for record in records:
+        if record["seed"] is not None:
+            seeds.setdefault(record["source"], set()).add(record["seed"])
+    single = [source for source, found in seeds.items() if len(found) == 1]
+    if not single:
+        return f"over test {group_by}s and seeds"
+    if len(single) == len(seeds):
+        return f"over test {group_by}s only, for this one seed: they leave out the variation between seeds"
+    return f"over test {group_by}s and seeds; of {', '.join(single)} over test {group_by}s only, for one seed"
 
 
 def tested_on(task: dict[str, Any], group_by: str) -> str:

@@ -1,6 +1,6 @@
 """Scores of predicted values: R2, mean absolute error and root mean squared error in the target's unit.
 
-Like accuracy, R2 is computed from sums over each test group, so that intervals can draw groups again (``scores``).
+Like accuracy, R2 is computed from sums over each test group, so that intervals can leave groups out (``scores``).
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def error_by_range(true: np.ndarray, error: np.ndarray) -> list[dict[str, float]
     ]
 
 
-def mean_r2(record: dict[str, Any], weights: np.ndarray) -> np.ndarray:
-    """R2, mean over targets, of each draw [draws] in which group g counts ``weights`` [draws, G] times."""
-    sums = {name: weights @ np.array(record["group_sums"][name], float).T for name in SUMS}  # [draws, T]
-    return r_squared(sums).mean(-1)
+def r2_without_each_group(record: dict[str, Any]) -> np.ndarray:
+    """R2, mean over targets, of the rows outside group 0, 1, ...: [G]."""
+    sums = {name: np.array(record["group_sums"][name], float) for name in SUMS}  # [T, G]
+    return r_squared({name: each.sum(1, keepdims=True) - each for name, each in sums.items()}).mean(0)

@@ -22,8 +22,8 @@ class Cell:
     high: float
     seeds: int
     printed: float | None
-    difference: tuple[float, float, float, float] | None
-    """To the reference row: mean, low, high, p."""
+    difference: tuple[float, float, float, float | None] | None
+    """To the reference row: mean, low, high, p (``paired_difference``)."""
     leak: str = ""
     """Which test rows were trained on (``evaluation.leaks``)."""
 

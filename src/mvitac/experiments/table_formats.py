@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.scores import by_cell, least_p, num_groups_of, percent, resampled, with_interval
+from mvitac.evaluation.scores import by_cell, covered, least_p, num_groups_of, percent, with_interval
 from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Cell, Line, lines_of, stresses_of
 from mvitac.registry import from_json
@@ -45,7 +45,7 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what was compared, the table, stress tests, AUROC, retrieval and cost."""
     plan = _plan(result)
     shown = any(cell.printed is not None for line in lines for cell in line.cells.values())
-    text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, shown), ""]
+    text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, lines, shown), ""]
     text += _table(lines, plan.reference, shown)
     for kind, worse in stresses_of(result).items():
         text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
@@ -89,19 +89,21 @@ def _gap(cell: Cell | None) -> str:
     if cell is None or cell.difference is None:
         return ""
     mean, _, _, p = cell.difference
-    return f"{100 * mean:+.1f} (p {p:.3f})" if p >= 0.0015 else f"{100 * mean:+.1f} (p .001)"
+    return f"{100 * mean:+.1f}" if p is None else f"{100 * mean:+.1f} (p {_p(p)})"
 
 
-def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
+def _p(p: float) -> str:
+    return f"{p:.3f}" if p >= 0.0005 else "< .001"
+
+
+def _preface(result: dict[str, Any], plan: Plan, lines: Sequence[Line], shown: bool) -> list[str]:
     """Paragraphs about data, budget, statistics, and everything that limits the comparison."""
-    least = least_p(max((num_groups_of(record) for record in result["records"]), default=1))
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
         f" {_budget(result)}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
         f" {_made(result)}.",
-        f"95 % intervals and p: {resampled(result['group_by'], seeds)}. p is of the difference to {plan.reference} on the"
-        f" same test rows, {least:.3f} at the least, not corrected for the number of rows."
+        f"95 % intervals: {covered(result['group_by'], result['records'])}. {_significance(result, plan, lines)}"
         " Controls are in italics.",
     ]
     if plan.folds:
@@ -120,6 +122,18 @@ def _preface(result: dict[str, Any], plan: Plan, shown: bool) -> list[str]:
     if result["unfinished"]:
         text.append(f"**Not finished: {', '.join(result['unfinished'])}.**")
     return [line for part in text for line in (part, "")][:-1]
+
+
+def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> str:
+    """What p is, and its smallest possible value for each task."""
+    if all(not cell.difference or cell.difference[3] is None for line in lines for cell in line.cells.values()):
+        return f"Differences to {plan.reference} have no p, which needs several seeds."
+    groups = {record["task"]: num_groups_of(record) for record in result["records"]}
+    least = ", ".join(f"{task} {_p(least_p(num))} ({num} {result['group_by']}s)" for task, num in groups.items())
+    return (
+        f"p is of the difference to {plan.reference} on the same test rows, where both have several seeds, not corrected"
+        f" for the number of rows. Smallest possible p: {least}."
+    )
 
 
 def _notes(result: dict[str, Any]) -> list[str]:
@@ -217,7 +231,8 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if any(cell.printed is not None for line in lines for cell in line.cells.values()):
         note += f"; in parentheses: printed in the paper on {plan.printed_on}"
-    notes = [note, *(f"% Note: {note}." for note in _notes(result))]
+    intervals = f"% 95 % intervals: {covered(result['group_by'], result['records'])}"
+    notes = [note, *(f"% Note: {note}." for note in _notes(result)), intervals]
     if result["leaks"]:
         notes.append(f"% LEAK: {result['leaks']}.")
     return "\n".join([*notes, *text, r"\bottomrule", r"\end{tabular}"]) + "\n"

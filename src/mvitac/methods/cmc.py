@@ -18,7 +18,7 @@ Shapes: N rows of training data, B in a batch, K negatives, D = 128.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, cast
 
 import torch
@@ -30,6 +30,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
 from mvitac.nn.encoders import EncoderConfig, build_towers, heads, trunks
 from mvitac.nn.memory_bank import Bank
+from mvitac.registry import formerly
 from mvitac.system.distributed import World
 
 EPS = 1e-7
@@ -45,6 +46,9 @@ class CMCConfig(MethodConfig):
 
     num_negatives: int = 16384
     """Number of negatives K, drawn from the bank for each query (TAG: 16384)."""
+    negatives_per_row: float = field(default=0.18, metadata=formerly(0.0))
+    """At most this many negatives per training row (TAG: 16,384 of 91,982 rows). 0 = no limit, as in runs before this
+    field."""
     temperature: float = 0.07
     """Temperature tau (TAG: .07)."""
     bank_momentum: float = 0.5
@@ -58,6 +62,13 @@ class CMCConfig(MethodConfig):
         self.check_fields(positive=("temperature",), share=("bank_momentum",), width=("out",))
         if not 1 <= self.num_negatives <= 1 << 20:
             raise ValueError(f"num_negatives {self.num_negatives}: give 1 to {1 << 20}")
+        if not 0 <= self.negatives_per_row <= 1 << 20:
+            raise ValueError(f"negatives_per_row {self.negatives_per_row}: give 0 to {1 << 20}")
+
+    def negatives(self, num_rows: int) -> int:
+        """Number of negatives when training on ``num_rows`` rows."""
+        limit = max(1, int(self.negatives_per_row * num_rows)) if self.negatives_per_row else self.num_negatives
+        return min(self.num_negatives, limit)
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> CMC:
         self.check_modalities(spec)
@@ -122,7 +133,8 @@ class CMC(Contrastive):
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert len(self.rows), "call prepare(rows) first"
         at = torch.searchsorted(self.rows, z["rows"])
-        drawn = torch.randint(len(self.rows), (len(at), self.config.num_negatives + 1), device=at.device)[:, 1:]
+        num = self.config.negatives(len(self.rows))
+        drawn = torch.randint(len(self.rows), (len(at), num + 1), device=at.device)[:, 1:]
         vision, touch = cast(Bank, self.banks["vision"]), cast(Bank, self.banks["touch"])
         place = torch.cat([touch.find(at)[:, None], touch.find_drawn(drawn)], dim=1)  # the same in both banks
         with torch.autocast(at.device.type, enabled=False):
@@ -141,7 +153,7 @@ class CMC(Contrastive):
             fixed: Z of earlier batches; 0 in the first batch.
         """
         dots, held = bank.dots(query, place)
-        logits, world, num = dots / self.config.temperature, bank.world, self.config.num_negatives
+        logits, world, num = dots / self.config.temperature, bank.world, self.config.negatives(len(self.rows))
         if self.config.softmax:
             return F.cross_entropy(gathered_logits(logits, held, world), torch.zeros_like(place[:, 0])), fixed
         scores = logits.exp()

@@ -8,13 +8,14 @@ momentum (teacher) tower for the other view, in both directions:
 The centre c is a moving average of the teacher's scores and keeps one prototype from winning everywhere. The low
 temperature tau_t keeps the distribution from becoming uniform.
 Sources: the paper (eq. 1-4, appendix C); https://github.com/facebookresearch/dino (main_dino.py).
-Not implemented: small local crops (every method here uses two views), the warm-up of tau_t, and freezing the last layer in
-the first epoch.
+Not implemented: small local crops (every method here uses two views), the warm-up of tau_t, freezing the last layer in the
+first epoch, gradient clipping (owners: norm 3), a weight decay that rises from .04 to .4 (here the recipe's, for all
+methods), and their truncated-normal start of the MLP.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import torch
@@ -26,6 +27,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
+from mvitac.registry import formerly
 
 BOTTLENECK = 256
 
@@ -50,10 +52,13 @@ class DINOConfig(MethodConfig):
     """Number of prototypes K. DINO's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
     hidden: int = 2048
     """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
+    prototype_norm: float = field(default=0.577, metadata=formerly(16.0))
+    """Norm of the prototypes at the start (DINO: .577). They are normalised before use, so a larger norm means smaller
+    steps of their direction: at 16, as in runs before this field, they hardly move."""
 
     def __post_init__(self) -> None:
         self.check_fields(
-            positive=("student_temperature", "teacher_temperature"),
+            positive=("student_temperature", "teacher_temperature", "prototype_norm"),
             share=("centre_momentum", "momentum", "momentum_end"),
             width=("out", "hidden"),
         )
@@ -65,12 +70,12 @@ class DINOConfig(MethodConfig):
 class Prototypes(nn.Module):
     """An MLP with a bottleneck: features [B, D] to cosines [B, K] with K learned directions."""
 
-    def __init__(self, features: int, hidden: int, num: int) -> None:
+    def __init__(self, features: int, hidden: int, num: int, norm: float) -> None:
         super().__init__()
         self.mlp = nn.Sequential(
             nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, BOTTLENECK)
         )
-        self.directions = nn.Parameter(torch.randn(num, BOTTLENECK))
+        self.directions = nn.Parameter(torch.randn(num, BOTTLENECK) * (norm / BOTTLENECK**0.5))
 
     def forward(self, features: Float[Tensor, "B D"]) -> Float[Tensor, "B K"]:
         return F.linear(F.normalize(self.mlp(features), dim=1), F.normalize(self.directions, dim=1))
@@ -91,7 +96,9 @@ class DINO(Contrastive):
     def __init__(self, config: DINOConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.student = build_towers(encoder, spec, lambda width: Prototypes(width, config.hidden, config.out))
+        self.student = build_towers(
+            encoder, spec, lambda width: Prototypes(width, config.hidden, config.out, config.prototype_norm)
+        )
         self.teacher = nn.ModuleDict({m: Momentum(tower) for m, tower in self.student.items()})
         self.register_buffer("centre", torch.zeros(len(self.student), config.out))
         self.pending: Tensor | None = None

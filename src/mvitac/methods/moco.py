@@ -2,6 +2,8 @@
 
 The positive of a query is the momentum tower's embedding of another view of the same image. The negatives are a queue of
 the last K keys; the other keys of the batch are not used. MViTac keeps the momentum tower and drops the queue.
+Not implemented: shuffled BatchNorm (section 3.3). Queries and keys of a batch are normalised by statistics of the same rows,
+which can reveal the positive.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.nn.small_conv import use_convolutions, use_products
-from mvitac.registry import LATER
+from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
@@ -46,7 +46,9 @@ class EncoderConfig:
     weights: str = IMAGENET
     """Initial weights: `imagenet` (downloaded by timm), `scratch` (random), or a file with the trunk's state dict
     (.safetensors, .pth)."""
-
+    stem: Literal["repeat", "random"] = field(default="repeat", metadata=LATER_IN_DIGEST)
+    """Start of a pretrained trunk's first convolution for images that do not have three channels: timm repeats and rescales
+    its filters, or random (the authors' code)."""
     temporal: Literal["stack", "mean", "attention"] = field(default="stack", metadata=LATER)
     """How several frames of a window are read. stack: as channels of one image. mean: the trunk sees each frame, and their
     features are averaged. attention: their weighted mean, with weights learned from the features and the frame's age."""
@@ -61,15 +63,15 @@ class EncoderConfig:
 def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Module:
     """Create a trunk that maps images [B, ``channels``, H, W] to pooled features [B, D]; ``trunk.num_features`` is D.
 
-    With more than three channels the pretrained stem is kept: timm repeats and rescales its filters. The channels are those
-    of all ``frames`` of a window together.
+    ``EncoderConfig.stem`` says how the first convolution of a pretrained trunk starts if there are not three channels. The
+    channels are those of all ``frames`` of a window together.
 
     Raises:
         ValueError: If the requested weights are not available. There is no silent fallback to random weights.
     """
     if frames == 1 or config.temporal == "stack":
-        return use_products(_from_timm(config, channels))
-    trunk = use_products(_from_timm(config, channels // frames))
+        return use_products(_with_stem(config, channels))
+    trunk = use_products(_with_stem(config, channels // frames))
     return PerFrame(trunk, frames, attention=config.temporal == "attention")
 
 
@@ -95,6 +97,15 @@ class PerFrame(nn.Module):
             return features.mean(1)
         weights = (self.score(features).squeeze(2) + self.age).softmax(dim=1)
         return (weights.unsqueeze(2) * features).sum(1)
+
+
+def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:
+    trunk = _from_timm(config, channels)
+    if config.stem == "random" and channels != 3:
+        names = trunk.pretrained_cfg["first_conv"]  # type: ignore[index]
+        for name in [names] if isinstance(names, str) else names:
+            trunk.get_submodule(name).reset_parameters()  # type: ignore[operator]
+    return trunk
 
 
 def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:

@@ -18,7 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import cross_modal, split_rows
-from mvitac.evaluation.scores import percent, resampled, summarise, with_interval
+from mvitac.evaluation.scores import covered, percent, summarise, with_interval
 from mvitac.model import load, precision_of
 from mvitac.registry import to_json
 from mvitac.report import galleries, tables
@@ -167,7 +167,7 @@ def _page(study: Study) -> str:
     notes = "".join(f" Note: {note}." for note in spec.notes)
     foot = page.paragraph(
         f"Data: {spec.name}, from {spec.source}; licence {spec.licence}.{notes}"
-        f" 95 % intervals: {resampled(spec.group_by, len({r.run.seed for r in study.runs}))}."
+        f" 95 % intervals: {covered(spec.group_by, study.result['records'])}."
         f" Written by mvitac {__version__}; this page makes no network request."
     )
     return page.html_page(title, _head(study, title), [section for section in drawn if section[2]], foot)

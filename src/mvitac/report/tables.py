@@ -12,10 +12,10 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.scores import (
     cell_text,
     columns_of,
+    covered,
     interval,
     leaks_in,
     percent,
-    resampled,
     sources_of,
     tested_on,
 )
@@ -32,7 +32,6 @@ def unseen_groups(group_by: str, records: Sequence[dict[str, Any]]) -> str:
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
     """Print one table per task: accuracy in percent, mean and 95 % interval."""
-    seeds = 0
     for name, task in result["summary"].items():
         modalities = columns_of(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
@@ -48,7 +47,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
             # LEAK on a line of its own, else the table is too wide.
             table.add_row(source, *(cell_text(task, source, m).replace(" LEAK", "\nLEAK") for m in modalities))
         console.print(table)
-    console.print(f"95 % intervals: {resampled(result['group_by'], seeds)}.", style="dim")
+    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
     for leak in result.get("leaks", ()):

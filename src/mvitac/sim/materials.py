@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mvitac.sim.coordinates import Motion, grid, turn
 from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS
@@ -159,6 +160,7 @@ def touch(
     size: int,
     held_out_sensor: bool = False,
     background: bool = False,
+    moment: int = 0,
 ) -> dict[str, Any]:
     """Simulate one pair.
 
@@ -167,17 +169,19 @@ def touch(
         size: Side of the pictures in pixels.
         held_out_sensor: Use the sensor that is not used otherwise; everything else is the same.
         background: Also return "background", the same copy of the sensor before contact.
+        moment: 0, or the number of a later moment of the same press (`motion.Motion`).
 
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
     """
-    _check_request(seed, category, instance, touch, size)
+    _check_request(seed, category, instance, touch, size, moment)
     thing = draw_instance(seed, category, instance)
     # One random stream per picture, so that they are independent; pixel noise is drawn last in each.
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
-    vision = _look(thing, eye, angle + eye.normal(0, 0.1), place, size)
-    pressed = _feel(thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor, background)
+    motion = Motion.draw(_TAG, seed, category, instance, touch, moment) if moment else None
+    vision = _look(thing, eye, angle + eye.normal(0, 0.1), place, size, motion)
+    pressed = _feel(thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor, background, motion)
     return {
         "vision": vision,
         "category": category,
@@ -195,28 +199,14 @@ def touch(
     }
 
 
-def _check_request(seed: int, category: int, instance: int, touch: int, size: int) -> None:
-    for name, value in (("seed", seed), ("instance", instance), ("touch", touch)):
+def _check_request(seed: int, category: int, instance: int, touch: int, size: int, moment: int) -> None:
+    for name, value in (("seed", seed), ("instance", instance), ("touch", touch), ("moment", moment)):
         if value < 0:
             raise ValueError(f"{name} must be >= 0, got {value}")
     if not 0 <= category < len(CLASSES):
         raise ValueError(f"category must be 0 to {len(CLASSES) - 1} ({', '.join(CLASSES)}), got {category}")
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
-
-
-def _grid(size: int, width_mm: float) -> tuple[F, F, float]:
-    """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
-    n = 2 * size if size <= 96 else max(192, size)
-    pixel = width_mm / n
-    axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
-    x, y = np.meshgrid(axis, axis)
-    return x, y, pixel
-
-
-def _turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
-    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-    return cos * x + sin * y + np.float32(place[0]), cos * y - sin * x + np.float32(place[1])
 
 
 def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -> F:
@@ -239,14 +229,21 @@ def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -
 
 
 def _look(
-    thing: Instance, rng: np.random.Generator, angle: float, place: NDArray[np.float64], size: int
+    thing: Instance,
+    rng: np.random.Generator,
+    angle: float,
+    place: NDArray[np.float64],
+    size: int,
+    motion: Motion | None,
 ) -> NDArray[np.uint8]:
     """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
-    x, y, pixel = _grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
+    x, y, pixel = grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
     width = float(x.shape[0] * pixel)
+    if motion:
+        x, y = motion.seen(x, y, width)
     curl = thing.curl
     inside = _outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)
-    texture = thing.sight(*_turn(x, y, angle, place))
+    texture = thing.sight(*turn(x, y, angle, place))
     lines = marks(x, y, rng, curl=curl, extent_mm=width, count=int(rng.integers(2, 4)))
     steep = np.float32(np.exp(rng.uniform(*np.log((0.05, 0.11)))) * thing.sight.wavelength_mm)
     bevel = np.float32(0.06 * width)
@@ -270,7 +267,8 @@ def _look(
     vignette = 1 - np.float32(0.5 / width**2) * (x * x + y * y)
     picture = area_resize(picture * tint * ((1 + np.float32(drop) * ramp) * vignette)[..., None], size, size)
     picture = 255 * np.clip(picture, 0, 1.2) ** np.float32(0.8)
-    picture = picture + rng.standard_normal(picture.shape, np.float32) * np.float32(grain)
+    noise = motion.noise if motion else rng
+    picture = picture + noise.standard_normal(picture.shape, np.float32) * np.float32(grain)
     return np.clip(picture + 0.5, 0, 255).astype(np.uint8)
 
 
@@ -293,8 +291,8 @@ def _table(x: F, y: F, rng: np.random.Generator, width: float, pixel: float) -> 
     """Draw the background [n, n, 3]: a patterned table, and objects with straight and with curved outlines."""
     ground, second = rng.uniform(0.12, 0.7, (2, 3)).astype(np.float32)
     table = rng.standard_normal((64, 64), np.float32)
-    stretch, scale, turn = rng.uniform(1, 5), width * rng.uniform(0.04, 0.15), rng.uniform(0, np.pi)
-    u, v = _turn(x, y, turn, rng.uniform(0, 999, 2))
+    stretch, scale, slanted = rng.uniform(1, 5), width * rng.uniform(0.04, 0.15), rng.uniform(0, np.pi)
+    u, v = turn(x, y, slanted, rng.uniform(0, 999, 2))
     pattern = fractal(u / np.float32(scale * stretch), v / np.float32(scale), table, 3)
     mix = np.clip(np.float32(rng.uniform(0, 0.35)) * pattern + 0.5, 0, 1)[..., None]
     picture = ground * mix + second * (1 - mix)
@@ -315,6 +313,7 @@ def _feel(
     size: int,
     held_out: bool,
     background: bool,
+    motion: Motion | None,
 ) -> dict[str, Any]:
     """Press the object into a gel: "touch" and, if requested, "background" (uint8 [size, size, 3]), sensor and force."""
     choice = [s for s in SENSORS.values() if s.held_out == held_out]
@@ -324,8 +323,10 @@ def _feel(
     dome = float(rng.uniform(18.0, 40.0))
     tilt = rng.normal(0, 0.04, 2).astype(np.float32)
     shear = rng.normal(0, 0.25, 2)
-    x, y, pixel = _grid(size, _TOUCH_MM)
-    u, v = _turn(x, y, angle, place)
+    x, y, pixel = grid(size, _TOUCH_MM)
+    if motion:
+        x, y, force, shear = motion.felt(x, y, force, shear)
+    u, v = turn(x, y, angle, place)
     curl = thing.curl
     # Soft objects deform, which would make their imprints shallower, so their relief is higher.
     yielding = GEL_STIFFNESS / thing.stiffness
@@ -343,7 +344,8 @@ def _feel(
     relief = relief + tilt[0] * x + tilt[1] * y - bulge * (x * x + y * y)
     imprint = press(relief, force_n=force, stiffness=thing.stiffness, pixel_mm=pixel, dome_radius_mm=dome)
     unit = int(rng.integers(2**31))
-    draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
+    noise = motion.noise if motion else rng
+    draw = partial(render, sensor=sensor, rng=noise, pixel_mm=pixel, size=size, unit=unit, gain=gain)
     made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
     if background:  # rendered last, so that other pictures do not change
         made["background"] = draw(np.zeros_like(imprint))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 import torch
@@ -34,7 +35,8 @@ class Batches:
         self.rows, self.seed, self.window, self.world = rows, run.seed, pack.window, world or World()
         self.per_epoch, self.batch_size = run.steps_per_epoch(len(rows)), run.batch_size
         self.share = run.batch_size // self.world.size
-        self.touch_groups = pack.touch_groups[rows] if run.sampler == "one-per-touch" else None
+        self.touch_groups = pack.touch_groups[rows] if run.sampler != "shuffle" else None
+        self.order = spread_order if run.sampler == "spread" else epoch_order
         self.shards = pack.shards[rows]
         self._epoch = lru_cache(2)(self._order)
 
@@ -54,9 +56,9 @@ class Batches:
         """[per_epoch, batch_size]"""
         seed, num = mix(self.seed, 1, epoch), self.per_epoch * self.batch_size
         if not self.window:
-            return self.rows[epoch_order(len(self.rows), self.touch_groups, seed)[:num]].reshape(self.per_epoch, -1)
+            return self.rows[self.order(len(self.rows), self.touch_groups, seed)[:num]].reshape(self.per_epoch, -1)
         size = self.world.size
-        lanes = shard_order(self.shards, self.touch_groups, self.window, size, num, seed)
+        lanes = shard_order(self.shards, self.touch_groups, self.window, size, num, seed, self.order)
         return self.rows[lanes.reshape(size, self.per_epoch, self.share).swapaxes(0, 1).reshape(self.per_epoch, -1)]
 
 
@@ -95,20 +97,45 @@ def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
     order = rng.permutation(num)
     if groups is None:
         return order
-    _, inverse, counts = np.unique(groups[order], return_inverse=True, return_counts=True)
-    by_group = np.argsort(inverse, kind="stable")
-    occurrence = np.empty(num, np.int64)
-    occurrence[by_group] = np.arange(num) - np.repeat(np.cumsum(counts) - counts, counts)
-    return order[np.argsort(occurrence, kind="stable")]
+    return order[np.argsort(_occurrences(groups[order])[0], kind="stable")]
+
+
+def spread_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
+    """A random permutation of 0..num-1 in which the rows of each of ``groups`` [num] are far apart.
+
+    The c rows of a group lie 1 / c of the length apart, give or take a fifth of that, around the end too.
+    """
+    assert groups is not None
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(num)
+    occurrence, inverse, counts = _occurrences(groups[order])
+    start, jitter = rng.random(len(counts)), rng.uniform(-0.1, 0.1, num)
+    return order[np.argsort((occurrence + start[inverse] + jitter) / counts[inverse] % 1)]
+
+
+def _occurrences(groups: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each of ``groups`` [N]: how often the same came before, and its number; and the size of each number's group."""
+    _, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    occurrence = np.empty(len(groups), np.int64)
+    occurrence[np.argsort(inverse, kind="stable")] = np.arange(len(groups)) - np.repeat(
+        np.cumsum(counts) - counts, counts
+    )
+    return occurrence, inverse, counts
 
 
 def shard_order(
-    shards: np.ndarray, groups: np.ndarray | None, window: int, num_lanes: int, num: int, seed: int
+    shards: np.ndarray,
+    groups: np.ndarray | None,
+    window: int,
+    num_lanes: int,
+    num: int,
+    seed: int,
+    order: Callable[[int, np.ndarray | None, int], np.ndarray] = epoch_order,
 ) -> np.ndarray:
     """A random order of rows 0..N-1 in which each process needs few shards at a time.
 
-    The shards are put in random order and cut into one lane per process. Within a lane, rows are shuffled as by
-    ``epoch_order``, ``window`` shards at a time. Only a shard that is cut is read by two processes.
+    The shards are put in random order and cut into one lane per process. Within a lane, rows are shuffled by
+    ``order``, ``window`` shards at a time. Only a shard that is cut is read by two processes.
 
     Args:
         shards: [N], the shard of each row.
@@ -117,6 +144,7 @@ def shard_order(
         num_lanes: Number of processes.
         num: Number of rows to use.
         seed: Random seed.
+        order: ``epoch_order`` or ``spread_order``.
 
     Returns:
         [num_lanes, num / num_lanes] row numbers, each at most once.
@@ -128,21 +156,24 @@ def shard_order(
         windows = np.array_split(held, -(-len(held) // window))
         firsts = np.searchsorted(place[lane], [some[0] for some in windows])
         for i, rows in enumerate(np.split(lane, firsts[1:])):  # views of the lane
-            rows[:] = rows[epoch_order(len(rows), None if groups is None else groups[rows], mix(seed, number, i))]
+            rows[:] = rows[order(len(rows), None if groups is None else groups[rows], mix(seed, number, i))]
     return lanes
 
 
-def partners(pack: Pack, rows: np.ndarray, generator: torch.Generator) -> np.ndarray:
-    """For each of ``rows`` a random other row of the same touch group, split and shard.
+def partners(
+    pack: Pack, rows: np.ndarray, generator: torch.Generator, of: Literal["touch_groups", "presses"] = "touch_groups"
+) -> np.ndarray:
+    """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
     A row without such others is its own partner.
     """
-    groups, split, shards = pack.touch_groups, pack.column("split"), pack.shards
+    groups: np.ndarray = getattr(pack, of)
+    split, shards = pack.column("split"), pack.shards
     whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
-        others = pack.rows_of(int(groups[row]))
+        others = pack.rows_of(int(groups[row]), of)
         others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         others = others[shards[others] == shards[row]]
         if len(others):

@@ -57,6 +57,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
     pack = open_pack(run.data, world, quiet) if pack is None else pack
+    if run.positives == "same-press":
+        _ = pack.presses  # the ValueError comes before anything is written
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)

@@ -11,6 +11,7 @@ its running statistics are updated once per chunk.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -149,8 +150,14 @@ def _running_statistics(method: Method) -> list[Tensor]:
 
 def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
     """Create the optimiser of the trainable parameters (momentum copies have none). Uses a fused kernel if available."""
-    parameters = [p for p in method.parameters() if p.requires_grad]
+    parameters: Any = [p for p in method.parameters() if p.requires_grad]
     fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
+    if config.weight_decay and not config.decay_norms:
+        vectors = [p for p in parameters if p.ndim <= 1]  # biases and BatchNorm
+        parameters = [
+            {"params": [p for p in parameters if p.ndim > 1]},
+            {"params": vectors, "weight_decay": 0.0},
+        ]
     if config.name == "sgd":
         momentum, decay = config.betas[0], config.weight_decay
         return torch.optim.SGD(parameters, config.lr, momentum=momentum, weight_decay=decay, fused=fused)

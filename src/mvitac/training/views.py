@@ -87,7 +87,8 @@ def make_views(
     assert (mirror is None) == (run.augment.gel_flip == "plain")
     views = [rows] * num_views
     if run.positives != "same-image":
-        views[1:] = [partners(pack, rows, generator) for _ in range(num_views - 1)]
+        of = "presses" if run.positives == "same-press" else "touch_groups"
+        views[1:] = [partners(pack, rows, generator, of) for _ in range(num_views - 1)]
     sources = dict.fromkeys(pack.spec.modalities, views)
     if run.positives == "same-touch-pairs" and num_views == 1:
         sources["touch"] = [partners(pack, rows, generator)]

@@ -1,0 +1,70 @@
+"""Coordinates of the pictures of materials, and how they change between two moments of one press."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvitac.sim.gel import F
+
+
+def grid(size: int, width_mm: float) -> tuple[F, F, float]:
+    """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
+    n = 2 * size if size <= 96 else max(192, size)
+    pixel = width_mm / n
+    axis = (np.arange(n, dtype=np.float32) - (n - 1) / 2) * np.float32(pixel)
+    x, y = np.meshgrid(axis, axis)
+    return x, y, pixel
+
+
+def turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
+    """Turn x, y [n, n] by ``angle`` in radians, then shift them by ``place`` (x, y) in mm."""
+    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    return cos * x + sin * y + np.float32(place[0]), cos * y - sin * x + np.float32(place[1])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """What changes from moment 0 of a press to a later one: camera and hand move a little, and the hand presses harder.
+
+    Object, lamp, clutter and sensor stay. The sizes were set by eye, for frames of a video some tenths of a second apart.
+    """
+
+    turn: float
+    """Rotation of the camera in radians."""
+    shift: NDArray[np.float64]
+    """Shift of the camera picture (x, y) in parts of its width."""
+    zoom: float
+    """Factor of the camera's field of view."""
+    slip: NDArray[np.float64]
+    """Movement of the object over the gel (x, y) in mm."""
+    force: float
+    """Factor of the force, at least 1."""
+    noise: np.random.Generator
+    """Source of the pixel noise of both pictures."""
+
+    @classmethod
+    def draw(cls, *numbers: int) -> Motion:
+        """Draw a motion that depends only on ``numbers``."""
+        rng = np.random.default_rng(numbers)
+        return cls(
+            turn=rng.normal(0, 0.04),
+            shift=rng.normal(0, 0.03, 2),
+            zoom=float(np.exp(rng.normal(0, 0.03))),
+            slip=rng.normal(0, 0.4, 2),
+            force=float(np.exp(rng.uniform(0.0, 0.6))),
+            noise=rng,
+        )
+
+    def seen(self, x: F, y: F, width: float) -> tuple[F, F]:
+        """Camera coordinates x, y [n, n] in mm of a picture ``width`` mm wide, after the camera has moved."""
+        cos, sin = (np.float32(self.zoom * part) for part in (np.cos(self.turn), np.sin(self.turn)))
+        dx, dy = (np.float32(part * width) for part in self.shift)
+        return cos * x + sin * y + dx, cos * y - sin * x + dy
+
+    def felt(self, x: F, y: F, force: float, shear: NDArray[np.float64]) -> tuple[F, F, float, NDArray[np.float64]]:
+        """Gel coordinates x, y [n, n] in mm, force in N and shear in mm. The gel follows half of the slip."""
+        dx, dy = (np.float32(part) for part in self.slip)
+        return x - dx, y - dy, force * self.force, shear + self.slip / 2

@@ -1,0 +1,125 @@
+"""Intervals and differences: worked cases, and their error rates over many simulated pairs of equal methods."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from benchmarks.calibration import rates_of_error
+from scipy.stats import t as student
+
+from mvitac.evaluation.scores import interval, least_p, paired_difference
+
+
+def record(correct: list[int], seed: int | None, sizes: int = 10) -> dict:
+    return {"group_sizes": [sizes] * len(correct), "group_correct": correct, "seed": seed}
+
+
+# -- level ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("equal", [True, False], ids=["equal", "unequal"])
+@pytest.mark.parametrize("groups", [4, 8, 106, 240])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_error_rates_are_no_more_than_stated(groups: int, equal: bool, seeds: int) -> None:
+    """At most 7 % instead of 5 %, also near the ceiling; with one seed there is no p to be wrong."""
+    for accuracy, seed_sd in ((0.6, 0.03), (0.9, 0.012)):
+        found = rates_of_error(groups, equal, seeds, accuracy, seed_sd, trials=150)
+        assert (found["p < .05"] is None) == (seeds == 1)
+        assert found["p < .05"] is None or found["p < .05"] <= 0.07
+        assert found["outside interval"] <= 0.07
+
+
+def test_a_difference_in_every_group_is_found() -> None:
+    """Groups differ wildly, but ours has one more right in each, under three seeds."""
+    base = np.random.default_rng(0).integers(0, 9, (3, 40))
+    theirs = [record(one.tolist(), seed) for seed, one in enumerate(base)]
+    ours = [record((one + 1).tolist(), seed) for seed, one in enumerate(base)]
+    mean, low, high, p = paired_difference(ours, theirs)
+    assert (mean, low, high) == pytest.approx((0.1, 0.1, 0.1)) and p is not None and p < 0.002
+    assert paired_difference(theirs, ours)[0] == pytest.approx(-0.1)
+    assert paired_difference(ours, ours) == (0.0, 0.0, 0.0, 1.0)
+
+
+# -- worked cases -----------------------------------------------------------------------------------------------------
+
+
+def test_equal_groups_give_the_t_test() -> None:
+    counts, gains = np.array([2, 5, 3, 6, 7, 4]), (3, 1, 0, 2, 1, 2)
+    ours = [record((counts + np.array(gains)).tolist(), seed) for seed in range(2)]
+    theirs = [record(counts.tolist(), seed) for seed in range(2)]
+    per_group = np.array(gains) / 10
+    margin = student.ppf(0.975, 5) * per_group.std(ddof=1) / 6**0.5
+    assert paired_difference(ours, theirs)[1:3] == pytest.approx((0.15 - margin, 0.15 + margin))
+    p = 2 * student.sf(0.15 / (per_group.std(ddof=1) / 6**0.5), 5)
+    assert p < least_p(6) == 2 / 2**6 == paired_difference(ours, theirs)[3]
+
+
+def test_seeds_give_the_t_test_over_seeds() -> None:
+    """Ours is better by chance of one seed of two: 1 degree of freedom."""
+    ours, theirs = [record([9] * 30, 0), record([3] * 30, 1)], [record([5] * 30, 0), record([5] * 30, 1)]
+    mean, low, high, p = paired_difference(ours, theirs)
+    margin = student.ppf(0.975, 1) * 0.3
+    assert mean == pytest.approx(0.1) and (low, high) == (-1.0, 1.0) and margin > 1
+    assert p == pytest.approx(2 * student.sf(0.1 / 0.3, 1))
+
+
+def test_equal_seeds_are_paired() -> None:
+    """Seeds differ by 50 points, but ours has one more right under each: certain where seeds are the same, not where not."""
+    theirs = [record([2] * 30, 0), record([7] * 30, 1)]
+    ours = [record([3] * 30, 0), record([8] * 30, 1)]
+    assert paired_difference(ours, theirs)[1:3] == pytest.approx((0.1, 0.1))
+    others = [{**r, "seed": r["seed"] + 5} for r in ours]
+    assert paired_difference(others, theirs)[1] < 0
+
+
+def test_one_seed_has_no_p() -> None:
+    three = [record([9] * 30, seed) for seed in range(3)]
+    one, control = [record([5] * 30, 0)], [record([5] * 30, None)]
+    assert paired_difference(one, three)[3] is None and paired_difference(three, one)[3] is None
+    assert paired_difference(three, control)[3] is not None  # a control without seeds has nothing to vary
+    assert paired_difference([record([3], 0)], [record([9], 0)])[1:] == (-1.0, 1.0, None)
+
+
+def test_interval_of_many_rows_is_the_binomial_one() -> None:
+    """100 groups of 1 row, 70 right: the 95 % interval of a mean of 100 coin flips at .7, about +-1.96 sqrt(.21/100)."""
+    mean, low, high = interval([{"group_sizes": [1] * 100, "group_correct": [1] * 70 + [0] * 30}])
+    assert mean == pytest.approx(0.7)
+    assert (low, high) == (pytest.approx(0.61, abs=0.015), pytest.approx(0.79, abs=0.015))
+
+
+def test_interval_counts_groups_not_rows() -> None:
+    """Ten times the rows in the same groups say next to nothing new."""
+    few = {"group_sizes": [1] * 20, "group_correct": [1, 0] * 10}
+    many = {"group_sizes": [10] * 20, "group_correct": [10, 0] * 10}
+    assert interval([few]) == pytest.approx(interval([many]), abs=0.01)
+
+
+def test_one_large_group_counts_as_few() -> None:
+    """19 groups of 1 row and one of 981 are little more than one group."""
+    even = {"group_sizes": [50] * 20, "group_correct": [25, 35] * 10}
+    uneven = {"group_sizes": [1] * 19 + [981], "group_correct": [0, 1] * 9 + [0, 590]}
+    assert np.ptp(interval([uneven])[1:]) > 5 * np.ptp(interval([even])[1:])
+
+
+def test_seeds_widen_the_interval() -> None:
+    same, good = record([5] * 50, 0), record([9] * 50, 1)
+    _, low, high = interval([same])
+    assert high - low < 0.1
+    mean, low, high = interval([same, good])
+    assert mean == pytest.approx(0.7) and high - low > 0.8  # t with 1 degree of freedom
+
+
+def test_intervals_stay_within_0_and_1_and_are_never_empty() -> None:
+    mean, low, high = interval([record([10] * 6, 0)])
+    assert (mean, high) == (1.0, 1.0) and 0.7 < low < 0.9
+    assert interval([record([0] * 6, 0)])[1:] == pytest.approx((0.0, 1 - low))
+
+
+def test_one_group_says_nothing_about_others() -> None:
+    assert interval([{"group_sizes": [10], "group_correct": [9]}]) == (0.9, 0.0, 1.0)
+
+
+def test_groups_without_rows_do_not_count() -> None:
+    full = record([5, 7, 2, 9, 4], 0)
+    holes = {"group_sizes": [10, 0, 10, 10, 0, 10, 10], "group_correct": [5, 0, 7, 2, 0, 9, 4], "seed": 0}
+    assert interval([holes]) == interval([full])
