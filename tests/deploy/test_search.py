@@ -94,7 +94,7 @@ def test_find_command_draws_what_it_found(
         assert sheet.size == (640, 160)
     (tmp_path / "bad.png").write_text("no picture")
     assert main(["find", str(tmp_path / "bad.png"), "--in", str(index)]) == 2
-    assert "cannot be read as a picture" in capsys.readouterr().err
+    assert "cannot be read as an image" in capsys.readouterr().err
     assert main(["find", "--in", str(index)]) == 2
     assert "name the picture to search for" in capsys.readouterr().err
 
