@@ -27,7 +27,7 @@ from mvitac.nn.linear_probe import LinearProbe
 from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import brief, digest, write_atomic
+from mvitac.system.files import brief, digest, parse_json, write_atomic
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
@@ -325,9 +325,9 @@ def load(path: str | Path) -> Model:
     if header.get("header_digest", given) != given:
         raise ValueError(f"{file} does not match its header's digest: it was changed or damaged")
     try:
-        run = Run.load(json.loads(header["run"]))
-        spec: DataSpec = from_json(DataSpec, json.loads(header["spec"]), "spec")
-        stored = int(from_json(int, json.loads(header["stored"]), "stored"))
+        run = Run.load(parse_json(header["run"]))
+        spec: DataSpec = from_json(DataSpec, parse_json(header["spec"]), "spec")
+        stored = int(from_json(int, parse_json(header["stored"]), "stored"))
         # Older headers have no spec.difference; it is in the data config.
         spec = replace(spec, difference=spec.difference or bool(getattr(run.data, "difference", False)))
     except (KeyError, ValueError) as error:

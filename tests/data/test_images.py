@@ -59,7 +59,7 @@ def test_same_pixels_everywhere(kind: str, tmp_path: Path) -> None:
 
 
 def test_floating_point_images_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="touch: this image cannot be used .*floating-point"):
+    with pytest.raises(ValueError, match=r"touch: this image cannot be used .*floating-point"):
         to_array(Image.fromarray(np.ones((8, 8), np.float32)), 3, "touch")
 
 

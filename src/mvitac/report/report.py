@@ -25,7 +25,7 @@ from mvitac.report import html as page
 from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
 from mvitac.run import load_run
-from mvitac.system.files import write_atomic
+from mvitac.system.files import parse_json, write_atomic
 from mvitac.system.progress import duration, shown, work
 
 
@@ -100,8 +100,8 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     lines = []
     for line in path.read_text().splitlines() if path.exists() else []:
         try:
-            lines.append(json.loads(line))
-        except json.JSONDecodeError:
+            lines.append(parse_json(line))
+        except ValueError:
             break
     return lines
 
