@@ -72,7 +72,7 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
         what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
         with shown(Console(stderr=True)), work(what):
             model = load(path)
-            data = pack or model.run.data.open()
+            data = pack or model.open_data()
             own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
             records += [{**own, **r} for r in stress(model, data, *chosen(data, options.config))]
     return records

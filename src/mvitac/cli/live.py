@@ -210,7 +210,7 @@ def sources(
 def _engine(model: str, threads: int, console: Any) -> "Engine":
     """The engine of an export; a run or an artifact is exported first, once, into the cache."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, lists_bf16
+    from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, import_openvino, lists_bf16
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_readouts
     from mvitac.model import safetensors_digest
@@ -220,9 +220,7 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     if (Path(model) / MANIFEST).is_file():
         engine = Engine(model, threads=threads)
         if engine.meta["precision"] == "bf16":
-            import openvino
-
-            if not lists_bf16(openvino.Core()):
+            if not lists_bf16(import_openvino().Core()):
                 console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
         return engine
     loaded = load(model)
@@ -232,7 +230,7 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
-        pack = own_data(loaded, "`mvitac export` it where the data is, and give that folder")
+        pack = own_data(loaded, "`mvitac export MODEL --on PACK --out DIR` first, and give DIR")
         export(with_readouts(loaded, pack), pack, folder)
     return Engine(folder, threads=threads)
 

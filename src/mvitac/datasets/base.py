@@ -27,6 +27,8 @@ class DatasetConfig(Registered, ABC):
 
     local: ClassVar[tuple[str, ...]] = ("workers",)
     """Options that do not affect the result."""
+    names_a_place: ClassVar[bool] = True
+    """Whether opening the data reads a path or a URL that the config names. That of an artifact is not believed."""
     phased: ClassVar[bool] = False
     """Whether rows of a touch group show phases of a grasp (before, during, after) instead of repeated touches."""
 
