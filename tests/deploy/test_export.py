@@ -375,7 +375,7 @@ def test_running_an_onnx_export_needs_no_torch() -> None:
 
 
 def test_conversion_to_openvino_tells_nobody(onnx: Path, tmp_path: Path) -> None:
-    """OpenVINO by itself looks up an analytics host and writes an id into the home folder, on import and by its converter."""
+    """OpenVINO looks up an analytics host and writes an id into the home folder, on import and by its converter."""
     shutil.copy(onnx / "model.onnx", tmp_path)
     (tmp_path / "home").mkdir()
     code = (

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from tyro.conf import Positional
 
 from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
+from mvitac.system.console import Console
 from mvitac.system.progress import shown, work
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live as Screen
 from rich.table import Table
 from rich.text import Text
@@ -17,6 +17,7 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse
 from mvitac.live.contact import LiveConfig
+from mvitac.system.console import Console
 from mvitac.system.files import write_json
 
 if TYPE_CHECKING:
@@ -219,9 +220,8 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
 
     if (Path(model) / MANIFEST).is_file():
         engine = Engine(model, threads=threads)
-        if engine.meta["precision"] == "bf16":
-            if not lists_bf16(import_openvino().Core()):
-                console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
+        if engine.meta["precision"] == "bf16" and not lists_bf16(import_openvino().Core()):
+            console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
         return engine
     loaded = load(model)
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.

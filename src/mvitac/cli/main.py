@@ -9,6 +9,8 @@ import re
 import sys
 from collections.abc import Sequence
 
+from mvitac.system.terminal import plain_output
+
 HELP = """\
 usage: mvitac COMMAND [OPTIONS]     (mvitac COMMAND --help explains one)
 
@@ -80,6 +82,11 @@ _NO_MEMORY = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     _wait_briefly()
+    with plain_output():
+        return _main(argv)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         code = _run(arguments)

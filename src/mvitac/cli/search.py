@@ -13,13 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tyro
 from PIL import Image
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.images import decode
 from mvitac.data.pack import Pack
+from mvitac.system.console import Console
 from mvitac.system.files import check_place, write_atomic
 from mvitac.system.progress import shown
 

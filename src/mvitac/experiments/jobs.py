@@ -17,7 +17,6 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from rich.console import Console
 from rich.progress import TaskID
 
 from mvitac.data.pack import Pack
@@ -28,6 +27,7 @@ from mvitac.model import load
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
 from mvitac.run import Run
+from mvitac.system.console import Console
 from mvitac.system.device import pick_device
 from mvitac.system.files import brief, parse_json, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from mvitac.evaluation.scores import cell_text, columns_of, interval, percent, resampled, sources_of, tested_on
+from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
