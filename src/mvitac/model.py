@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from mvitac.data.notebook import table
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Method
 from mvitac.nn.encoders import SCRATCH, num_features, timm_trunk
@@ -27,7 +28,7 @@ from mvitac.nn.linear_probe import LinearProbe
 from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import brief, digest, write_atomic
+from mvitac.system.files import brief, digest, parse_json, write_atomic
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
@@ -53,7 +54,11 @@ class Model(nn.Module):
         projectors: modality -> head into the shared space.
         tasks: Names of the tasks of the method's own ``classifiers``; empty for a self-supervised method.
         readouts: Name -> linear probe, if the model is a published artifact.
+        foreign: Whether it is from an artifact or an index, which may be a stranger's: no place that ``run`` names is
+            opened.
     """
+
+    foreign = False
 
     def __init__(self, method: Method, run: Run, spec: DataSpec, stored: int) -> None:
         super().__init__()
@@ -279,6 +284,12 @@ class Model(nn.Module):
         """task -> class names, in the order of the columns of ``predict``."""
         return {r.question.task: r.question.classes for r in self.readouts.values()}
 
+    def open_data(self, *, quiet: bool = False) -> Pack:
+        """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""
+        if self.foreign and self.run.data.names_a_place:
+            raise ValueError("an artifact may be a stranger's: its data's place is not opened, name a pack (--on PACK)")
+        return self.run.data.open(quiet=quiet)
+
     def weights_digest(self) -> str:
         """Content address of the weights and of the image size they expect, for caches."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
@@ -325,9 +336,9 @@ def load(path: str | Path) -> Model:
     if header.get("header_digest", given) != given:
         raise ValueError(f"{file} does not match its header's digest: it was changed or damaged")
     try:
-        run = Run.load(json.loads(header["run"]))
-        spec: DataSpec = from_json(DataSpec, json.loads(header["spec"]), "spec")
-        stored = int(from_json(int, json.loads(header["stored"]), "stored"))
+        run = Run.load(parse_json(header["run"]))
+        spec: DataSpec = from_json(DataSpec, parse_json(header["spec"]), "spec")
+        stored = int(from_json(int, parse_json(header["stored"]), "stored"))
         # Older headers have no spec.difference; it is in the data config.
         spec = replace(spec, difference=spec.difference or bool(getattr(run.data, "difference", False)))
     except (KeyError, ValueError) as error:
@@ -340,10 +351,6 @@ def load(path: str | Path) -> Model:
             check_tensors(file, fresh(empty, spec, stored).state_dict(), tensors)
         model = fresh(empty, spec, stored)
     model.run = run
+    model.foreign = any((file.parent / name).exists() for name in ("artifact.json", "index.json"))
     model.load_state_dict(tensors)
     return model
-
-
-def precision_of(run: Run, record: dict[str, Any]) -> str:
-    """The precision that a recorded run was computed in, with ``auto`` resolved. Older records have no such entry."""
-    return record.get("precision", run.precision)

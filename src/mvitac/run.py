@@ -248,3 +248,8 @@ def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
         return Run.load(record["run"]), record
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
+
+
+def precision_of(run: Run, record: dict[str, Any]) -> str:
+    """The precision that a recorded run was computed in, with ``auto`` resolved. Older records have no such entry."""
+    return record.get("precision", run.precision)

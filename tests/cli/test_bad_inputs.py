@@ -15,6 +15,8 @@ import json
 import os
 import pickle
 import shutil
+import subprocess
+import sys
 import typing
 import warnings
 from collections.abc import Callable, Iterator
@@ -40,6 +42,7 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.evaluation import probe as probe_module
+from mvitac.experiments.plan import setting
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model
@@ -538,6 +541,39 @@ def test_after_a_full_disk_the_run_goes_on(
     straight = safetensors.torch.load_file(finished / "model.safetensors")
     again = safetensors.torch.load_file(tmp_path / "out" / "model.safetensors")
     assert all(torch.equal(value, again[key]) for key, value in straight.items())
+
+
+NESTED = "[" * 100_000 + "]" * 100_000
+
+
+def test_nested_brackets(refused: Callable[..., str], finished: Path, tmp_path: Path) -> None:
+    """100,000 of them, wherever JSON is read: a table, a model's header, an option, a pack's description."""
+    (tmp_path / "pairs.jsonl").write_text(NESTED)
+    refused("data pack --data folder --path {tmp}/pairs.jsonl --out {out}", "line 1 is not JSON", "brackets")
+    shutil.copytree(finished, tmp_path / "run")
+    weights = safetensors.torch.load_file(finished / "model.safetensors")
+    with safetensors.safe_open(finished / "model.safetensors", "pt") as opened:
+        header = {**opened.metadata(), "run": NESTED}
+    header["header_digest"] = digest([header["run"], header["spec"], header["stored"]])
+    safetensors.torch.save_file(weights, tmp_path / "run" / "model.safetensors", header)
+    refused("export {tmp}/run --on {pack} --out {out}", "damaged header", "brackets")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "pack.json").write_text(NESTED)
+    refused("data info {tmp}/bad", "pack.json is not valid JSON", "brackets")
+    assert setting(f"steps={NESTED}") == ("steps", NESTED)
+
+
+@pytest.mark.parametrize("port", ["-1", "0", "65536"])
+def test_port(refused: Callable[..., str], port: str) -> None:
+    refused(f"explore {{run}} --port {port}", f"--port {port}: give 1 to 65535")
+
+
+def test_a_small_limit_of_memory_is_one_line(pack: Pack) -> None:
+    """``ulimit -v``: shared libraries cannot be loaded."""
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (300 << 20,) * 2); "
+    code = f"{limit} from mvitac.cli.main import main; raise SystemExit(main(['data', 'info', {str(pack.path)!r}]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("mvitac: error: not enough memory"), done.stderr
 
 
 def test_out_of_memory_is_one_line(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -492,6 +492,7 @@ TRAIN = ["pretrain", "--recipe", "smoke", "--data", "stream", "--data.cache", "{
         ),
         (["data", "shard", "{pack}", "{shards}"], "{shards} holds a pack already"),
         (["data", "shard", "{pack}", "{tmp}/new", "--shard-mb", "0"], "shard_mb 0.0: give"),
+        (["data", "shard", "{pack}", "{tmp}/new", "--shard-mb", "inf"], "shard_mb inf: give"),
         (["data", "shard", "{pack}", "odd://place"], "odd://place cannot be opened"),
         (["data", "pack", "--data", "stream", "--out", "{tmp}/o"], "use it with --data stream"),
     ],

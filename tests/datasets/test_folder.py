@@ -385,7 +385,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),
     "32 bit": (lambda path: Image.fromarray(np.full((8, 8), 70000, np.int32)).save(path, "TIFF"), "16 bits"),
     "other size": (lambda path: Image.new("RGB", (9, 9)).save(path), "one size"),
-    "gone": (lambda path: path.unlink(), "not exist any more"),
+    "gone": (lambda path: path.unlink(), "does not exist"),
 }
 
 

@@ -331,24 +331,24 @@ def test_what_the_hub_gives_is_checked_too(copy: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize(
     ("command", "advice"),
-    [("export {} --out x", "--on PACK"), ("explore {}", "--on PACK"), ("live {}", "give that folder")],
+    [("export {} --out x", "--on PACK"), ("explore {}", "--on PACK"), ("live {}", "mvitac export MODEL --on PACK")],
 )
 def test_without_its_data_a_command_says_what_to_do(
     command: str,
     advice: str,
-    artifact: Path,
+    smoke_run: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """As on a robot, to which the artifact was copied."""
+    """As on a robot, to which the run was copied."""
 
-    def gone(self: PackConfig) -> Pack:
+    def gone(self: PackConfig, **_: Any) -> Pack:
         raise ValueError("no pack at /somewhere/else")
 
     monkeypatch.setattr(PackConfig, "open", gone)
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    assert main(command.format(artifact).split()) == 2
+    assert main(command.format(smoke_run).split()) == 2
     said = capsys.readouterr().err
     assert "trained on is not here (no pack at /somewhere/else)" in said and advice in said

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -361,3 +362,18 @@ def test_impossible_requests_are_refused_first(
 def test_running_an_onnx_export_needs_no_torch() -> None:
     code = "import sys, mvitac.deploy.engine; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
+
+
+def test_conversion_to_openvino_tells_nobody(onnx: Path, tmp_path: Path) -> None:
+    """OpenVINO looks up an analytics host and writes an id into the home folder, on import and by its converter."""
+    shutil.copy(onnx / "model.onnx", tmp_path)
+    (tmp_path / "home").mkdir()
+    code = (
+        "import sys; from pathlib import Path; from mvitac.deploy.quantise import to_openvino;"
+        "sys.addaudithook(lambda event, given: event.startswith('socket.') and sys.exit(f'{event} {given}'));"
+        f"to_openvino(Path({str(tmp_path / 'model.onnx')!r}))"
+    )
+    environment = {**os.environ, "HOME": str(tmp_path / "home"), "CI": ""}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "model.xml").stat().st_size and not list((tmp_path / "home").rglob("*"))

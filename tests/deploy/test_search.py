@@ -100,7 +100,7 @@ def test_find_command_draws_what_it_found(
     assert pixels.shape[1] < 4 * 180 and pixels.shape[0] > 160 + 2 * 17  # one line, with captions
     (tmp_path / "bad.png").write_text("no picture")
     assert main(["find", str(tmp_path / "bad.png"), "--in", str(index)]) == 2
-    assert "cannot be read as a picture" in capsys.readouterr().err
+    assert "cannot be read as an image" in capsys.readouterr().err
     assert main(["find", "--in", str(index)]) == 2
     assert "name the picture to search for" in capsys.readouterr().err
 

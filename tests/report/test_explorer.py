@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import html
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from PIL import Image
@@ -21,6 +24,7 @@ import mvitac
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.report.explorer_data import ExplorerData
+from mvitac.report.guard import MAX_BODY, Guard, as_text
 from mvitac.report.palette import COLOURS, MAP_HUES
 from support.browser import CHROMIUM, Browser
 from support.toy import reordered
@@ -331,6 +335,63 @@ def check_zoom(browser: Browser, land: ExplorerData, row: int) -> None:
         act()
         browser.wait("document.querySelector('.map canvas').toDataURL() != window.before")
         browser.until(f"document.querySelector('.tip').textContent.startsWith({name!r})", hover)
+
+
+LISTENING = {"host": "127.0.0.1:7860"}
+REFUSED: list[tuple[dict[str, str], int]] = [
+    ({"host": "evil.example:7860"}, 403),  # its name was made to point to 127.0.0.1
+    ({"host": "192.0.2.1:7860"}, 403),
+    ({"host": ""}, 403),
+    ({**LISTENING, "origin": "http://evil.example"}, 403),
+    ({**LISTENING, "origin": "http://127.0.0.1:8000"}, 403),  # another page of this machine
+    ({**LISTENING, "origin": "null"}, 403),
+    ({**LISTENING, "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, 403),
+    ({**LISTENING, "content-length": str((20 << 20) + 1)}, 413),
+]
+
+
+def test_the_server_answers_only_itself() -> None:
+    """Names of this machine and the page's own origin; at most 20 MB; pages load nothing from elsewhere."""
+    guard = Guard(None, "127.0.0.1")
+    for headers, status in REFUSED:
+        found = guard.refuses({k.encode(): v.encode() for k, v in headers.items()})
+        assert found and found[0] == status, headers
+    for headers in (LISTENING, {"host": "localhost:1", "origin": "http://localhost:1"}, {"host": "[::1]:7860"}):
+        assert guard.refuses({k.encode(): v.encode() for k, v in headers.items()}) is None, headers
+    network = Guard(None, "0.0.0.0")
+    assert (
+        network.allows("192.0.2.1:7860") and network.allows(socket.gethostname()) and not network.allows("evil.example")
+    )
+
+
+def test_the_running_server_refuses_rebinding_and_large_uploads(artifact: Path, pack: Pack) -> None:
+    port = free_port()
+    address = f"http://127.0.0.1:{port}/"
+    with serving(["-m", "mvitac", "explore", str(artifact), "--on", str(pack.path), "--port", str(port)], port):
+        own = httpx.get(address)
+        assert own.status_code == 200 and "default-src 'self'" in own.headers["content-security-policy"]
+        assert httpx.get(address, headers={"host": "evil.example"}).status_code == 403
+        cross = httpx.get(f"{address}config", headers={"origin": "http://evil.example"})
+        assert cross.status_code == 403 and "access-control-allow-origin" not in cross.headers
+        files = {"files": ("big.png", bytes(MAX_BODY + 1))}
+        assert httpx.post(f"{address}gradio_api/upload", files=files).status_code == 413
+
+
+def test_labels_are_text_in_markdown() -> None:
+    """No image or link, of which a browser would fetch the address."""
+    from markdown_it import MarkdownIt
+
+    render = MarkdownIt("gfm-like", {"linkify": False}).render
+    for label in (
+        "![x](http://evil/x.png)",
+        "<img src=http://evil>",
+        "[a](javascript:b)",
+        "**b** `c` &lt;",
+        "http://evil",
+    ):
+        text = render(f"**{as_text(label)}**")
+        assert "<img" not in text and "<a" not in text, text
+        assert html.unescape(re.sub("<[^>]*>", "", text)).strip() == label
 
 
 def test_a_page_of_very_many_and_of_none(browser: Browser, artifact: Path, pack: Pack) -> None:

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from rich.console import Console
 
 from mvitac.cli.options import parse, selectors
 from mvitac.datasets.base import DatasetConfig
@@ -18,6 +17,7 @@ from mvitac.experiments.plan import Plan, setting
 from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
 from mvitac.registry import default, to_json, unknown
+from mvitac.system.console import Console
 from mvitac.system.files import check_place, write_json
 
 

@@ -12,11 +12,11 @@ def demo(argv: list[str]) -> None:
     from typing import Annotated
 
     import tyro
-    from rich.console import Console
 
     from mvitac.experiments.demo import run_demo
     from mvitac.recipes import RECIPES, recipe
     from mvitac.run import Run
+    from mvitac.system.console import Console
 
     @dataclass(frozen=True, kw_only=True)
     class Options:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
@@ -17,6 +16,7 @@ from mvitac.deploy.publish import own_data, with_readouts
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
 from mvitac.report.tables import print_summary
+from mvitac.system.console import Console
 from mvitac.system.progress import shown
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json
@@ -17,6 +16,7 @@ from mvitac.evaluation.scores import summarise
 from mvitac.model import load
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_summary
+from mvitac.system.console import Console
 from mvitac.system.files import read_json
 from mvitac.system.progress import shown, work
 
@@ -74,7 +74,7 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
         what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
         with shown(Console(stderr=True)), work(what):
             model = load(path)
-            data = pack or model.run.data.open()
+            data = pack or model.open_data()
             own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
             leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
             records += [

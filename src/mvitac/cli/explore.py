@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from tyro.conf import Positional
 
 from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
+from mvitac.system.console import Console
 from mvitac.system.progress import shown, work
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ def explore(argv: list[str]) -> None:
         raise ValueError(f"{len(options.runs)} runs given: give one, or two to compare")
     if options.rows < 3:
         raise ValueError(f"--rows {options.rows}: give at least 3")
+    if options.port is not None and not 1 <= options.port <= 65535:
+        raise ValueError(f"--port {options.port}: give 1 to 65535, or leave it out for a free one")
     try:
         from mvitac.report.explorer import serve
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live as Screen
 from rich.table import Table
 from rich.text import Text
@@ -18,6 +18,7 @@ from tyro.conf import Positional
 from mvitac.cli.options import check_json, parse
 from mvitac.data.spec import task_title
 from mvitac.live.contact import LiveConfig
+from mvitac.system.console import Console
 from mvitac.system.files import write_json
 
 if TYPE_CHECKING:
@@ -215,7 +216,7 @@ def sources(
 def _engine(model: str, threads: int, console: Any) -> "Engine":
     """The engine of an export; a run or an artifact is exported first, once, into the cache."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, lists_bf16
+    from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, import_openvino, lists_bf16
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_readouts
     from mvitac.model import safetensors_digest
@@ -224,11 +225,8 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
 
     if (Path(model) / MANIFEST).is_file():
         engine = Engine(model, threads=threads)
-        if engine.meta["precision"] == "bf16":
-            import openvino
-
-            if not lists_bf16(openvino.Core()):
-                console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
+        if engine.meta["precision"] == "bf16" and not lists_bf16(import_openvino().Core()):
+            console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
         return engine
     loaded = load(model)
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
@@ -237,7 +235,7 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
-        pack = own_data(loaded, "`mvitac export` it where the data is, and give that folder")
+        pack = own_data(loaded, "`mvitac export MODEL --on PACK --out DIR` first, and give DIR")
         export(with_readouts(loaded, pack), pack, folder)
     return Engine(folder, threads=threads)
 

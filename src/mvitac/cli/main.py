@@ -9,6 +9,8 @@ import re
 import sys
 from collections.abc import Sequence
 
+from mvitac.system.terminal import plain_output
+
 HELP = """\
 usage: mvitac COMMAND [OPTIONS]     (mvitac COMMAND --help explains one)
 
@@ -70,9 +72,21 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 
+_NO_MEMORY = (
+    "out of memory|can't allocate memory|cannot allocate memory|failed to map segment|can't start new thread"
+    "|std::bad_alloc"
+)
+"""What torch, the loader of shared libraries and threads say when memory (``ulimit -v``) runs out."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     _wait_briefly()
+    with plain_output():
+        return _main(argv)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         code = _run(arguments)
@@ -85,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    except (ValueError, OSError, MemoryError) as error:
+    except (ValueError, OSError, MemoryError, RecursionError) as error:
         text = one_line(error)
         if arguments[0] == "data":  # here the options of a dataset are --path, not --data.path as for pretrain
             text = text.replace("--data.", "--")
@@ -95,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if type(error).__name__ == "Interrupted":
             print(f"mvitac: {error}", file=sys.stderr)
             return 130
-        if isinstance(error, RuntimeError) and re.search("out of memory|can't allocate memory", str(error)):  # torch's
+        if isinstance(error, (RuntimeError, ImportError)) and re.search(_NO_MEMORY, str(error)):
             print(f"mvitac: error: {one_line(MemoryError())}", file=sys.stderr)
             return 2
         raise
@@ -170,6 +184,8 @@ def one_line(error: BaseException) -> str:
         text = f"{error.filename or 'file'}: {error.strerror} ({hint})"
     elif isinstance(error, MemoryError):
         text = "not enough memory: use a smaller --batch-size, --augment.size or pack"
+    elif isinstance(error, RecursionError):
+        text = "a file that was read is nested too deeply: it is damaged"
     else:
         text = str(error) or type(error).__name__
     text = " ".join(text.split()).replace("\0", "\\x00")

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,7 +45,7 @@ def parse(
         with contextlib.redirect_stderr(boxed):
             if {"-h", "--help"} & set(argv):
                 # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
-                with _joined_lines():
+                with _joined_lines(), contextlib.redirect_stdout(getattr(sys.stdout, "rich_proxied_file", sys.stdout)):
                     return tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff,))  # type: ignore[arg-type]
             with _columns("10000"):  # the lines of an error must not be wrapped
                 return tyro.cli(kind, **options)  # type: ignore[arg-type]
@@ -117,7 +118,7 @@ def check_json(path: Path | None) -> None:
 
 def console(json_file: Path | None) -> Any:
     """Where a command prints: stdout, or stderr if its JSON goes to stdout."""
-    from rich.console import Console
+    from mvitac.system.console import Console
 
     return Console(markup=False, highlight=False, stderr=json_file == STDOUT)
 

@@ -12,17 +12,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import tyro
-from PIL import Image
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.image_grid import GAP, Block, Tile, draw, side_by_side
-from mvitac.data.images import fit
+from mvitac.data.images import decode, fit
 from mvitac.data.pack import Pack
 from mvitac.report.palette import colour
-from mvitac.system.files import brief, check_place, write_atomic
+from mvitac.system.console import Console
+from mvitac.system.files import check_place, write_atomic
 from mvitac.system.progress import shown
 
 if TYPE_CHECKING:
@@ -163,15 +162,13 @@ def find(argv: list[str]) -> None:
 
 
 def _picture(files: Sequence[Path]) -> np.ndarray:
-    """One RGB picture [H, W, 3 x files]: the files stacked in channels, at the size of the first one."""
-    parts: list[Image.Image] = []
-    for file in files:
-        try:
-            with Image.open(file) as opened:
-                parts.append(opened.convert("RGB"))
-        except Exception as error:  # Pillow has an exception for each kind of damage
-            raise ValueError(f"{file} cannot be read as a picture ({brief(error)}): give another") from None
-    return np.concatenate([np.asarray(p.resize(parts[0].size)) for p in parts], axis=2)
+    """One RGB picture [H, W, 3 x files]: the files stacked in channels, as ``data pack`` reads and stacks them."""
+    parts = [np.asarray(decode(file)) for file in files]
+    for file, part in zip(files, parts, strict=True):
+        if part.shape != parts[0].shape:
+            (h, w), (h2, w2) = parts[0].shape[:2], part.shape[:2]
+            raise ValueError(f"{files[0]} is {w} x {h}, {file} is {w2} x {h2}: stacked sensors need one size")
+    return np.concatenate(parts, axis=2)
 
 
 def _draw(out: Path, query: np.ndarray, index: "Index", options: _FindOptions, found: Sequence[dict[str, Any]]) -> None:

@@ -21,7 +21,6 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from rich.console import Console
 
 from mvitac.data.build_parts import Work, make_parts
 from mvitac.data.jpeg import QUALITY
@@ -31,6 +30,7 @@ from mvitac.data.partial_pack import JpegFile, Part, RowFile
 from mvitac.data.source import Source
 from mvitac.data.spec import DataSpec
 from mvitac.registry import from_json, to_json, unknown
+from mvitac.system.console import Console
 from mvitac.system.files import brief, digest, digest_file, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.progress import shown

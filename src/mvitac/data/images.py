@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 
 def fit(image: np.ndarray, size: int) -> np.ndarray:
@@ -34,6 +34,8 @@ IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".p
 def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
     """Read an image file as RGB: rotated by EXIF, 16 bits scaled to 8, transparent parts black.
 
+    Packs, ``find``, ``live FOLDER`` and the explorer all read files with it; ``Model.embed`` treats PIL images alike.
+
     ``name`` is the name of an open file in error messages.
     """
     name = name or str(path)
@@ -43,10 +45,9 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
             if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
                 raise ValueError(f"it holds {getattr(image, 'n_frames', 0)} frames, not one: store one image per row")
             image.load()
-            ImageOps.exif_transpose(image, in_place=True)
-            return _to_rgb(image)
+            return to_rgb(image)
     except FileNotFoundError:
-        raise ValueError(f"{name} does not exist any more: it was there when packing began") from None
+        raise ValueError(f"{name} does not exist: an image is missing there") from None
     # PIL has no common base class for errors of damaged files.
     except (OSError, ValueError, SyntaxError, TypeError, IndexError, EOFError, struct.error) as error:
         raise ValueError(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from None
@@ -54,7 +55,14 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
         raise ValueError(f"{name} is too large ({error})") from None
 
 
-def _to_rgb(image: Image.Image) -> Image.Image:
+def to_rgb(image: Image.Image) -> Image.Image:
+    """An opened image as RGB, by the rules of ``decode``; ``image`` itself is not changed.
+
+    Raises:
+        ValueError: If its values are floating-point, or lie outside 16 bits.
+    """
+    if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
+        image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I"):
         values = np.asarray(image).astype(np.int64)
         if values.min() < 0 or values.max() > 65535:

@@ -16,6 +16,9 @@ from mvitac.data.streaming import reach, shard_name
 from mvitac.system.files import brief, digest
 from mvitac.system.progress import shown, work
 
+MAX_SHARD_MB = 1_000_000
+"""A terabyte: a shard is read whole."""
+
 
 def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, quiet: bool = False) -> int:
     """Write ``pack`` to ``url`` in shards and return their number.
@@ -32,8 +35,8 @@ def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, q
     Raises:
         ValueError: If ``url`` has a pack already or cannot be written.
     """
-    if not shard_mb > 0:
-        raise ValueError(f"shard_mb {shard_mb}: give a positive number of megabytes")
+    if not 0 < shard_mb <= MAX_SHARD_MB:
+        raise ValueError(f"shard_mb {shard_mb}: give a number of megabytes above 0, at most {MAX_SHARD_MB:,}")
     system, place = reach(url)
     parts = assign_rows(pack, int(shard_mb * 1e6), seed)
     digests: dict[str, str] = {}

@@ -28,6 +28,8 @@ class DatasetConfig(Registered, ABC):
 
     local: ClassVar[tuple[str, ...]] = ("workers",)
     """Options that do not affect the result."""
+    names_a_place: ClassVar[bool] = True
+    """Whether opening the data reads a path or a URL that the config names. That of an artifact is not believed."""
     phased: ClassVar[bool | None] = None
     """``Pack.phased`` where it is known before the data is opened. None: the opened pack decides."""
 

@@ -7,7 +7,6 @@ Class numbers are replaced by the class names in the file's metadata (ClassLabel
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,7 +17,7 @@ import pyarrow.parquet as pq
 from mvitac.datasets.table.image_refs import ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.system.files import brief, digest
+from mvitac.system.files import brief, digest, parse_json
 
 SPLITS = {"train": "train", "validation": "val", "valid": "val", "val": "val", "test": "test"}
 
@@ -103,7 +102,7 @@ def _mark_gaps(opened: pq.ParquetFile, group: int, column: str, places: list[Ima
 def _classes(schema: pa.Schema) -> dict[str, list[str]]:
     """Return column -> class names, from the metadata of Hugging Face's datasets library."""
     try:
-        features: dict[str, Any] = json.loads((schema.metadata or {})[b"huggingface"])["info"]["features"]
+        features: dict[str, Any] = parse_json((schema.metadata or {})[b"huggingface"])["info"]["features"]
     except (KeyError, ValueError):
         return {}
     return {k: f["names"] for k, f in features.items() if isinstance(f, dict) and f.get("_type") == "ClassLabel"}

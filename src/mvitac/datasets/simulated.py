@@ -25,6 +25,8 @@ LICENCE = "Apache-2.0 (made by this package)"
 class SimulatedConfig(DatasetConfig):
     """Options of both simulators."""
 
+    names_a_place: ClassVar[bool] = False
+
     num: int = 6000
     """Number of pairs (materials) or of grasps with three phases each (grasps)."""
     seed: int = 0

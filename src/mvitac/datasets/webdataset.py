@@ -10,7 +10,6 @@ Images are read from inside the tar. A .json gives a column per scalar, .cls and
 
 from __future__ import annotations
 
-import json
 import tarfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from mvitac.data.images import IMAGES
 from mvitac.datasets.table.image_refs import ImageRef, TarMember
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.system.files import brief, digest
+from mvitac.system.files import brief, digest, parse_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,13 +72,13 @@ class WebDatasetConfig(RowsConfig):
                         file = tar.extractfile(member)
                         text = file.read().decode() if file else ""
                         row.update(_known(text) if last == "json" else {last: text.strip()})
-        except (tarfile.TarError, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        except (tarfile.TarError, OSError, ValueError) as error:
             raise ValueError(f"{shard} cannot be read as an uncompressed tar ({brief(error)})") from None
 
 
 def _known(text: str) -> dict[str, str]:
     """Return the scalars of a JSON object as text."""
-    value = json.loads(text)
+    value = parse_json(text)
     if not isinstance(value, dict):
         return {}
     return {name: text_of(v) for name, v in value.items() if isinstance(v, (str, int, float, bool)) or v is None}

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -116,15 +117,24 @@ def _onnx(path: Path, precision: str, threads: int) -> Call:
     return lambda arrays: session.run(None, dict(zip(names, arrays, strict=True)))  # type: ignore[return-value]
 
 
+def import_openvino() -> Any:
+    """Module ``openvino`` without its telemetry, which looks up an analytics host and keeps an id in the home folder.
+
+    Importing it is reported, too. A None in ``sys.modules`` makes its import fail; OpenVINO then does without.
+    """
+    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
+    import openvino
+
+    return openvino
+
+
 def lists_bf16(core: Any) -> bool:
     """Whether OpenVINO (an ``openvino.Core``) lists bf16 for this CPU; where it does not, fp32 is used."""
     return "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 def _openvino(path: Path, precision: str, threads: int) -> Call:
-    import openvino
-
-    core = openvino.Core()
+    core = import_openvino().Core()
     config = {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": threads,

@@ -125,7 +125,7 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
 def own_data(model: Model, instead: str) -> Pack:
     """The data ``model`` was trained on; the ValueError where it is missing ends with ``instead``, what to do."""
     try:
-        return model.run.data.open()
+        return model.open_data()
     except ValueError as error:
         raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None
 
@@ -133,7 +133,7 @@ def own_data(model: Model, instead: str) -> Pack:
 def with_readouts(model: Model, pack: Pack | None = None) -> Model:
     """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack`` (default: the run's data)."""
     if not model.readouts:
-        model.readouts = fit_readouts(model, pack or model.run.data.open())
+        model.readouts = fit_readouts(model, pack or model.open_data())
     return model
 
 

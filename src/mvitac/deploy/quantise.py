@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from mvitac.deploy.engine import FILES, open_engine
+from mvitac.deploy.engine import FILES, import_openvino, open_engine
 
 Target = Literal["auto", "avx2", "vnni"]
 """CPU of an int8 export: avx2 = any (7-bit weights), vnni = 8-bit weights, for CPUs that do not saturate (x86 with VNNI
@@ -46,10 +46,13 @@ def write_onnx(
 
 
 def to_openvino(path: Path) -> None:
-    """Convert the ONNX file for OpenVINO, into the same folder."""
-    import openvino
+    """Convert the ONNX file for OpenVINO, into the same folder.
 
-    openvino.save_model(openvino.convert_model(path), path.with_name(FILES["openvino"][0]), compress_to_fp16=False)
+    Not by ``openvino.convert_model``, which reports each use (``import_openvino``).
+    """
+    openvino = import_openvino()
+    model = openvino.Core().read_model(path)
+    openvino.save_model(model, path.with_name(FILES["openvino"][0]), compress_to_fp16=False)
 
 
 def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]], *, seven_bits: bool) -> None:

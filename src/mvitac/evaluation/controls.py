@@ -142,7 +142,7 @@ def _untrained_trunks(
     probes: Sequence[str],
 ) -> tuple[Records, Records]:
     # Built one by one: threads would share the random generator.
-    models = [fresh(_scratch(run), spec, pack.size) for run, spec in starts]
+    models = [fresh(scratch(run), spec, pack.size) for run, spec in starts]
     scored = in_threads(
         lambda model: (probe_model(model, pack, tasks, modalities, probes), cross_modal(model, pack)), models
     )
@@ -162,7 +162,7 @@ def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run,
 
     def parts_of(run: Run, spec: DataSpec) -> tuple[set[str], int]:
         with torch.device("meta"):
-            method = run.method.build(spec, _scratch(run).encoder)
+            method = run.method.build(spec, scratch(run).encoder)
         return set(method.encoders()), len(method.projectors())
 
     built = [(run, spec, *parts_of(run, spec)) for run, spec in zip(runs, specs, strict=True)]
@@ -177,7 +177,8 @@ def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run,
     return found
 
 
-def _scratch(run: Run) -> Run:
+def scratch(run: Run) -> Run:
+    """``run`` from random initial weights."""
     return replace(run, encoder=replace(run.encoder, weights=SCRATCH))
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.controls import Records, controls_of, start_weights
+from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
 from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import (
     PROBES,
@@ -27,7 +27,7 @@ from mvitac.evaluation.scores import summarise
 from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
-from mvitac.run import load_run
+from mvitac.run import Run, load_run
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
@@ -87,7 +87,7 @@ def probe_runs(
     _check_paths(paths)
     models = [load(path) for path in paths]
     names = names_of(paths, models)
-    packs = [pack or model.run.data.open() for model in models]
+    packs = [pack or model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError(
             "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
@@ -98,8 +98,10 @@ def probe_runs(
     for task in tasks:
         for modality in modalities:
             split_rows(pack, task, modality)
+    # The initial weights that an artifact names may be any file or download.
+    runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:
-        _check_weights(models, session)
+        _check_weights(runs, session)
     scored_rows = Scored(pack)
     sources = check_unseen(paths, models, pack, tasks, allow_leak=allow_leak)
     records: Records = []
@@ -114,7 +116,7 @@ def probe_runs(
         records += own
         retrieval += found
     if session.controls:
-        runs, specs = [m.run for m in models], [m.spec for m in models]
+        specs = [m.spec for m in models]
         controls, found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
         records += controls
         retrieval += found
@@ -202,10 +204,10 @@ def check_unseen(
     return sources
 
 
-def _check_weights(models: Sequence[Model], session: ProbeConfig) -> None:
+def _check_weights(runs: Sequence[Run], session: ProbeConfig) -> None:
     """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
-    for weights in start_weights([m.run for m in models], session.imagenet):
-        build_trunk(replace(models[0].run.encoder, weights=weights), 3)
+    for weights in start_weights(runs, session.imagenet):
+        build_trunk(replace(runs[0].encoder, weights=weights), 3)
 
 
 def _probe_run(

@@ -26,10 +26,9 @@ from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.experiments.jobs import Job, Work, pairs_per_second, seconds_of
 from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
-from mvitac.model import precision_of
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
-from mvitac.run import Run, load_run
+from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.progress import duration

@@ -9,13 +9,12 @@ from concurrent.futures import FIRST_EXCEPTION, wait
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.recipes import RECIPES
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_summary
 from mvitac.run import Run
+from mvitac.system.console import Console
 from mvitac.system.device import describe_precision, pick_device, pick_precision
 from mvitac.system.files import write_json
 from mvitac.system.processes import side_by_side

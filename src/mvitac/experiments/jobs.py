@@ -6,7 +6,6 @@ failed.json. A run that fails otherwise is reported, and the next call tries it 
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
@@ -18,7 +17,6 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from rich.console import Console
 from rich.progress import TaskID
 
 from mvitac.data.pack import Pack
@@ -29,8 +27,9 @@ from mvitac.model import load
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
 from mvitac.run import Run
+from mvitac.system.console import Console
 from mvitac.system.device import pick_device
-from mvitac.system.files import brief, read_json, write_json
+from mvitac.system.files import brief, parse_json, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.system.processes import my_device, side_by_side
 from mvitac.system.progress import Bars, shown
@@ -333,7 +332,7 @@ def seconds_of(path: Path) -> float:
     total, before = 0.0, 0
     batch_size = read_json(path / "run.json", "a run's record")["run"]["batch_size"]
     for line in (path / "log.jsonl").read_text().splitlines():
-        entry = json.loads(line)
+        entry = parse_json(line)
         if entry.get("pairs_per_s"):
             total += (entry["step"] - before) * batch_size / entry["pairs_per_s"]
         before = entry["step"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from mvitac.experiments.plan import Plan, Printed, Row
 from mvitac.registry import from_json, unknown
-from mvitac.system.files import brief
+from mvitac.system.files import brief, parse_json
 
 
 def find_plan(given: str) -> Plan:
@@ -22,7 +21,7 @@ def find_plan(given: str) -> Plan:
         raise unknown("plan", given, [*PLANS, "a .toml file", "a .json file"])
     try:
         text = path.read_text()
-        value = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        value = tomllib.loads(text) if path.suffix == ".toml" else parse_json(text)
     except FileNotFoundError:
         raise ValueError(f"plan {given} does not exist: choose {', '.join(PLANS)}, or give a file that does") from None
     except (ValueError, RecursionError) as error:

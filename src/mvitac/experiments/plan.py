@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from mvitac.evaluation.probe import Probe
 from mvitac.recipes import recipe, with_method
 from mvitac.registry import to_json, unknown
 from mvitac.run import Run
+from mvitac.system.files import parse_json
 
 Printed = dict[str, dict[str, float]]
 """modality -> task -> top-1 accuracy in percent as printed in the paper."""
@@ -167,6 +167,6 @@ def setting(text: str, what: str = "--set") -> tuple[str, Any]:
         example = "split=fold1" if what == "fold" else "steps=100 or method.temperature=0.2"
         raise ValueError(f"{what} {text}: give field=value, e.g. {example}")
     try:
-        return name, json.loads(value)
+        return name, parse_json(value)
     except ValueError:
         return name, value

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mvitac.data.images import decode
 from mvitac.system.files import brief
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
@@ -130,16 +131,10 @@ class Folder(Source):
             raise OSError(f"{self.path} holds no pictures ({', '.join(PICTURES)})")
 
     def read(self) -> np.ndarray:
-        from PIL import Image
-
         if not self.left:
             raise Ended
         path = self.left.popleft()
-        try:
-            with Image.open(path) as image:
-                return np.array(image.convert("RGB"))
-        except Exception as error:  # Pillow has an exception for each kind of damage
-            raise ValueError(f"{path.name}: {brief(error)}") from None
+        return np.array(decode(path, path.name))
 
 
 class Simulated(Source):

@@ -12,16 +12,22 @@ from typing import Any
 import gradio as gr
 import numpy as np
 from gradio.themes import Base
+from PIL import Image
+from starlette.middleware import Middleware
 
+from mvitac.data.images import to_rgb
 from mvitac.data.spec import task_title
 from mvitac.report import html
 from mvitac.report.explorer_data import ExplorerData
+from mvitac.report.guard import MAX_BODY, Guard, as_text
 from mvitac.report.palette import colour
 
 os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # no telemetry from a local page; read on import
 
 K = 6
 KEYS = "Arrow keys go from point to point, Enter shows its neighbours, + and - zoom, 0 resets."
+KEPT = (60, 600)
+"""Seconds between two deletions of uploaded pictures, and the age of those that are deleted."""
 MAP = (
     f'<div class="map"><canvas tabindex="0" role="application" aria-label="Map of features. {KEYS}"></canvas>'
     '<div class="tip" aria-live="polite"></div></div>'
@@ -67,8 +73,8 @@ def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
         lands: Name of each run -> its data.
     """
     first = next(iter(lands.values()))
-    with gr.Blocks(title="mvitac explorer") as blocks:
-        gr.Markdown(f"### {' | '.join(lands)} on {first.pack.spec.name}")
+    with gr.Blocks(title="mvitac explorer", delete_cache=KEPT) as blocks:
+        gr.Markdown(f"### {as_text(' | '.join(lands))} on {as_text(first.pack.spec.name)}")
         controls = _controls(first)
         draw = partial(_maps, list(lands.values()))
         start = draw(*(c.value for c in controls))
@@ -117,7 +123,7 @@ def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
     hover.__name__ = "tip"  # scatter.js calls server.tip
     with gr.Column(min_width=300):
         if several:
-            gr.Markdown(f"**{name}**")
+            gr.Markdown(f"**{as_text(name)}**")
         return gr.HTML(
             value,
             html_template=MAP,
@@ -139,7 +145,7 @@ def _on_click(land: ExplorerData) -> Callable[[str | None, gr.EventData], list[A
             _found(land, f"nearest by {m}" + legend, land.neighbours(x[i : i + 1], m, K, without=i), m, i, task)
             for m, x in land.x.items()
         ]
-        return [f"**{land.describe(i)}**", *lists]
+        return [f"**{as_text(land.describe(i))}**", *lists]
 
     return click
 
@@ -169,7 +175,7 @@ def _query_form(land: ExplorerData, by: str) -> None:
     wants = "your picture (of touch: minus its background)" if land.model.spec.difference else "your picture"
     with gr.Row():
         with gr.Column(min_width=240):
-            given = gr.Image(label=wants, type="numpy", image_mode="RGB", sources=["upload", "clipboard"])
+            given = gr.Image(label=wants, type="pil", image_mode=None, sources=["upload", "clipboard"])
             kind = gr.Radio(list(land.x), value=next(iter(land.x)), label="it is a picture of")
             ask = gr.Button(f"Query and classify{by}")
         with gr.Column(min_width=240):
@@ -178,23 +184,29 @@ def _query_form(land: ExplorerData, by: str) -> None:
     ask.click(partial(_query, land), [given, kind], [answer, alike])
 
 
-def _query(land: ExplorerData, image: np.ndarray | None, modality: str) -> tuple[str, str]:
+def _query(land: ExplorerData, image: Image.Image | None, modality: str) -> tuple[str, str]:
     """Classify an image and find the rows most similar to it."""
     if image is None:
         return "Give a picture first.", ""
-    answers, pairs = land.query(image, modality, K)
+    try:
+        answers, pairs = land.query(np.asarray(to_rgb(image)), modality, K)
+    except ValueError as error:
+        return as_text(f"This picture cannot be used: {error}"), ""
     lines = []
     for name, probabilities in answers.items():
         best = sorted(probabilities.items(), key=lambda item: -item[1])[:3]
-        lines.append(
-            f"- **{task_title(name, tuple(probabilities))}**: " + ", ".join(f"{c} {100 * p:.0f} %" for c, p in best)
-        )
+        title = as_text(task_title(name, tuple(probabilities)))
+        lines.append(f"- **{title}**: " + ", ".join(f"{as_text(c)} {100 * p:.0f} %" for c, p in best))
     found = _found(land, "most similar", pairs, modality)
     return "\n".join(lines) or "This run has no labels to classify by.", found
 
 
 def serve(blocks: gr.Blocks, *, host: str = "127.0.0.1", port: int | None = None, wait: bool = True) -> str:
-    """Serve the page and return its address. Fonts come from the machine, nothing from the network."""
+    """Serve the page and return its address. Fonts come from the machine, nothing from the network.
+
+    Only names of this machine and the page's own origin are answered (``guard.Guard``).
+    """
     theme = Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])
     options: dict[str, Any] = {"share": False, "quiet": True, "theme": theme}
+    options |= {"max_file_size": MAX_BODY, "app_kwargs": {"middleware": [Middleware(Guard, host=host)]}}
     return blocks.launch(server_name=host, server_port=port, prevent_thread_lock=not wait, **options)[1]

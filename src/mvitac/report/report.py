@@ -11,22 +11,21 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from rich.console import Console
-
 from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import cross_modal, split_rows
 from mvitac.evaluation.scores import covered, percent, summarise, with_interval
-from mvitac.model import load, precision_of
+from mvitac.model import load
 from mvitac.registry import to_json
 from mvitac.report import galleries, tables
 from mvitac.report import html as page
 from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
-from mvitac.run import load_run
-from mvitac.system.files import write_atomic
+from mvitac.run import load_run, precision_of
+from mvitac.system.console import Console
+from mvitac.system.files import parse_json, write_atomic
 from mvitac.system.progress import duration, shown, work
 
 
@@ -58,7 +57,7 @@ def write_report(
     runs = open_runs(paths)
     if pack is None and len({r.record.get("pack") for r in runs}) > 1:
         raise ValueError("these runs were trained on different data: write one report per dataset")
-    pack = pack or runs[0].run.data.open(quiet=quiet)
+    pack = pack or runs[0].model.open_data(quiet=quiet)
     if result is None and (result := stored_result(paths, pack)):
         if not quiet:
             print(f"scores: {paths[0] / 'probe.json'}")
@@ -101,8 +100,8 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     lines = []
     for line in path.read_text().splitlines() if path.exists() else []:
         try:
-            lines.append(json.loads(line))
-        except json.JSONDecodeError:
+            lines.append(parse_json(line))
+        except ValueError:
             break
     return lines
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from mvitac.evaluation.leaks import leak_mark
@@ -19,6 +18,7 @@ from mvitac.evaluation.scores import (
     sources_of,
     tested_on,
 )
+from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")

@@ -9,7 +9,8 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from filelock import FileLock, Timeout
-from rich.console import Console
+
+from mvitac.system.console import Console
 
 _held: ContextVar[frozenset[Path]] = ContextVar("_held", default=frozenset())
 """Paths whose locks this thread holds."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from mvitac.registry import to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import naming, write_atomic
+from mvitac.system.files import naming, parse_json, write_atomic
 from mvitac.system.progress import WIDE, shown
 
 Logger = Callable[[int, dict[str, float]], None]
@@ -41,7 +41,7 @@ class Log:
         if path.exists():
             for line in path.read_text(errors="replace").splitlines():
                 try:
-                    entry = json.loads(line)
+                    entry = parse_json(line)
                     early = entry["step"] <= start
                 except (ValueError, TypeError, KeyError):
                     break  # an incomplete line, written when the run was killed
@@ -108,7 +108,7 @@ def last_line(run: Path) -> dict[str, Any]:
         return {}
     for line in reversed(lines):
         try:
-            entry = json.loads(line)
+            entry = parse_json(line)
         except ValueError:  # the line is being written
             continue
         if "loss" in entry:

@@ -12,10 +12,10 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, write_sources
 from mvitac.methods.base import Method
-from mvitac.model import Model, precision_of
+from mvitac.model import Model
 from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.registry import to_json
-from mvitac.run import Run, load_run
+from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import describe, pick_device, pick_precision
 from mvitac.system.distributed import World, local_device, synchronise_norms
 from mvitac.system.files import brief, check_place, write_json

@@ -18,7 +18,8 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from mvitac.data.images import decode, difference, fit
+from mvitac.data.images import decode, difference, fit, to_rgb
+from mvitac.system.files import brief
 from mvitac.transforms.random_views import normalise, plain_view
 
 ImageInput = str | Path | np.ndarray | Tensor | Image.Image | Sequence[Any]
@@ -92,7 +93,10 @@ def to_array(image: Any, channels: int, what: str) -> np.ndarray:
     if isinstance(image, (str, os.PathLike)):
         image = decode(Path(image))
     if isinstance(image, Image.Image):
-        image = np.asarray(image.convert("RGB"))
+        try:
+            image = np.asarray(to_rgb(image))
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{what}: this image cannot be used ({brief(error)})") from None
     if isinstance(image, Tensor):
         image = (image.float() if image.is_floating_point() else image).detach().cpu().numpy()
     known = isinstance(image, np.ndarray) and (image.dtype == np.uint8 or np.issubdtype(image.dtype, np.floating))

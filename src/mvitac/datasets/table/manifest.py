@@ -6,7 +6,6 @@ Cells are text, whatever the file format. Rows are counted from 1, without the h
 from __future__ import annotations
 
 import csv
-import json
 import math
 import operator
 import os
@@ -25,7 +24,7 @@ from mvitac.data.pack_table import SPLITS
 from mvitac.datasets.table.image_refs import VIDEOS, File, Frame, ImageRef
 from mvitac.datasets.table.splits import likely_split
 from mvitac.registry import unknown
-from mvitac.system.files import brief, digest, digest_file
+from mvitac.system.files import brief, digest, digest_file, parse_json
 
 MANIFESTS = (".csv", ".parquet", ".jsonl")
 COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
@@ -176,8 +175,8 @@ def _read_jsonl(file: Path) -> tuple[list[str], list[dict[str, str]]]:
         if not line.strip():
             continue
         try:
-            row = json.loads(line)
-        except json.JSONDecodeError as error:
+            row = parse_json(line)
+        except ValueError as error:
             raise ValueError(f"{file} line {number} is not JSON ({error}): write one object per line") from None
         if not isinstance(row, dict):
             raise ValueError(f"{file} line {number} is not an object: write one {{...}} per line")

@@ -1,0 +1,225 @@
+"""Forty artifacts made by a stranger: each is refused in one line or used as plain data.
+
+While a command runs, every path and network address that Python touches is recorded by an audit hook. None may lie in the
+trap, a folder that only the artifact names, and none may be on the network.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors
+import safetensors.torch
+
+import mvitac
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.deploy.artifact import seal
+from mvitac.system.files import digest, digest_file
+
+_touched: list[str] | None = None
+
+
+def _hook(event: str, arguments: tuple[Any, ...]) -> None:
+    if _touched is not None and event.split(".")[0] in ("open", "os", "shutil", "socket", "subprocess", "glob"):
+        _touched.append(f"{event} {arguments}")
+
+
+@pytest.fixture
+def touched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """What Python opens, lists, deletes, starts and connects to during the test."""
+    global _touched
+    if not hasattr(sys, "_mvitac_hook"):
+        sys.addaudithook(_hook)  # cannot be removed again
+        sys._mvitac_hook = True  # type: ignore[attr-defined]
+    _touched = []
+    yield _touched
+    _touched = None
+
+
+Change = Callable[[Path, dict[str, Any]], object]
+"""Changes the run in the header of model.safetensors, given the trap and the run."""
+
+
+def forge(folder: Path, trap: Path, *, run: Change | None = None, manifest: Change | None = None) -> None:
+    """Change the artifact in ``folder``, and make every digest fit again."""
+    file = folder / "model.safetensors"
+    if run:
+        with safetensors.safe_open(file, "pt") as opened:
+            header = opened.metadata()
+        value = json.loads(header["run"])
+        run(trap, value)
+        header["run"] = json.dumps(value)
+        header["header_digest"] = digest([header["run"], header["spec"], header["stored"]])
+        safetensors.torch.save_file(safetensors.torch.load_file(file), file, header)
+    described = json.loads((folder / "artifact.json").read_text())
+    if manifest:
+        manifest(trap, described)
+    for name in described["files"]:
+        if (folder / name).is_file():
+            described["files"][name] = digest_file(folder / name)
+    described["digest"] = seal(described)
+    (folder / "artifact.json").write_text(json.dumps(described))
+
+
+def data(name: str, **fields: str) -> Change:
+    """The data is said to be of dataset ``name``; {trap} in a field stands for the trap."""
+
+    def change(trap: Path, run: dict[str, Any]) -> None:
+        run["data"] = {"name": name, **{k: v.replace("{trap}", str(trap)) for k, v in fields.items()}}
+
+    return change
+
+
+COMMANDS = {
+    "export": ["export", "{artifact}", "--out", "{out}"],
+    "explore": ["explore", "{artifact}"],
+    "probe": ["probe", "{artifact}"],
+    "report": ["report", "{artifact}", "--quiet"],
+    "live": ["live", "{artifact}", "--seconds", "1"],
+    "publish": ["publish", "{artifact}", "{out}"],
+}
+STREAM = data("stream", url="http://198.51.100.7/shards")
+PLACES: list[tuple[str, Change]] = [
+    *((command, STREAM) for command in COMMANDS),
+    ("export", data("stream", url="s3://bucket/shards")),
+    ("explore", data("stream", url="file://{trap}")),
+    ("probe", data("stream", url="{trap}", cache="{trap}")),
+    ("live", data("stream", url="http://198.51.100.7/shards", cache="{trap}")),
+    ("report", data("stream", url="ftp://198.51.100.7/shards")),
+    ("export", data("pack", path="{trap}")),
+    ("explore", data("pack", path="{trap}/../trap")),
+    ("probe", data("folder", path="{trap}/pairs.csv")),
+    ("live", data("hub", path="{trap}")),
+    ("report", data("webdataset", path="{trap}")),
+    ("publish", data("lerobot", path="{trap}")),
+    ("export", data("touch-and-go", root="{trap}")),
+    ("explore", data("calandra", path="{trap}")),
+]
+
+
+@pytest.fixture
+def trap(tmp_path: Path) -> Path:
+    """A folder of somebody's files, as a killed streaming process leaves them: such folders are deleted by the next."""
+    folder = tmp_path / "trap"
+    (folder / "process-0").mkdir(parents=True)
+    (folder / "process-1").mkdir()
+    (folder / "process-1" / "letter.txt").write_text("dear")
+    (folder / "pairs.csv").write_text("touch\nx.png\n")
+    return folder
+
+
+@pytest.fixture
+def copy(artifact: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(artifact, tmp_path / "artifact")
+
+
+def check(touched: list[str], trap: Path) -> None:
+    """Nothing in the trap was touched, nothing was sent, nothing was deleted."""
+    for one in touched:
+        assert f"{trap}" not in one and "/trap" not in one, one
+        assert not one.startswith(("socket.connect", "socket.getaddrinfo", "subprocess", "os.system")), one
+    assert (trap / "process-1" / "letter.txt").read_text() == "dear"
+
+
+@pytest.mark.parametrize(("command", "change"), PLACES)
+def test_the_place_of_its_data_is_not_opened(
+    copy: Path,
+    trap: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    touched: list[str],
+    command: str,
+    change: Change,
+) -> None:
+    forge(copy, trap, run=change)
+    touched.clear()
+    words = [w.format(artifact=copy, out=tmp_path / "out") for w in COMMANDS[command]]
+    assert main(words) == 2
+    seen = list(touched)
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "stranger" in error and "--on PACK" in error
+    check(seen, trap)
+    assert not (tmp_path / "out").exists()
+
+
+def encoder(**fields: str) -> Change:
+    def change(trap: Path, run: dict[str, Any]) -> None:
+        run["encoder"] |= {k: v.replace("{trap}", str(trap)) for k, v in fields.items()}
+
+    return change
+
+
+@pytest.mark.parametrize("weights", ["{trap}/letter.pth", "imagenet"])
+def test_initial_weights_are_neither_opened_nor_fetched(
+    copy: Path, trap: Path, pack: Pack, touched: list[str], weights: str
+) -> None:
+    forge(copy, trap, run=encoder(weights=weights))
+    touched.clear()
+    assert main(["probe", str(copy), "--on", str(pack.path), "--tasks", "bright", "--modalities", "touch"]) == 0
+    check(list(touched), trap)
+
+
+def setting(*keys: str, value: Any) -> Change:
+    """``value`` at ``keys`` of the run or of artifact.json."""
+
+    def change(trap: Path, whole: dict[str, Any]) -> None:
+        inner = whole
+        for key in keys[:-1]:
+            inner = inner[key]
+        inner[keys[-1]] = value
+
+    return change
+
+
+def probe_field(name: str, value: Any) -> Change:
+    return lambda trap, whole: whole["probes"][0].update({name: value})
+
+
+RUNS: list[tuple[str, Change, str]] = [
+    ("trunk from the Hub", encoder(trunk="hf-hub:stranger/model"), "unknown trunk"),
+    ("trunk from a folder", encoder(trunk="local-dir:{trap}"), "unknown trunk"),
+    ("another trunk", encoder(trunk="resnet18"), "holds other weights"),
+    ("unknown method", setting("method", value={"name": "evil"}), "unknown method 'evil'"),
+    ("unknown dataset", setting("data", value={"name": "evil"}), "unknown dataset 'evil'"),
+    ("a field that is none", setting("exec", value="rm"), "unknown field in run 'exec'"),
+    ("a list for a number", setting("steps", value=[1]), "steps"),
+    ("batch of minus one", setting("batch_size", value=-1), "batch_size -1"),
+    ("a path with NUL", setting("data", value={"name": "pack", "path": "a\0b"}), "NUL"),
+]
+MANIFESTS: list[tuple[str, Change, str]] = [
+    ("file above", lambda trap, m: m["files"].update({"../trap/pairs.csv": "0"}), "refused"),
+    ("absolute file", lambda trap, m: m["files"].update({str(trap / "pairs.csv"): "0"}), "refused"),
+    ("files are a list", setting("files", value=["model.safetensors"]), "names no files"),
+    ("without model", lambda trap, m: m["files"].pop("model.safetensors"), "lacks model.safetensors"),
+    ("version", setting("format_version", value=99), "format 99"),
+    ("other mean", setting("preprocessing", "mean", value=[0, 0, 0]), "predictions would be wrong"),
+    ("probe of sound", probe_field("modality", "sound"), "tensor"),
+    ("one class more", lambda trap, m: m["probes"][0]["classes"].append("x"), "do not fit"),
+    ("accuracy is text", probe_field("accuracy", "100 %"), "is damaged"),
+    ("probe by another name", probe_field("task", "../../x"), "tensor"),
+]
+
+
+@pytest.mark.parametrize(("run", "manifest", "says"), [
+    *(pytest.param(change, None, says, id=name) for name, change, says in RUNS),
+    *(pytest.param(None, change, says, id=name) for name, change, says in MANIFESTS),
+])  # fmt: skip
+def test_refused(
+    copy: Path, trap: Path, touched: list[str], run: Change | None, manifest: Change | None, says: str
+) -> None:
+    forge(copy, trap, run=run, manifest=(lambda t, m: None) if manifest is None else None)
+    if manifest:
+        described = json.loads((copy / "artifact.json").read_text())
+        manifest(trap, described)
+        (copy / "artifact.json").write_text(json.dumps({**described, "digest": seal(described)}))
+    touched.clear()
+    with pytest.raises(ValueError, match=says):
+        mvitac.load(str(copy))
+    check(list(touched), trap)
