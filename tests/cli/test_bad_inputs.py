@@ -1151,7 +1151,9 @@ def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pyt
     run, _ = mvitac.run.load_run(finished)  # type: ignore[attr-defined]
     noticed = 0
     for _ in range(NUM_DAMAGES):
-        (tmp_path / "r" / kind).write_bytes(damaged(data, rng))
+        while (other := damaged(data, rng)) == data:  # zeros for zeros
+            pass
+        (tmp_path / "r" / kind).write_bytes(other)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -1160,4 +1162,4 @@ def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pyt
             noticed += in_one_line(error)
         finally:
             (tmp_path / "r" / MODEL).unlink(missing_ok=True)
-    assert noticed > NUM_DAMAGES // 4
+    assert noticed == NUM_DAMAGES if kind == CHECKPOINT else noticed > NUM_DAMAGES // 4

@@ -19,7 +19,8 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
-from mvitac.run import Optim
+from mvitac.run import Optim, Run
+from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
@@ -56,6 +57,63 @@ def test_stopped_and_resumed_equals_straight(pack: Pack, straight: Path, tmp_pat
     assert_equal_weights(straight, tmp_path / "r")
     steps = [json.loads(line)["step"] for line in (tmp_path / "r" / "log.jsonl").read_text().splitlines()]
     assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
+
+
+def cut_after_five(pack: Pack, out: Path) -> Run:
+    """A run that dies after step 5, with checkpoints of steps 2 and 4."""
+    run = smoke(pack, checkpoint_every=2)
+    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+        train(run, out, quiet=True)
+    return run
+
+
+def flip(path: Path, bit: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[bit // 8 % len(data)] ^= 1 << bit % 8
+    path.write_bytes(data)
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(
+    pack: Pack, straight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One flipped bit among the weights. Once it is resumed and cut again, both are good ones."""
+    out = tmp_path / "r"
+    run = cut_after_five(pack, out)
+    flip(out / CHECKPOINT, 8 * (out / CHECKPOINT).stat().st_size // 2)
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+        train(run, out, resume=True, quiet=True)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{out / CHECKPOINT} does not match its digest" in said
+    assert f"continuing from {out / PREVIOUS}, step 2" in said
+    assert [torch.load(out / name, weights_only=True)["step"] for name in (PREVIOUS, CHECKPOINT)] == [2, 4]
+    train(run, out, resume=True, quiet=True)
+    assert_equal_weights(straight, out)
+    assert capsys.readouterr().err == "" and not (out / PREVIOUS).exists()
+
+
+def test_killed_between_two_checkpoints(pack: Pack, straight: Path, tmp_path: Path) -> None:
+    """The old one has moved away, the new one is not there yet."""
+    run = cut_after_five(pack, tmp_path / "r")
+    os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)
+    train(run, tmp_path / "r", resume=True, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
+
+
+def test_two_damaged_checkpoints_stop(pack: Pack, tmp_path: Path) -> None:
+    run = cut_after_five(pack, tmp_path / "r")
+    for name in (CHECKPOINT, PREVIOUS):
+        flip(tmp_path / "r" / name, 12345)
+    with pytest.raises(ValueError, match=rf"{CHECKPOINT} does not match.*: delete it and {PREVIOUS} to start"):
+        train(run, tmp_path / "r", resume=True, quiet=True)
+
+
+def test_checkpoints_without_a_digest_still_resume(pack: Pack, straight: Path, tmp_path: Path) -> None:
+    """Version 0.1.0 wrote them."""
+    run, file = cut_after_five(pack, tmp_path / "r"), tmp_path / "r" / CHECKPOINT
+    torch.save(torch.load(file, weights_only=True), file)
+    assert file.read_bytes()[-2:] == bytes(2)  # an archive without a comment
+    train(run, tmp_path / "r", resume=True, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
 
 
 def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from mvitac.system.files import brief, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.system.processes import my_device, side_by_side
 from mvitac.system.progress import Bars, shown
+from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.log import Logger, in_a_bar, last_line
 from mvitac.training.loop import Diverged, Interrupted, train
 from mvitac.training.sampler import training_rows
@@ -74,8 +75,9 @@ class Job:
         return bool(self.failure) or all(_scored(self.out / name) == self.asked for name in kept)
 
     def drop_checkpoint(self) -> None:
-        """Delete the checkpoint. A scored run needs none, and it is four times as large as the weights."""
-        (self.out / "checkpoint.pt").unlink(missing_ok=True)
+        """Delete the checkpoints. A scored run needs none, and one is four times as large as the weights."""
+        for name in (CHECKPOINT, PREVIOUS):
+            (self.out / name).unlink(missing_ok=True)
 
 
 def _scored(path: Path) -> dict[str, Any] | None:

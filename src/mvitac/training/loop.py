@@ -50,6 +50,7 @@ def train(
     """Pre-train and write the result into a folder.
 
     The folder gets run.json (the settings), log.jsonl, checkpoint.pt (to resume from) and model.safetensors (the result).
+    Until it is finished, checkpoint.previous.pt is the checkpoint before.
 
     Args:
         run: What to train, e.g. ``mvitac.recipe("demo")``.
@@ -129,11 +130,12 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) 
 
             # Save a checkpoint. All processes take part, because memory banks are sharded.
             if save:
-                checkpoint.save(out / "checkpoint.pt", run, method, step.optimiser, done, world)
+                checkpoint.save(out, run, method, step.optimiser, done, world)
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
     if world.writes:
         Model(method, run, pack.spec, pack.size).save(out / "model.safetensors")
+        (out / checkpoint.PREVIOUS).unlink(missing_ok=True)
     world.wait()
 
 

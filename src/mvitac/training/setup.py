@@ -69,9 +69,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
 
     method = _build_method(run, pack, rows, device, world)
     step = Step(run, method, device, world)
-    num_steps, start = run.num_steps(len(rows)), 0
-    if (out / "checkpoint.pt").exists():
-        start = checkpoint.restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
+    num_steps = run.num_steps(len(rows))
+    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
     if not resumed and world.writes:
