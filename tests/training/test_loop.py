@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import time
 from dataclasses import replace
@@ -20,6 +21,7 @@ from mvitac.data.pack import Pack
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
 from mvitac.run import Optim, Run
+from mvitac.system import files
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
@@ -114,6 +116,66 @@ def test_checkpoints_without_a_digest_still_resume(pack: Pack, straight: Path, t
     assert file.read_bytes()[-2:] == bytes(2)  # an archive without a comment
     train(run, tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(straight, tmp_path / "r")
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_killed_before_its_record_has_its_name(pack: Pack, straight: Path, tmp_path: Path, resume: bool) -> None:
+    """The folder then holds nothing but a temporary file; a foreign file in it is still refused."""
+    ended = begin(int)
+    ended.join()
+    orphans = [f".run.json.{ended.pid}-7.tmp", f".log.jsonl.{files._HERE}-{ended.pid}-7.tmp"]
+    (tmp_path / "r").mkdir()
+    for name in orphans:
+        (tmp_path / "r" / name).touch()
+    train(smoke(pack), tmp_path / "r", resume=resume, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
+    assert not list((tmp_path / "r").glob(".*"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / ".thesis.tex.tmp").touch()
+    with pytest.raises(ValueError, match="exists and is not a run"):
+        train(smoke(pack), tmp_path / "other", resume=resume, quiet=True)
+
+
+def test_temporary_files_of_others_stay(tmp_path: Path) -> None:
+    """Of this process, of another machine, and of another file."""
+    ended = begin(int)
+    ended.join()
+    names = (
+        f".a.{files._HERE}-{os.getpid()}-1.tmp",
+        f".a.00000000-{ended.pid}-1.tmp",
+        f".b.{ended.pid}-1.tmp",
+        "a.tmp",
+    )
+    for name in names:
+        (tmp_path / name).touch()
+    files.write_json(tmp_path / "a", 1)
+    assert {path.name for path in tmp_path.iterdir()} == {*names, "a"}
+
+
+def test_a_truncated_model_is_made_again(
+    pack: Pack, straight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(straight, tmp_path / "r")
+    model = tmp_path / "r" / "model.safetensors"
+    whole = model.read_bytes()
+    model.write_bytes(whole[:1000])
+    train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
+    assert "model.safetensors cannot be read" in (said := capsys.readouterr().err) and "making it again" in said
+    assert_equal_weights(straight, tmp_path / "r")
+    model.write_bytes(whole[:1000])
+    (tmp_path / "r" / CHECKPOINT).unlink()
+    with pytest.raises(ValueError, match=r"model\.safetensors cannot be read.*checkpoint is gone: delete"):
+        train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
+
+
+def test_a_folder_that_is_deleted_during_training_is_an_error(pack: Pack, tmp_path: Path) -> None:
+    def delete(step: int, values: dict[str, float]) -> None:
+        if step == 4:
+            shutil.rmtree(tmp_path / "r", ignore_errors=True)  # called twice: losses, evaluation
+
+    with pytest.raises(ValueError, match=r"run\.json is gone: .* was deleted or moved during training"):
+        train(smoke(pack, checkpoint_every=2), tmp_path / "r", quiet=True, loggers=(delete,))
+    assert not list(tmp_path.iterdir())
 
 
 def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:

@@ -53,12 +53,11 @@ def save(
 
     def write(file: Any) -> None:
         file.write(buffer.getbuffer())
-        file.flush()
-        os.fsync(file.fileno())
+        file.flush()  # a full disk shows here, before the last checkpoint moves away
         with contextlib.suppress(FileNotFoundError):
             os.replace(out / CHECKPOINT, out / PREVIOUS)
 
-    write_atomic(out / CHECKPOINT, write, sync=False)
+    write_atomic(out / CHECKPOINT, write)
 
 
 def seal(buffer: io.BytesIO) -> None:
@@ -69,7 +68,7 @@ def seal(buffer: io.BytesIO) -> None:
 
 
 def restore(
-    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, num_steps: int, world: World = World()
+    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, num_steps: int, world: World | None = None
 ) -> int:
     """Load the checkpoint in the run's folder ``out`` into ``method`` and ``optimiser``.
 
@@ -89,7 +88,7 @@ def restore(
         except Damaged as error:
             damage = damage or error
             continue
-        if damage and world.writes:
+        if damage and (world is None or world.writes):
             print(f"mvitac: {damage}; continuing from {path}, step {step}", file=sys.stderr)
             (out / CHECKPOINT).unlink()  # else the next checkpoint would push it to the place of the good one
         return step

@@ -25,7 +25,7 @@ from mvitac.system.locks import hold_lock
 from mvitac.training import checkpoint
 from mvitac.training.log import EARLY, Log, Logger
 from mvitac.training.sampler import mix
-from mvitac.training.setup import Setup, check_out, set_up
+from mvitac.training.setup import Setup, check_out, check_still_there, set_up
 from mvitac.training.validation import evaluate
 from mvitac.training.views import load_chunks
 
@@ -130,11 +130,14 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) 
 
             # Save a checkpoint. All processes take part, because memory banks are sharded.
             if save:
+                if world.writes:
+                    check_still_there(out)
                 checkpoint.save(out, run, method, step.optimiser, done, world)
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
     if world.writes:
         Model(method, run, pack.spec, pack.size).save(out / "model.safetensors")
+        check_still_there(out)
         (out / checkpoint.PREVIOUS).unlink(missing_ok=True)
     world.wait()
 

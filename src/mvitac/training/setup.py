@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,13 +11,13 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.methods.base import Method
-from mvitac.model import Model, precision_of
+from mvitac.model import Model, load, precision_of
 from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run
 from mvitac.system.device import describe, pick_device, pick_precision
 from mvitac.system.distributed import World, local_device, synchronise_norms
-from mvitac.system.files import brief, check_place, write_json
+from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
@@ -63,7 +64,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     resumed = (out / "run.json").exists()
     if resumed:
         begun = check_same(asked, pack, out)
-        if (out / "model.safetensors").exists():
+        if _is_finished(out, world):
             return None
         _check_precision(begun, asked, run, out)
 
@@ -86,8 +87,33 @@ def check_out(out: Path, resume: bool) -> None:
     if (out / "run.json").exists():
         if not resume:
             raise ValueError(f"{out} already holds a run: continue it with --resume, or choose another --out")
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    elif out.exists() and (not out.is_dir() or not all(map(is_temporary, out.iterdir()))):
         raise ValueError(f"{out} exists and is not a run: choose another --out")
+
+
+def check_still_there(out: Path) -> None:
+    """Raise ValueError if the folder of the run has been deleted or moved since training began."""
+    if not (out / "run.json").exists():
+        raise ValueError(f"{out / 'run.json'} is gone: {out} was deleted or moved during training, start again")
+
+
+def _is_finished(out: Path, world: World) -> bool:
+    """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint.
+
+    Raises:
+        ValueError: If there is no checkpoint either.
+    """
+    if not (out / "model.safetensors").exists():
+        return False
+    try:
+        load(out)
+    except ValueError as error:
+        if not (out / checkpoint.CHECKPOINT).exists():
+            raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
+        if world.writes:
+            print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
+        return False
+    return True
 
 
 def check_divisible(run: Run, world: World) -> None:
