@@ -543,6 +543,11 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     ),
     "control of names": (many_names, {"controls": ("w=side",)}, r"'side' has 72 values that are not numbers"),
     "id twice": (each(id="a"), {}, r"id 'a' occurs in several rows"),
+    "vision is touch": (
+        None,
+        {"touch": ("vision",)},
+        r"column .vision. would be both vision and touch: give every image",
+    ),
 }
 
 
