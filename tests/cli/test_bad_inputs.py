@@ -249,6 +249,8 @@ OPTIONS: list[tuple[str, str, list[str]]] = [
     ("workers-huge", "data simulate materials --workers 100000 --out {out}", ["100000", "1024"]),
     ("from-and-method", "pretrain --from {run}/run.json --method mvitac --out {out}", ["--from", "--method"]),
     ("from-and-data", "pretrain --from {run}/run.json --data pack --out {out}", ["--from", "--data"]),
+    ("accuracy-loss-nan", "export {run} --accuracy-loss nan --out {out}", ["--accuracy-loss nan", "0 to 100"]),
+    ("min-cosine-nan", "export {run} --min-cosine nan --out {out}", ["--min-cosine nan", "-1 to 1"]),
 ]
 
 
@@ -449,6 +451,12 @@ def test_out_may_not_be_written(
     refused([*command, "{tmp}/locked/out"], "locked", os.strerror(number), "choose another")
 
 
+def test_shards_without_a_place(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An empty URL is the working folder for fsspec."""
+    monkeypatch.chdir(tmp_path)
+    refused(["data", "shard", "{pack}", ""], "the URL of the shards is empty", "s3://")
+
+
 def test_cache_that_is_a_file(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     occupy(tmp_path)
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "file"))
@@ -492,6 +500,7 @@ FULL: list[tuple[str, str, str, tuple[str, ...]]] = [
         "probe {tmp}/r --probes knn --tasks pattern --no-controls --json {tmp}/scores.json",
         ("cache", "r/probe.json"),
     ),
+    ("index-bank", "touch.npy", "index {pack} --model {tmp}/r --out {out}", ()),
 ]
 
 

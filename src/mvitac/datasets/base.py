@@ -92,7 +92,8 @@ class DatasetConfig(Registered, ABC):
         changed = {} if stamps is None else {"stamps": digest(stamps)}
         key = digest({"fingerprint": source.fingerprint(), "size": self.size, **kept, **changed})[:16]
         path = cache_dir() / "packs" / f"{self.name}-{key}"
-        if path.exists():
+        unfinished = path.with_name(f"{path.name}.partial")  # beside a pack: its build was killed in the last clean-up
+        if path.exists() and not unfinished.exists():
             pack = Pack(path)
             # A pack from before its reader named values has their columns already.
             pack.spec = replace(pack.spec, values=source.spec().values)

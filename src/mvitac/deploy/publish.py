@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -27,7 +25,8 @@ from mvitac.nn.encoders import SCRATCH, build_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
 from mvitac.registry import to_json
 from mvitac.run import load_run
-from mvitac.system.files import brief, check_place, digest_file, write_atomic, write_json
+from mvitac.system.files import brief, digest_file, write_atomic, write_json
+from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 
 
@@ -139,20 +138,16 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
         ``out``. The artifact was loaded once, as a check, before it got this name.
 
     Raises:
+        Busy: another process writes ``out``.
         ValueError: ``out`` exists or cannot be written, or the run or its data is missing.
     """
-    if out.exists():
-        raise ValueError(f"{out} already exists: choose another place, or delete it first")
-    check_place(out)
-    model = load(run)
-    _, record = load_run(run)
-    pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
-    fitted = _fit_all(model, pack)
-    model.readouts = {readout.question.name: readout for readout, _ in fitted}
-    scores = _scores(run, model, pack, [record for _, record in fitted])
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with new_folder(out) as partial:
+        model = load(run)
+        _, record = load_run(run)
+        pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
+        fitted = _fit_all(model, pack)
+        model.readouts = {readout.question.name: readout for readout, _ in fitted}
+        scores = _scores(run, model, pack, [record for _, record in fitted])
         _write_weights(model, partial)
         write_json(partial / "run.json", record)
         manifest = {**_describe(model, pack), "scores": scores}
@@ -160,9 +155,6 @@ def publish(run: Path, out: Path, pack: Pack | None = None) -> Path:
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
         write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})
         read(partial)
-        os.rename(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return out
 
 
