@@ -175,6 +175,7 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("device-number", PRETRAIN + "--device cuda:99", ["'cuda:99'", "use cpu"]),
     ("device-huge", PRETRAIN + "--device cuda:99999999999", ["cuda:99999999999", "cpu"]),
     ("device-empty", PRETRAIN + "--device=", ["device ''", "cpu"]),
+    ("device-of-compare", "compare --device zzz --data materials --out {out}", ["'zzz'", "cuda:N"]),
     ("device-absent", PRETRAIN + "--device mps", ["'mps'", "cpu"]),
     (
         "optimiser",
