@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from mvitac.deploy.engine import FILES, open_engine
+from mvitac.system.files import brief
 
 Target = Literal["auto", "avx2", "vnni"]
 """CPU of an int8 export: avx2 = any (7-bit weights), vnni = 8-bit weights, for CPUs that do not saturate (x86 with VNNI
@@ -49,7 +50,11 @@ def to_openvino(path: Path) -> None:
     """Convert the ONNX file for OpenVINO, into the same folder."""
     import openvino
 
-    openvino.save_model(openvino.convert_model(path), path.with_name(FILES["openvino"][0]), compress_to_fp16=False)
+    model, out = openvino.convert_model(path), path.with_name(FILES["openvino"][0])
+    try:
+        openvino.save_model(model, out, compress_to_fp16=False)
+    except RuntimeError as error:  # it does not say why
+        raise ValueError(f"{out} cannot be written ({brief(error)}): is the disk full?") from None
 
 
 def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]], *, seven_bits: bool) -> None:

@@ -201,7 +201,7 @@ def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
     for classes, alike in {
         ("Wood", "wood", "cork"): "'Wood' and 'wood'",
         ("1", "01", "10"): "'1' and '01'",
-            ("stiff", "stifi", "x"): "",
+        ("stiff", "stifi", "x"): "",
         ("\ufb01rm", "firm", "x"): "'\\ufb01rm' and 'firm'",
         ("soft\u200b", "x", "soft"): "'soft\\u200b' and 'soft'",
         ("hard wood", "hard_wood", "1.05"): "'hard wood' and 'hard_wood'",
