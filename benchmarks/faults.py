@@ -63,7 +63,7 @@ COMMANDS = {
     "embed": "embed {base}/pack --model {base}/run --out {out}/e.npz",
     "report": "report {base}/run --out {out}/report --quiet",
 }
-SLOW = ("torch._dynamo", "mvitac.evaluation.evaluate", "mvitac.report.report", "mvitac.deploy.publish")
+SLOW = ("torch._dynamo", "mvitac.evaluation.evaluate", "mvitac.training.loop")
 """Modules that are imported late."""
 EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link")
 
@@ -270,8 +270,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--num", type=int, default=100, help="flips per kind of file")
     options = parser.parse_args(argv)
     sys.modules["mvitac.transforms.numba_views"] = None  # type: ignore[assignment] # compiled in every process: seconds
-    for name in (*(f"mvitac.cli.{command.split(':')[0]}" for command in ALL.values()), *SLOW):
-        importlib.import_module(name)
+    if options.kind == "kills":
+        for name in (*(f"mvitac.cli.{ALL[command].split(':')[0]}" for command in options.commands), *SLOW):
+            importlib.import_module(name)
     with tempfile.TemporaryDirectory(prefix="mvitac-faults-") as folder:
         base = Path(folder)
         if child(lambda: prepare(base), base / "said"):  # this process computes nothing, so that it can be forked

@@ -14,8 +14,8 @@ from support.processes import begin, finish
 @pytest.mark.parametrize(
     ("argv", "counts"),
     [
-        (["kills", "--commands", "data shard", "pretrain", "--points", "3"], {"finished": 3}),
-        (["flips", "--num", "8"], {"refused": 8, "made again": 8}),
+        (["kills", "--commands", "pretrain", "--points", "2"], {"finished": 2}),
+        (["flips", "--num", "5"], {"refused": 5, "made again": 5}),
     ],
 )
 def test_nothing_is_lost_or_goes_unnoticed(argv: list[str], counts: dict[str, int], tmp_path: Path) -> None:

@@ -97,7 +97,8 @@ def test_killed_between_two_checkpoints(pack: Pack, straight: Path, tmp_path: Pa
     """The old one has moved away, the new one is not there yet."""
     run = cut_after_five(pack, tmp_path / "r")
     os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)
-    train(run, tmp_path / "r", resume=True, quiet=True)
+    with power_cut(4):  # steps 5 to 8 and no more
+        train(run, tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(straight, tmp_path / "r")
 
 
@@ -114,7 +115,8 @@ def test_checkpoints_without_a_digest_still_resume(pack: Pack, straight: Path, t
     run, file = cut_after_five(pack, tmp_path / "r"), tmp_path / "r" / CHECKPOINT
     torch.save(torch.load(file, weights_only=True), file)
     assert file.read_bytes()[-2:] == bytes(2)  # an archive without a comment
-    train(run, tmp_path / "r", resume=True, quiet=True)
+    with power_cut(4):
+        train(run, tmp_path / "r", resume=True, quiet=True)
     assert_equal_weights(straight, tmp_path / "r")
 
 
