@@ -164,6 +164,9 @@ def test_a_truncated_model_is_made_again(
     train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
     assert "model.safetensors cannot be read" in (said := capsys.readouterr().err) and "making it again" in said
     assert_equal_weights(straight, tmp_path / "r")
+    (tmp_path / "r" / PREVIOUS).touch()  # as if killed before it was deleted
+    train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
+    assert not (tmp_path / "r" / PREVIOUS).exists() and capsys.readouterr().err == ""
     model.write_bytes(whole[:1000])
     (tmp_path / "r" / CHECKPOINT).unlink()
     with pytest.raises(ValueError, match=r"model\.safetensors cannot be read.*checkpoint is gone: delete"):

@@ -113,6 +113,8 @@ def _is_finished(out: Path, world: World) -> bool:
         if world.writes:
             print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
         return False
+    if world.writes:
+        (out / checkpoint.PREVIOUS).unlink(missing_ok=True)  # left by a process that was killed at the very end
     return True
 
 
