@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -179,7 +180,8 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
     todo = [job for job in work.jobs if not job.done]
     for job in work.jobs:
         if job.done and not job.failure:
-            job.drop_checkpoint()  # a killed process may have left it
+            with suppress(Busy), hold_lock(job.out, "", wait=False):
+                job.drop_checkpoint()  # a killed process may have left it, and its lock
     report = _Reporter(work, say)
     try:
         with shown(console, quiet=console is None) as bars:
