@@ -178,6 +178,7 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("device-number", PRETRAIN + "--device cuda:99", ["'cuda:99'", "use cpu"]),
     ("device-huge", PRETRAIN + "--device cuda:99999999999", ["cuda:99999999999", "cpu"]),
     ("device-empty", PRETRAIN + "--device=", ["device ''", "cpu"]),
+    ("device-of-compare", "compare --device zzz --data materials --out {out}", ["'zzz'", "cuda:N"]),
     ("device-absent", PRETRAIN + "--device mps", ["'mps'", "cpu"]),
     (
         "optimiser",
@@ -252,6 +253,8 @@ OPTIONS: list[tuple[str, str, list[str]]] = [
     ("workers-huge", "data simulate materials --workers 100000 --out {out}", ["100000", "1024"]),
     ("from-and-method", "pretrain --from {run}/run.json --method mvitac --out {out}", ["--from", "--method"]),
     ("from-and-data", "pretrain --from {run}/run.json --data pack --out {out}", ["--from", "--data"]),
+    ("accuracy-loss-nan", "export {run} --accuracy-loss nan --out {out}", ["--accuracy-loss nan", "0 to 100"]),
+    ("min-cosine-nan", "export {run} --min-cosine nan --out {out}", ["--min-cosine nan", "-1 to 1"]),
 ]
 
 
@@ -452,6 +455,12 @@ def test_out_may_not_be_written(
     refused([*command, "{tmp}/locked/out"], "locked", os.strerror(number), "choose another")
 
 
+def test_shards_without_a_place(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An empty URL is the working folder for fsspec."""
+    monkeypatch.chdir(tmp_path)
+    refused(["data", "shard", "{pack}", ""], "the URL of the shards is empty", "s3://")
+
+
 def test_cache_that_is_a_file(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     occupy(tmp_path)
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "file"))
@@ -495,6 +504,7 @@ FULL: list[tuple[str, str, str, tuple[str, ...]]] = [
         "probe {tmp}/r --probes knn --tasks pattern --no-controls --json {tmp}/scores.json",
         ("cache", "r/probe.json"),
     ),
+    ("index-bank", "touch.npy", "index {pack} --model {tmp}/r --out {out}", ()),
 ]
 
 
@@ -1187,7 +1197,9 @@ def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pyt
     run, _ = mvitac.run.load_run(finished)  # type: ignore[attr-defined]
     noticed = 0
     for _ in range(NUM_DAMAGES):
-        (tmp_path / "r" / kind).write_bytes(damaged(data, rng))
+        while (other := damaged(data, rng)) == data:  # zeros for zeros
+            pass
+        (tmp_path / "r" / kind).write_bytes(other)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -1196,4 +1208,4 @@ def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pyt
             noticed += in_one_line(error)
         finally:
             (tmp_path / "r" / MODEL).unlink(missing_ok=True)
-    assert noticed > NUM_DAMAGES // 4
+    assert noticed == NUM_DAMAGES if kind == CHECKPOINT else noticed > NUM_DAMAGES // 4

@@ -192,6 +192,28 @@ def test_killed_while_holes_are_closed(tmp_path: Path, writes_before_the_kill: i
     assert contents(tmp_path / "p") == contents(straight.path)
 
 
+def test_killed_in_the_last_clean_up(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pack is there, what it was made from is not all deleted: the same command again deletes the rest."""
+
+    def killed(path: Path) -> None:
+        next(path.glob("part-*.json")).unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(packing.shutil, "rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            toy_pack(tmp_path / "p")
+    (tmp_path / "p.lock").touch()
+    with pytest.raises(ValueError, match="already exists"):
+        toy_pack(tmp_path / "p", num=60)  # another dataset
+    assert (tmp_path / "p.partial").exists()
+    source = Counting()
+    assert build(source, tmp_path / "p", size=32, quiet=True).digest == pack.digest and not source.seen
+    assert [path.name for path in tmp_path.iterdir()] == ["p"]
+    with pytest.raises(ValueError, match="already exists"):
+        toy_pack(tmp_path / "p")
+
+
 def test_leftovers_in_the_folder_do_not_get_into_the_pack(pack: Pack, tmp_path: Path) -> None:
     """Those of a build that was killed at its very end, or of a version that kept images in its parts."""
     partial = almost_finished(tmp_path / "p", Toy())

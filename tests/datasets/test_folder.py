@@ -224,6 +224,39 @@ def test_classes_sort_by_name_or_by_number_and_pandas_gaps_do_not_matter(tmp_pat
         assert [t.classes for t in spec.tasks] == [("2", "4", "6", "8", "10"), ("metal", "wood")]
 
 
+def test_two_ways_to_type_a_name_are_one(tmp_path: Path, rows: Table) -> None:
+    """Unicode forms and blanks; a class "Nan" is a name, as no program writes a missing number so."""
+    names = {
+        "wood": ("Nan", " Nan ", "Nan\u00a0"),
+        "metal": ("caf\u00e9 au  lait", "cafe\u0301 au lait", "caf\u00e9 au\tlait"),
+    }
+    objects = ("tasse {}", " tasse\u00a0 {}", "tasse  {} ")
+    same = [dict(row) for row in rows]
+    for i, (row, clean) in enumerate(zip(rows, same, strict=True)):
+        clean["object"] = objects[0].format(row["object"])
+        row["object"] = objects[i % 3].format(row["object"])
+        if row["material"]:
+            clean["material"], row["material"] = names[row["material"]][0], names[row["material"]][i % 3]
+            clean["material"] = clean["material"].replace("  ", " ")
+    typed = config(write(rows, tmp_path / "typed.csv"), only=("object!=tasse   002",))
+    pack = packed(typed, tmp_path / "typed")
+    other = packed(config(write(same, tmp_path / "same.csv"), only=("object!=tasse 002",)), tmp_path / "same")
+    assert pack.spec.tasks[0].classes == ("Nan", "caf\u00e9 au lait") == other.spec.tasks[0].classes
+    assert set(pack.column("group")) == {f"tasse {i:03d}" for i in (0, 1, 3, 4, 5, 6, 7)}
+    assert pack.digest == other.digest
+
+
+def test_tables_in_one_form_keep_their_fingerprint_and_paths_their_bytes(tmp_path: Path, rows: Table) -> None:
+    plain = config(write(rows, tmp_path / "m.csv")).source().fingerprint()
+    assert set(plain) == {"reader", "title", "manifest", "file_sizes", "options"}
+    odd = tmp_path / "vision" / "a\u0308  0.png"
+    (tmp_path / "vision" / "00.png").rename(odd)
+    rows[0]["vision"] = f"vision/{odd.name}"
+    assert set(config(write(rows, tmp_path / "m.csv")).source().fingerprint()) == set(plain)
+    rows[0]["object"] = "000\u00a0 0"
+    assert set(config(write(rows, tmp_path / "m.csv")).source().fingerprint()) == {*plain, "cells"}
+
+
 def test_unlabelled_rows_are_kept_for_pre_training_only(tmp_path: Path, rows: Table) -> None:
     pack = packed(config(write(rows, tmp_path / "m.csv"), label_only=("seq<=1",)), tmp_path / "pack")
     labels = pack.column("label_material")
@@ -543,6 +576,11 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     ),
     "control of names": (many_names, {"controls": ("w=side",)}, r"'side' has 72 values that are not numbers"),
     "id twice": (each(id="a"), {}, r"id 'a' occurs in several rows"),
+    "vision is touch": (
+        None,
+        {"touch": ("vision",)},
+        r"column .vision. would be both vision and touch: give every image",
+    ),
 }
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from filelock import FileLock
 from PIL import Image
 
 import mvitac
@@ -17,7 +16,6 @@ from mvitac.data.images import fit
 from mvitac.data.pack import Pack
 from mvitac.deploy.search import Index, build, nearest
 from mvitac.model import Model
-from mvitac.system.locks import Busy
 from support.examples import load_example
 
 
@@ -157,15 +155,6 @@ def test_a_changed_index_is_refused(index: Path, tmp_path: Path, artifact: Path,
             Index(copy)
     with pytest.raises(ValueError, match="already exists"):
         build(mvitac.load(artifact), pack, index)
-
-
-def test_an_index_that_another_process_writes_is_left_to_it(tmp_path: Path, artifact: Path, pack: Pack) -> None:
-    (partial := tmp_path / "index.partial").mkdir()
-    with FileLock(tmp_path / "index.lock"), pytest.raises(Busy, match="is being written by another process"):
-        build(mvitac.load(artifact), pack, tmp_path / "index", ("test",))
-    assert partial.exists()
-    build(mvitac.load(artifact), pack, tmp_path / "index", ("test",))
-    assert not partial.exists() and not (tmp_path / "index.lock").exists()
 
 
 def test_without_a_shared_space_only_like_finds_like(pack: Pack, tmp_path: Path, artifact: Path) -> None:

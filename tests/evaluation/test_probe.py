@@ -188,6 +188,22 @@ def test_features_are_computed_once(runs: list[Path], monkeypatch: pytest.Monkey
     assert probe_runs(runs[:1], session)["records"] == first["records"]
 
 
+@pytest.mark.parametrize("damage", ["bit", "cut", "no digest"])
+def test_damaged_cached_features_are_computed_again(
+    smoke_run: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
+    model, rows = load(smoke_run), np.arange(20)
+    first = features_module.features(model, pack, "touch", rows)
+    (file,) = tmp_path.rglob("*.npy")
+    whole = file.read_bytes()
+    bit = bytearray(whole)
+    bit[len(bit) // 2] ^= 1
+    file.write_bytes({"bit": bytes(bit), "cut": whole[:500], "no digest": whole[:-32]}[damage])
+    np.testing.assert_array_equal(features_module.features(model, pack, "touch", rows), first)
+    assert file.read_bytes() == whole
+
+
 def test_retrieval_of_the_untrained_is_chance(pack: Pack) -> None:
     run = recipe("smoke", PackConfig(path=pack.path))
     found = [r for seed in (0, 1, 2) for r in cross_modal(fresh(replace(run, seed=seed), pack.spec, 32), pack)]

@@ -408,8 +408,9 @@ def test_what_another_process_is_at_is_left_to_it(pack: Pack, tmp_path: Path) ->
 def test_a_run_killed_once_scored_loses_its_checkpoint_later(done: tuple[Path, dict], pack: Pack) -> None:
     work = lay_out(small(pack), pack, done[0], ProbeConfig())
     (work.jobs[0].out / "checkpoint.pt").touch()
+    work.jobs[0].out.with_name("seed0.lock").touch()
     do_all(work, 1, lambda line: None)
-    assert not (work.jobs[0].out / "checkpoint.pt").exists()
+    assert not (work.jobs[0].out / "checkpoint.pt").exists() and not list(done[0].rglob("*.lock"))
 
 
 def test_other_settings_in_the_same_folder_are_refused(done: tuple[Path, dict], pack: Pack, tmp_path: Path) -> None:

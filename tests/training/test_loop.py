@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import time
 from dataclasses import replace
@@ -23,7 +24,9 @@ from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
 from mvitac.recipes import recipe
-from mvitac.run import Optim
+from mvitac.run import Optim, Run
+from mvitac.system import files
+from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
@@ -62,6 +65,128 @@ def test_stopped_and_resumed_equals_straight(pack: Pack, straight: Path, tmp_pat
     assert_equal_weights(straight, tmp_path / "r")
     steps = [json.loads(line)["step"] for line in (tmp_path / "r" / "log.jsonl").read_text().splitlines()]
     assert steps == sorted(steps) and steps.count(8) == 2  # one step line, one eval line, nothing twice
+
+
+def cut_after_five(pack: Pack, out: Path) -> Run:
+    """A run that dies after step 5, with checkpoints of steps 2 and 4."""
+    run = smoke(pack, checkpoint_every=2)
+    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+        train(run, out, quiet=True)
+    return run
+
+
+def flip(path: Path, bit: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[bit // 8 % len(data)] ^= 1 << bit % 8
+    path.write_bytes(data)
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(
+    pack: Pack, straight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One flipped bit among the weights. Once it is resumed and cut again, both are good ones."""
+    out = tmp_path / "r"
+    run = cut_after_five(pack, out)
+    flip(out / CHECKPOINT, 8 * (out / CHECKPOINT).stat().st_size // 2)
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+        train(run, out, resume=True, quiet=True)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{out / CHECKPOINT} does not match its digest" in said
+    assert f"continuing from {out / PREVIOUS}, step 2" in said
+    assert [torch.load(out / name, weights_only=True)["step"] for name in (PREVIOUS, CHECKPOINT)] == [2, 4]
+    train(run, out, resume=True, quiet=True)
+    assert_equal_weights(straight, out)
+    assert capsys.readouterr().err == "" and not (out / PREVIOUS).exists()
+
+
+def test_killed_between_two_checkpoints(pack: Pack, straight: Path, tmp_path: Path) -> None:
+    """The old one has moved away, the new one is not there yet."""
+    run = cut_after_five(pack, tmp_path / "r")
+    os.replace(tmp_path / "r" / CHECKPOINT, tmp_path / "r" / PREVIOUS)
+    with power_cut(4):  # steps 5 to 8 and no more
+        train(run, tmp_path / "r", resume=True, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
+
+
+def test_two_damaged_checkpoints_stop(pack: Pack, tmp_path: Path) -> None:
+    run = cut_after_five(pack, tmp_path / "r")
+    for name in (CHECKPOINT, PREVIOUS):
+        flip(tmp_path / "r" / name, 12345)
+    with pytest.raises(ValueError, match=rf"{CHECKPOINT} does not match.*: delete it and {PREVIOUS} to start"):
+        train(run, tmp_path / "r", resume=True, quiet=True)
+
+
+def test_checkpoints_without_a_digest_still_resume(pack: Pack, straight: Path, tmp_path: Path) -> None:
+    """Version 0.1.0 wrote them."""
+    run, file = cut_after_five(pack, tmp_path / "r"), tmp_path / "r" / CHECKPOINT
+    torch.save(torch.load(file, weights_only=True), file)
+    assert file.read_bytes()[-2:] == bytes(2)  # an archive without a comment
+    with power_cut(4):
+        train(run, tmp_path / "r", resume=True, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_killed_before_its_record_has_its_name(pack: Pack, straight: Path, tmp_path: Path, resume: bool) -> None:
+    """The folder then holds nothing but a temporary file; a foreign file in it is still refused."""
+    ended = begin(int)
+    ended.join()
+    orphans = [f".run.json.{ended.pid}-7.tmp", f".log.jsonl.{files._HERE}-{ended.pid}-7.tmp"]
+    (tmp_path / "r").mkdir()
+    for name in orphans:
+        (tmp_path / "r" / name).touch()
+    train(smoke(pack), tmp_path / "r", resume=resume, quiet=True)
+    assert_equal_weights(straight, tmp_path / "r")
+    assert not list((tmp_path / "r").glob(".*"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / ".thesis.tex.tmp").touch()
+    with pytest.raises(ValueError, match="exists and is not a run"):
+        train(smoke(pack), tmp_path / "other", resume=resume, quiet=True)
+
+
+def test_temporary_files_of_others_stay(tmp_path: Path) -> None:
+    """Of this process, of another machine, and of another file."""
+    ended = begin(int)
+    ended.join()
+    names = (
+        f".a.{files._HERE}-{os.getpid()}-1.tmp",
+        f".a.00000000-{ended.pid}-1.tmp",
+        f".b.{ended.pid}-1.tmp",
+        "a.tmp",
+    )
+    for name in names:
+        (tmp_path / name).touch()
+    files.write_json(tmp_path / "a", 1)
+    assert {path.name for path in tmp_path.iterdir()} == {*names, "a"}
+
+
+def test_a_truncated_model_is_made_again(
+    pack: Pack, straight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(straight, tmp_path / "r")
+    model = tmp_path / "r" / "model.safetensors"
+    whole = model.read_bytes()
+    model.write_bytes(whole[:1000])
+    train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
+    assert "model.safetensors cannot be read" in (said := capsys.readouterr().err) and "making it again" in said
+    assert_equal_weights(straight, tmp_path / "r")
+    (tmp_path / "r" / PREVIOUS).touch()  # as if killed before it was deleted
+    train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
+    assert not (tmp_path / "r" / PREVIOUS).exists() and capsys.readouterr().err == ""
+    model.write_bytes(whole[:1000])
+    (tmp_path / "r" / CHECKPOINT).unlink()
+    with pytest.raises(ValueError, match=r"model\.safetensors cannot be read.*checkpoint is gone: delete"):
+        train(smoke(pack), tmp_path / "r", resume=True, quiet=True)
+
+
+def test_a_folder_that_is_deleted_during_training_is_an_error(pack: Pack, tmp_path: Path) -> None:
+    def delete(step: int, values: dict[str, float]) -> None:
+        if step == 4:
+            shutil.rmtree(tmp_path / "r", ignore_errors=True)  # called twice: losses, evaluation
+
+    with pytest.raises(ValueError, match=r"run\.json is gone: .* was deleted or moved during training"):
+        train(smoke(pack, checkpoint_every=2), tmp_path / "r", quiet=True, loggers=(delete,))
+    assert not list(tmp_path.iterdir())
 
 
 def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:

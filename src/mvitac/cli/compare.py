@@ -18,6 +18,7 @@ from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
 from mvitac.registry import default, to_json, unknown
 from mvitac.system.console import Console
+from mvitac.system.device import pick_device
 from mvitac.system.files import check_place, write_json
 
 
@@ -126,6 +127,7 @@ def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
     options = parse(_Options, rest, "compare", default=usual, description=manual)
     if options.jobs is not None and not 1 <= options.jobs <= 1024:
         raise ValueError(f"jobs {options.jobs}: give 1 to 1024 runs at a time")
+    pick_device(options.device)
     return options
 
 

@@ -88,8 +88,6 @@ class _ExportOptions:
 def export(argv: list[str]) -> None:
     """mvitac export RUN|ARTIFACT --out DIR [--format torch|onnx|openvino] [--int8]"""
     options = parse(_ExportOptions, argv, "export")
-    model = load(options.model)
-    pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
     config = exports.ExportConfig(
         kind=options.kind,
         precision=options.precision,
@@ -101,6 +99,8 @@ def export(argv: list[str]) -> None:
         num_rows=options.num_rows,
         threads=options.threads,
     )
+    model = load(options.model)
+    pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
     with shown(Console(stderr=True)):
         calibrate = Pack(options.calibrate) if options.calibrate else None
         report = exports.export(with_readouts(model, pack), pack, options.out, config, calibrate=calibrate)

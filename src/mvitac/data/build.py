@@ -97,13 +97,33 @@ def build(
     """
     out = Path(out)
     check_request(size, workers, max_damaged, store=store, quality=quality)
-    if not out.exists():
+    if not out.exists() or any(out.with_name(out.name + left).exists() for left in (".partial", ".lock")):
         with hold_lock(out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet):
             if not out.exists():
                 return _build(source, out, size, workers, max_damaged, quiet, store, quality)
+            if _clean_up(out, _request(source, size, store, quality)):
+                return Pack(out)
     if exist_ok:
         return Pack(out)
     raise ValueError(f"{out} already exists: choose another --out, or delete it first")
+
+
+def _clean_up(out: Path, request: dict[str, Any]) -> bool:
+    """Delete what a killed build of the same request left beside the finished pack ``out``; return whether it did."""
+    partial = out.with_name(out.name + ".partial")
+    if not partial.exists() or (partial / "pack").exists():
+        return False
+    meta = read_json(out / "pack.json", "a pack's description")
+    if not isinstance(meta, dict) or {name: meta.get(name) for name in request} != json.loads(json.dumps(request)):
+        return False
+    shutil.rmtree(partial)
+    return True
+
+
+def _request(source: Source, size: int, store: Store, quality: int) -> dict[str, Any]:
+    """Return what identifies a pack of ``source``; it is kept in request.json and pack.json."""
+    spec = to_json(source.spec())
+    return {"fingerprint": source.fingerprint(), "size": size, "spec": spec, **stored_as(store, quality)}
 
 
 def _build(
@@ -121,7 +141,7 @@ def _build(
     num = sum(counts)
     if not num:
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
-    request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(spec), **stored_as(store, quality)}
+    request = _request(source, size, store, quality)
     partial = out.with_name(out.name + ".partial")
     files: dict[str, RowFile | JpegFile] = {}
     for modality in spec.modalities:

@@ -59,7 +59,10 @@ def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, q
         meta = {**rest, "format": SHARDED, "pack": pack.digest, "shards": [len(rows) for rows in parts]}
         meta = {**meta, "seed": seed, "digests": digests}
         system.pipe_file(f"{place}/pack.json", json.dumps({**meta, "digest": digest(meta)}, indent=1).encode())
-    except (ValueError, OSError, KeyboardInterrupt):
+    except (ValueError, KeyboardInterrupt):
+        raise
+    except OSError as error:
+        error.filename = error.filename or url  # a full disk has no file name
         raise
     except Exception as error:  # each kind of store raises its own
         raise ValueError(f"{url} cannot be written ({brief(error)})") from None

@@ -39,6 +39,8 @@ HEADER = 128
 
 def reach(url: str) -> tuple[Any, str]:
     """Return the fsspec file system of ``url`` and the path in it; ValueError if fsspec does not know the protocol."""
+    if not url.strip():
+        raise ValueError("the URL of the shards is empty: give a folder, file:///..., s3://...")
     try:
         system, place = fsspec.url_to_fs(url)
     except ImportError as error:

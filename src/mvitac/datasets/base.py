@@ -100,7 +100,8 @@ class DatasetConfig(Registered, ABC):
         """Return the pack of single frames."""
         source = self.source()
         path = self.place(source)
-        if path.exists():
+        unfinished = path.with_name(f"{path.name}.partial")  # beside a pack: its build was killed in the last clean-up
+        if path.exists() and not unfinished.exists():
             pack = Pack(path)
             # A pack from before its reader named values has their columns already.
             pack.spec = replace(pack.spec, values=source.spec().values)

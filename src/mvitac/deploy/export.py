@@ -9,8 +9,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import os
-import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -31,7 +29,8 @@ from mvitac.deploy.quantise import Target, quantise, this_machine, to_openvino, 
 from mvitac.evaluation.features import sample
 from mvitac.model import Model
 from mvitac.system.device import has_bf16
-from mvitac.system.files import check_place, digest, digest_file, write_atomic, write_json
+from mvitac.system.files import digest, digest_file, write_atomic, write_json
+from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
@@ -74,6 +73,10 @@ class ExportConfig:
             raise ValueError("--int8 is for onnx and openvino: give --format onnx or --format openvino")
         if self.target != "auto" and not self.int8:
             raise ValueError(f"--target {self.target} chooses the weights of --int8: add --int8, or leave --target out")
+        if not (0 <= self.accuracy_loss <= 100):
+            raise ValueError(f"--accuracy-loss {self.accuracy_loss}: give points of accuracy, 0 to 100")
+        if not (self.min_cosine is None or -1 <= self.min_cosine <= 1):
+            raise ValueError(f"--min-cosine {self.min_cosine}: give a cosine, -1 to 1")
         if self.num_rows < 1:
             raise ValueError(f"--rows {self.num_rows}: give at least 1")
         if self.precision == "bf16" and (self.kind != "openvino" or self.int8):
@@ -96,16 +99,14 @@ def export(
         The report: cosines, accuracies, size in MB, latency in ms.
 
     Raises:
+        Busy: another process writes ``out``.
         ValueError: the export is not possible, or differs by more than ``config`` allows; ``out`` is not made.
     """
-    if out.exists():
-        raise ValueError(f"{out} already exists: choose another --out, or delete it first")
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
         raise ValueError(
             "--precision bf16: this CPU does not compute bf16 itself, so OpenVINO would use fp32 or emulate it, and the"
             " export could not be checked: export it on a CPU with AVX512-BF16 or AMX, or leave --precision out"
         )
-    check_place(out)
     graph = ExportModule(model, config.modalities)
     for given, modality in product((pack, calibrate or pack), graph.inputs):
         _check_fits(model, given, modality)
@@ -115,10 +116,7 @@ def export(
             f"{pack.path} has no rows in split test: an export is checked on rows that no probe was fitted on"
         )
     rows = sample(rows, config.num_rows)
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
+    with new_folder(out) as partial:
         with work(f"writing {config.kind}"), silent():
             if config.int8 and config.target == "auto":
                 config = replace(config, target=this_machine(config.kind))
@@ -126,9 +124,6 @@ def export(
         report, wanted = _measure(model, graph, partial, pack, rows, config)
         _write_check(graph, partial, pack, rows, wanted)
         _write_manifest(model, graph, partial, config, report)
-        os.rename(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return report
 
 
@@ -162,7 +157,9 @@ def _write_model(
     batch = torch.export.Dim("batch", min=1, max=1024)
     shapes = (tuple({0: batch} for _ in two),)
     if config.kind == "torch":
-        torch.export.save(torch.export.export(graph, two, dynamic_shapes=shapes), folder / FILES["torch"][0])
+        buffer = io.BytesIO()  # to a file, torch ends the process on a full disk
+        torch.export.save(torch.export.export(graph, two, dynamic_shapes=shapes), buffer)
+        write_atomic(folder / FILES["torch"][0], lambda file: file.write(buffer.getbuffer()))
         return
     path = write_onnx(graph, two, folder, list(graph.inputs), list(graph.outputs), shapes)
     if examples is not None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -20,7 +18,7 @@ from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import check_unseen, stored_result
 from mvitac.evaluation.features import features
-from mvitac.evaluation.leaks import Scored, write_sources
+from mvitac.evaluation.leaks import Scored, Source, write_sources
 from mvitac.evaluation.probe import score_rows, split_rows
 from mvitac.evaluation.scores import cell_text, columns_of, covered, sources_of, summarise, tested_on
 from mvitac.model import Model, load
@@ -28,7 +26,8 @@ from mvitac.nn.encoders import SCRATCH, build_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
 from mvitac.registry import to_json
 from mvitac.run import load_run
-from mvitac.system.files import brief, check_place, digest_file, write_atomic, write_json
+from mvitac.system.files import brief, digest_file, write_atomic, write_json
+from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 
 
@@ -137,6 +136,19 @@ def with_readouts(model: Model, pack: Pack | None = None) -> Model:
     return model
 
 
+def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tuple[list[Source] | None, dict[str, Any]]:
+    """Fit the probes of ``model``; returns what it learned from, if that is known, and the scores of ``_scores``."""
+    tasks = {task.name: task for task in pack.spec.tasks if _scorable(pack, task)}
+    learned, scored = check_unseen([run], [model], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
+    fitted = _fit_all(model, pack)
+    for readout, record in fitted:
+        q = readout.question
+        record["leak"] = scored.leak(learned, split_rows(pack, tasks[q.task], q.modality).test)
+        readout.question = replace(q, leak=record["leak"])
+    model.readouts = {readout.question.name: readout for readout, _ in fitted}
+    return learned, _scores(run, model, pack, [record for _, record in fitted])
+
+
 def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False) -> Path:
     """Write the artifact of a finished run.
 
@@ -150,27 +162,15 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         ``out``. The artifact was loaded once, as a check, before it got this name.
 
     Raises:
+        Busy: another process writes ``out``.
         ValueError: ``out`` exists or cannot be written, the run or its data is missing, or the run was trained on what
             ``pack`` would score.
     """
-    if out.exists():
-        raise ValueError(f"{out} already exists: choose another place, or delete it first")
-    check_place(out)
-    model = load(run)
-    _, record = load_run(run)
-    pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
-    tasks = {task.name: task for task in pack.spec.tasks if _scorable(pack, task)}
-    learned, scored = check_unseen([run], [model], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
-    fitted = _fit_all(model, pack)
-    for readout, found in fitted:
-        q = readout.question
-        found["leak"] = scored.leak(learned, split_rows(pack, tasks[q.task], q.modality).test)
-        readout.question = replace(q, leak=found["leak"])
-    model.readouts = {readout.question.name: readout for readout, _ in fitted}
-    scores = _scores(run, model, pack, [found for _, found in fitted])
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with new_folder(out) as partial:
+        model = load(run)
+        _, record = load_run(run)
+        pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
+        learned, scores = _fit_and_score(run, model, pack, allow_leak)
         _write_weights(model, partial)
         write_json(partial / "run.json", record)
         if learned is not None:
@@ -180,9 +180,6 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
         write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})
         read(partial)
-        os.rename(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return out
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from mvitac.deploy.engine import FILES, import_openvino, open_engine
+from mvitac.system.files import brief
 
 Target = Literal["auto", "avx2", "vnni"]
 """CPU of an int8 export: avx2 = any (7-bit weights), vnni = 8-bit weights, for CPUs that do not saturate (x86 with VNNI
@@ -51,8 +52,11 @@ def to_openvino(path: Path) -> None:
     Not by ``openvino.convert_model``, which reports each use (``import_openvino``).
     """
     openvino = import_openvino()
-    model = openvino.Core().read_model(path)
-    openvino.save_model(model, path.with_name(FILES["openvino"][0]), compress_to_fp16=False)
+    model, out = openvino.Core().read_model(path), path.with_name(FILES["openvino"][0])
+    try:
+        openvino.save_model(model, out, compress_to_fp16=False)
+    except RuntimeError as error:  # it does not say why
+        raise ValueError(f"{out} cannot be written ({brief(error)}): is the disk full?") from None
 
 
 def quantise(path: Path, inputs: list[str], examples: list[list[np.ndarray]], *, seven_bits: bool) -> None:

@@ -11,8 +11,6 @@ Shapes: N rows, Q queries, E dimensions.
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -26,8 +24,8 @@ import torch
 from mvitac.data.pack import Pack, has_difference
 from mvitac.model import Model, load
 from mvitac.registry import unknown
-from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
-from mvitac.system.locks import hold_lock
+from mvitac.system.files import digest, digest_file, naming, read_json, write_atomic, write_json
+from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 from mvitac.transforms.preprocess import ImageInput
 
@@ -145,57 +143,47 @@ def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> 
         Busy: another process writes ``out``.
         ValueError: ``out`` exists, or the pack does not fit the model.
     """
-    check_place(out)
-    busy = f"{out} is being written by another process: wait until it ends, or choose another --out"
-    with hold_lock(out, busy, wait=False):
-        return _build(model, pack, out, splits)
+    with new_folder(out) as partial:
+        _fill(model, pack, partial, splits)
+    return Index(out, verify=False)
 
 
-def _build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...]) -> Index:
-    if out.exists():
-        raise ValueError(f"{out} already exists: choose another --out, or delete it first")
+def _fill(model: Model, pack: Pack, folder: Path, splits: tuple[str, ...]) -> None:
+    """Write the files of an index into ``folder``."""
     modalities = check_pack(model, pack)
     rows = pack.rows(*(splits or np.unique(pack.column("split"))), having=modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no whole pairs{' in ' * bool(splits)}{', '.join(splits)}: nothing to index")
     shared = all(m in model.projectors for m in modalities)
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        for modality in modalities:
-            _write_bank(partial / f"{modality}.npy", embeddings(model, pack, modality, rows, shared=shared), len(rows))
-        model.save(partial / "model.safetensors")
-        pq.write_table(describe(pack, rows), partial / "rows.parquet")
-        names = sorted(p.name for p in partial.iterdir())
-        meta = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "num": len(rows),
-            "space": "shared" if shared else "features",
-            "pack": str(pack.path.absolute()),
-            "pack_digest": pack.digest,
-            "weights": model.weights_digest(),
-            "classes": {task.name: list(task.classes) for task in pack.spec.tasks},
-            "files": {name: digest_file(partial / name) for name in names},
-        }
-        write_json(partial / "index.json", {**meta, "digest": digest(meta)})
-        os.rename(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return Index(out, verify=False)
+    for modality in modalities:
+        _write_bank(folder / f"{modality}.npy", embeddings(model, pack, modality, rows, shared=shared), len(rows))
+    model.save(folder / "model.safetensors")
+    write_atomic(folder / "rows.parquet", lambda file: pq.write_table(describe(pack, rows), file))
+    meta = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "num": len(rows),
+        "space": "shared" if shared else "features",
+        "pack": str(pack.path.absolute()),
+        "pack_digest": pack.digest,
+        "weights": model.weights_digest(),
+        "classes": {task.name: list(task.classes) for task in pack.spec.tasks},
+        "files": {path.name: digest_file(path) for path in sorted(folder.iterdir())},
+    }
+    write_json(folder / "index.json", {**meta, "digest": digest(meta)})
 
 
 def _write_bank(path: Path, chunks: Iterator[np.ndarray], num: int) -> None:
-    """``num`` unit vectors as .npy, chunk by chunk, so that memory does not grow with the number of rows."""
+    """``num`` unit vectors as .npy, chunk by chunk, so that memory does not grow with the number of rows.
+
+    Not by a memory map: on a full disk, writing to one kills the process.
+    """
     first = next(chunks)
-    bank = np.lib.format.open_memmap(path, "w+", np.float32, (num, first.shape[1]))
-    start = 0
-    for x in chain([first], chunks):
-        bank[start : start + len(x)] = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
-        start += len(x)
-    assert start == num
-    bank.flush()
+    header = {"descr": "<f4", "fortran_order": False, "shape": (num, first.shape[1])}
+    with naming(path), path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for x in chain([first], chunks):
+            file.write((x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)).astype("<f4", order="C").data)
 
 
 class Index:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 from collections.abc import Callable
 
 import numpy as np
@@ -52,7 +54,10 @@ def sample(rows: np.ndarray, num: int) -> np.ndarray:
 
 
 def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:
-    """Features [len(rows), D] float32, cached on disk by weights, data, rows and image size (``Model.features``)."""
+    """Features [len(rows), D] float32, cached on disk by weights, data, rows and image size (``Model.features``).
+
+    The cached file is a .npy followed by its sha256. One that does not match, or has none, is computed again.
+    """
     device = next(model.parameters()).device
     sides = model.run.augment
     # The weights' digest covers eval_size already.
@@ -60,11 +65,13 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
     key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type, *side])
     path = cache_dir() / "features" / f"{key[:32]}.npy"
     if path.exists():
-        try:
-            return np.load(path, allow_pickle=False)
-        except (ValueError, EOFError, OSError):
-            path.unlink()  # damaged file: compute the features again
+        data = path.read_bytes()
+        if hashlib.sha256(memoryview(data)[:-32]).digest() == data[-32:]:
+            return np.load(io.BytesIO(data), allow_pickle=False)
     with work(f"reading {modality} features", len(rows), "images") as advance:
         values = pack_features(model, pack, modality, rows, for_heads=for_heads, advance=advance).numpy()
-    write_atomic(path, lambda file: np.save(file, values))
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    buffer.write(hashlib.sha256(buffer.getbuffer()).digest())
+    write_atomic(path, lambda file: file.write(buffer.getbuffer()))
     return values

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -33,6 +34,7 @@ from mvitac.system.files import brief, parse_json, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.system.processes import my_device, side_by_side
 from mvitac.system.progress import Bars, shown
+from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.log import Logger, in_a_bar, last_line
 from mvitac.training.loop import Diverged, Interrupted, train
 
@@ -72,8 +74,9 @@ class Job:
         return bool(self.failure) or all(_scored(self.out / name) == self.asked for name in kept)
 
     def drop_checkpoint(self) -> None:
-        """Delete the checkpoint. A scored run needs none, and it is four times as large as the weights."""
-        (self.out / "checkpoint.pt").unlink(missing_ok=True)
+        """Delete the checkpoints. A scored run needs none, and one is four times as large as the weights."""
+        for name in (CHECKPOINT, PREVIOUS):
+            (self.out / name).unlink(missing_ok=True)
 
 
 def _scored(path: Path) -> dict[str, Any] | None:
@@ -175,7 +178,8 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
     todo = [job for job in work.jobs if not job.done]
     for job in work.jobs:
         if job.done and not job.failure:
-            job.drop_checkpoint()  # a killed process may have left it
+            with suppress(Busy), hold_lock(job.out, "", wait=False):
+                job.drop_checkpoint()  # a killed process may have left it, and its lock
     report = _Reporter(work, say)
     try:
         with shown(console, quiet=console is None) as bars:

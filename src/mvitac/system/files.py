@@ -7,8 +7,11 @@ import errno
 import hashlib
 import json
 import os
+import platform
+import re
 import tempfile
 import threading
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,7 +20,8 @@ from typing import Any, BinaryIO
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool = True) -> None:
     """Write a temporary file next to ``path``, then rename it to ``path``, so that no reader sees a partial file.
 
-    If it fails (full disk, Ctrl-C), the temporary file is removed and ``path`` is unchanged.
+    If it fails (full disk, Ctrl-C), the temporary file is removed and ``path`` is unchanged. Temporary files of processes
+    that were killed are removed by the next write to ``path`` (with ``sync``).
 
     Args:
         path: The file to write. Missing folders are created.
@@ -25,8 +29,10 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
         sync: Flush to disk, which protects against power loss. Without it, only a killed process is safe.
     """
     made = [parent for parent in path.parents if not parent.exists()]
-    neighbour = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    neighbour = path.with_name(f".{path.name}.{_HERE}-{os.getpid()}-{threading.get_ident()}.tmp")
     try:
+        if sync and not made:
+            _remove_orphans(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with neighbour.open("wb") as file:
             write(file)
@@ -44,6 +50,37 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
             error.filename = str(path)  # a failed write has no file name
         raise
+
+
+_HERE = f"{zlib.crc32(platform.node().encode()):08x}"
+"""This machine, in the names of temporary files."""
+_TEMPORARY = re.compile(r"\.(?P<name>.+?)\.((?P<machine>[0-9a-f]{8})-)?(?P<process>\d+)-\d+\.tmp")
+
+
+def is_temporary(path: Path) -> bool:
+    """Return whether ``path`` has the name of a temporary file of ``write_atomic``."""
+    return _TEMPORARY.fullmatch(path.name) is not None
+
+
+def _remove_orphans(path: Path) -> None:
+    """Remove temporary files of ``path`` whose process has ended; those of other machines are kept."""
+    for name in os.listdir(path.parent):
+        found = _TEMPORARY.fullmatch(name) if name.endswith(".tmp") else None
+        ours = found and found["name"] == path.name and found["machine"] in (None, _HERE)
+        if found and ours and not _is_alive(int(found["process"])):
+            path.with_name(name).unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    if os.name == "nt":  # signal 0 is Ctrl-C there
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # it belongs to another user, or no process has this number
+        pass
+    return True
 
 
 @contextlib.contextmanager

@@ -1,8 +1,10 @@
-"""File locks: one process per pack or run. A lock is released even if its process is killed."""
+"""File locks: one process per pack or run, and new folders. A lock is released even if its process is killed."""
 
 from __future__ import annotations
 
 import errno
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -11,6 +13,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from mvitac.system.console import Console
+from mvitac.system.files import check_place, naming
 
 _held: ContextVar[frozenset[Path]] = ContextVar("_held", default=frozenset())
 """Paths whose locks this thread holds."""
@@ -56,3 +59,27 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
         _held.reset(token)
         Path(lock.lock_file).unlink(missing_ok=True)  # filelock detects a deleted lock file
         lock.release()
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """Yield the new folder ``<out>.partial``. It is renamed to ``out`` at the end, or deleted after an error.
+
+    Raises:
+        Busy: If another process writes ``out``.
+        ValueError: If ``out`` exists or cannot be written.
+    """
+    check_place(out)
+    busy = f"{out} is being written by another process: wait until it ends, or choose another place"
+    with hold_lock(out, busy, wait=False):
+        if out.exists():
+            raise ValueError(f"{out} already exists: choose another place, or delete it first")
+        partial = out.with_name(out.name + ".partial")
+        shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
+        partial.mkdir(parents=True)
+        try:
+            with naming(out):  # an error of a full disk has no file name
+                yield partial
+            os.rename(partial, out)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)

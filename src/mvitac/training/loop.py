@@ -25,7 +25,7 @@ from mvitac.system.locks import hold_lock
 from mvitac.training import checkpoint
 from mvitac.training.log import EARLY, Log, Logger
 from mvitac.training.sampler import mix
-from mvitac.training.setup import Setup, check_out, set_up
+from mvitac.training.setup import Setup, check_out, check_still_there, set_up
 from mvitac.training.validation import evaluate
 from mvitac.training.views import load_chunks
 
@@ -50,7 +50,8 @@ def train(
     """Pre-train and write the result into a folder.
 
     The folder gets run.json (the settings), trained_on.safetensors (hashes of the rows it learns from), log.jsonl,
-    checkpoint.pt (to resume from) and model.safetensors (the result).
+    checkpoint.pt (to resume from) and model.safetensors (the result). Until it is finished, checkpoint.previous.pt is the
+    checkpoint before.
 
     Args:
         run: What to train, e.g. ``mvitac.recipe("demo")``.
@@ -130,11 +131,15 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) 
 
             # Save a checkpoint. All processes take part, because memory banks are sharded.
             if save:
-                checkpoint.save(out / "checkpoint.pt", run, method, step.optimiser, done, world)
+                if world.writes:
+                    check_still_there(out)
+                checkpoint.save(out, run, method, step.optimiser, done, world)
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
     if world.writes:
         Model(method, run, pack.spec, pack.size).save(out / "model.safetensors")
+        check_still_there(out)
+        (out / checkpoint.PREVIOUS).unlink(missing_ok=True)
     world.wait()
 
 

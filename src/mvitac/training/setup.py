@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,13 +13,13 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, write_sources
 from mvitac.methods.base import Method
-from mvitac.model import Model
+from mvitac.model import Model, load
 from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import describe, pick_device, pick_precision
 from mvitac.system.distributed import World, local_device, synchronise_norms
-from mvitac.system.files import brief, check_place, write_json
+from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
@@ -66,23 +67,22 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     resumed = (out / "run.json").exists()
     if resumed:
         begun = check_same(asked, pack, out)
-        if (out / "model.safetensors").exists():
+        if _is_finished(out, world):
             return None
         _check_precision(begun, asked, run, out)
 
     method = _build_method(run, pack, rows, device, world)
     step = Step(run, method, device, world)
-    num_steps, start = run.num_steps(len(rows)), 0
-    if (out / "checkpoint.pt").exists():
-        start = checkpoint.restore(out / "checkpoint.pt", run, method, step.optimiser, num_steps)
+    num_steps = run.num_steps(len(rows))
+    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
-    if world.writes and not (out / FILE).exists():
-        write_sources(out, [source_of(pack, rows)])
     if not resumed and world.writes:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
         here = {"device": describe(device), "precision": run.precision}
         write_json(out / "run.json", {**record, **here, **provenance()})
+    if world.writes and not (out / FILE).exists():
+        write_sources(out, [source_of(pack, rows)])
     return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps)
 
 
@@ -92,8 +92,35 @@ def check_out(out: Path, resume: bool) -> None:
     if (out / "run.json").exists():
         if not resume:
             raise ValueError(f"{out} already holds a run: continue it with --resume, or choose another --out")
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    elif out.exists() and (not out.is_dir() or not all(map(is_temporary, out.iterdir()))):
         raise ValueError(f"{out} exists and is not a run: choose another --out")
+
+
+def check_still_there(out: Path) -> None:
+    """Raise ValueError if the folder of the run has been deleted or moved since training began."""
+    if not (out / "run.json").exists():
+        raise ValueError(f"{out / 'run.json'} is gone: {out} was deleted or moved during training, start again")
+
+
+def _is_finished(out: Path, world: World) -> bool:
+    """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint.
+
+    Raises:
+        ValueError: If there is no checkpoint either.
+    """
+    if not (out / "model.safetensors").exists():
+        return False
+    try:
+        load(out)
+    except ValueError as error:
+        if not (out / checkpoint.CHECKPOINT).exists():
+            raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
+        if world.writes:
+            print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
+        return False
+    if world.writes:
+        (out / checkpoint.PREVIOUS).unlink(missing_ok=True)  # left by a process that was killed at the very end
+    return True
 
 
 def check_divisible(run: Run, world: World) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from mvitac.data.checks.examine import examine, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
 from mvitac.data.checks.image_stats import area_means, look_at
+from mvitac.data.checks.name_checks import similar_names
 from mvitac.data.image_grid import MISSING, pair
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Sample, Source
@@ -97,6 +99,8 @@ class Presses(Source):
             "sensor": "a" if obj // 3 % 2 else "b",
             "force": 1.0 + (obj * 7 + k * 5) % 11,
         }
+        if fault == "spelling" and obj == 2:
+            columns["group"] = "OBJECT\u00a003"  # in train, while "object 3" is in test
         if fault == "labels" and item % 30 == 1:
             columns["label_material"] = -1
         if fault == "unseen class":
@@ -168,6 +172,11 @@ FAULTS = {
     "copies": ("identical images across splits", "broken", "vision: 5 of 320"),
     "near-copies": ("near-copies across splits", "look", "vision: 16 of"),
     "leak": ("groups across splits", "broken", "e.g. 'object 0'; 1 of 5 in test are also in train"),
+    "spelling": (
+        "names that differ in spelling only",
+        "look",
+        r"group: 'OBJECT\xa003' and 'object 3'; 1 of these are in more than one split",
+    ),
     "labels": ("missing labels", "look", "first 00-01"),
     "numbers": ("numbers", "look", "force is not a number in 1 of 320 (0.3 %), first row 41"),
     "range": ("numbers", "look", "force is 1e+06 in row 41"),
@@ -185,6 +194,25 @@ def test_each_fault_is_named_and_nothing_else(fault: str, tmp_path: Path) -> Non
     assert (findings[item].verdict, evidence in findings[item].evidence) == (verdict, True), findings[item].evidence
     assert findings[item].advice
     assert exit_code(findings.values()) == {"look": 1, "broken": 2}[verdict]
+
+
+def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
+    """Case, leading zeros, a ligature, an invisible character; but not numbers that differ."""
+    other = copy.copy(pack)
+    for classes, alike in {
+        ("Wood", "wood", "cork"): "'Wood' and 'wood'",
+        ("1", "01", "10"): "'1' and '01'",
+        ("stiff", "stifi", "x"): "",
+        ("\ufb01rm", "firm", "x"): "'\\ufb01rm' and 'firm'",
+        ("soft\u200b", "x", "soft"): "'soft\\u200b' and 'soft'",
+        ("hard wood", "hard_wood", "1.05"): "'hard wood' and 'hard_wood'",
+        ("1.05", "1.5", "105"): "",
+        ("1 2", "12", "-12"): "",
+    }.items():
+        other.spec = replace(pack.spec, tasks=(Task(name="pattern", classes=classes), pack.spec.tasks[1]))
+        found = similar_names(other)
+        assert found.verdict == ("look" if alike else "ok"), classes
+        assert (f"classes of pattern: {alike}" == found.evidence) == bool(alike), found.evidence
 
 
 # -- the source and the pack --------------------------------------------------------------------------------------------

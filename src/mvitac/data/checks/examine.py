@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.build import build
-from mvitac.data.checks import duplicates, image_checks, table_checks
+from mvitac.data.checks import duplicates, image_checks, name_checks, table_checks
 from mvitac.data.checks.contact_sheet import blocks_of
 from mvitac.data.checks.finding import Finding
 from mvitac.data.checks.image_stats import look_at
@@ -85,6 +85,7 @@ def examine(pack: Pack, counts: list[Count] | None = None, *, part: bool = False
         table_checks.mixture(pack),
         *labels,
         *table_checks.leaks(pack),
+        name_checks.similar_names(pack),
         duplicates.exact_copies(pack, looks),
         duplicates.near_copies(pack, looks),
         table_checks.numbers(pack),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,8 @@ from PIL import Image
 
 from mvitac.data.pack import Pack
 from mvitac.datasets.lerobot.reader import RENAMED, VERSION
-from mvitac.system.files import check_place, write_json
+from mvitac.system.files import write_json
+from mvitac.system.locks import new_folder
 
 ROWS_PER_GROUP = 100
 """Rows per parquet row group, which is the smallest unit of reading."""
@@ -40,11 +40,13 @@ def check_fps(fps: float) -> None:
 
 
 def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
-    """Write the rows of ``pack`` that have every modality to the new folder ``out``, and return their number."""
+    """Write the rows of ``pack`` that have every modality to the new folder ``out``, and return their number.
+
+    Raises:
+        Busy: If another process writes ``out``.
+        ValueError: If ``out`` exists or cannot be written, or no row has every modality.
+    """
     check_fps(fps)
-    check_place(out)
-    if out.exists():
-        raise ValueError(f"{out} already exists: choose another --out, or delete it first")
     rows = pack.rows("train", "val", "test", "unlabelled", having=pack.spec.modalities)
     if not len(rows):
         raise ValueError(f"{pack.path} has no row with all of {', '.join(pack.spec.modalities)}: nothing to write")
@@ -52,33 +54,32 @@ def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
     groups = pack.touch_groups[rows]
     starts = np.flatnonzero(np.r_[True, groups[1:] != groups[:-1]])
     ends = np.r_[starts[1:], len(rows)]
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    features = _features(pack)
-    homes = _write_data(pack, rows, starts, fps, partial, features)
-    _write_episodes(pack, partial, starts, ends, homes)
-    _write_tasks(pack, partial)
-    write_json(partial / "meta" / "stats.json", _stats(pack, rows, starts, fps))
-    write_json(
-        partial / "meta" / "info.json",
-        {
-            "codebase_version": VERSION,
-            "robot_type": "unknown",
-            "total_episodes": len(starts),
-            "total_frames": len(rows),
-            "total_tasks": 1,
-            "chunks_size": FILES_PER_CHUNK,
-            "data_files_size_in_mb": FILE_BYTES >> 20,
-            "video_files_size_in_mb": 200,
-            "fps": fps,
-            "splits": {"train": f"0:{len(starts)}"},
-            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-            "video_path": None,
-            "features": features,
-        },
-    )
-    partial.rename(out)
+    with new_folder(out) as partial:
+        features = _features(pack)
+        homes = _write_data(pack, rows, starts, fps, partial, features)
+        _write_episodes(pack, partial, starts, ends, homes)
+        _write_tasks(pack, partial)
+        write_json(partial / "meta" / "stats.json", _stats(pack, rows, starts, fps))
+        write_json(partial / "meta" / "info.json", _info(len(rows), len(starts), fps, features))
     return len(rows)
+
+
+def _info(num_rows: int, num_episodes: int, fps: int, features: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "codebase_version": VERSION,
+        "robot_type": "unknown",
+        "total_episodes": num_episodes,
+        "total_frames": num_rows,
+        "total_tasks": 1,
+        "chunks_size": FILES_PER_CHUNK,
+        "data_files_size_in_mb": FILE_BYTES >> 20,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": f"0:{num_episodes}"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": None,
+        "features": features,
+    }
 
 
 def _cameras(pack: Pack) -> dict[str, tuple[str, int]]:

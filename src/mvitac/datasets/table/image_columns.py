@@ -32,6 +32,11 @@ def image_columns(manifest: Manifest, vision: str | None, touch: tuple[str, ...]
     for column in (vision, *touch):
         if column:
             manifest.check(column)
+    if vision in touch:
+        raise ValueError(
+            f"column {vision!r} would be both vision and touch: give every image its own column, or vision='' if there is"
+            " no camera"
+        )
     if not (vision or touch):
         raise ValueError(
             f"{manifest.file} has no column vision, touch, or left and right (it has {', '.join(have)}):"

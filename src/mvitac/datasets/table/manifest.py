@@ -10,9 +10,11 @@ import math
 import operator
 import os
 import re
+import unicodedata
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,8 @@ from mvitac.registry import unknown
 from mvitac.system.files import brief, digest, digest_file, parse_json
 
 MANIFESTS = (".csv", ".parquet", ".jsonl")
+NAN = ("nan", "NaN", "NAN")
+"""How programs write a missing number. "Nan" is a name."""
 COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 
 
@@ -57,6 +61,14 @@ class Manifest:
     def check(self, column: str) -> None:
         if column not in self.columns and column not in self.found:
             raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
+
+    def normalised(self, paths: Collection[str | None]) -> Manifest:
+        """Return this table with the cells in one form (``normal``), except in the columns of ``paths``.
+
+        Else two ways to type a name would be two classes, or one object in train and in test.
+        """
+        rows = [{name: cell if name in paths else normal(cell) for name, cell in row.items()} for row in self.rows]
+        return replace(self, rows=rows)
 
     def refs(self, column: str) -> list[ImageRef | None]:
         """Return each row's image in ``column``; None where the cell is empty.
@@ -100,10 +112,16 @@ def text_of(value: Any) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     text = str(value).strip()
-    if text.lower() == "nan":
+    if text in NAN:
         return ""
     # pandas writes an integer column with a missing value as 1.0, 2.0, ...: these are the classes 1 and 2.
     return re.sub(r"^(-?\d+)\.0+$", r"\1", text) if ".0" in text else text
+
+
+@lru_cache(1 << 16)
+def normal(text: str) -> str:
+    """Return ``text`` in Unicode form NFC, with single blanks between words and none around them."""
+    return " ".join(unicodedata.normalize("NFC", text).split())
 
 
 def number_of(text: str) -> float | None:
@@ -298,7 +316,7 @@ class Condition:
 
     def holds(self, row: dict[str, str]) -> bool:
         """Return whether ``row`` meets the condition; an empty cell is neither <= nor >= anything."""
-        cell, wanted = row[self.column], text_of(self.value)
+        cell, wanted = row[self.column], normal(text_of(self.value))
         if self.sign in COMPARE:
             number = number_of(cell)
             return number is not None and COMPARE[self.sign](number, float(wanted))

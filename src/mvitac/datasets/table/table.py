@@ -65,7 +65,8 @@ class RowsConfig(DatasetConfig, ABC):
     """Column of tactile images, or two columns (left right) to stack on channels; default: "touch" if it exists, else
     "left" and "right"; "" = none."""
     labels: tuple[str, ...] = ()
-    """Columns that become tasks. Classes are the sorted distinct values; an empty cell or NaN is unlabelled."""
+    """Columns that become tasks. Classes are the sorted distinct values; an empty cell or NaN is unlabelled. Unicode
+    forms and blanks are made equal."""
     values: tuple[str, ...] = field(default=(), metadata=LATER)
     """Columns of numbers to predict, as column:unit, e.g. force_n:N; or several as one task: pose=z_mm:mm,tilt_deg:deg.
     An empty cell or NaN is not measured."""
@@ -169,6 +170,10 @@ class Rows(Source):
         self._manifest_digest = manifest.digest
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
         self._vision, self._touch = image_columns(manifest, config.vision, config.touch)
+        given = manifest.rows
+        manifest = manifest.normalised({self._vision, *self._touch, *(config.background or ("background",))})
+        # Tables that were in this form keep their packs in the cache.
+        self._form = {} if manifest.rows == given and not _names_nan(given) else {"cells": "normal"}
         self._group = config.group or ("group" if "group" in manifest.columns else None)
         self._split = config.split or ("split" if "split" in manifest.columns else BY_GROUP)
         self._sensor = config.sensor or ("sensor" if "sensor" in manifest.columns else None)
@@ -304,6 +309,7 @@ class Rows(Source):
             "manifest": self._manifest_digest,
             "file_sizes": digest(self._sizes),
             "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
+            **self._form,
         }
 
     def stamps(self) -> list[int]:
@@ -311,6 +317,11 @@ class Rows(Source):
 
     def read(self, item: int) -> list[Sample | Lost]:
         return read_rows([self._rows[i] for i in self._items[item]], self._config.size)
+
+
+def _names_nan(rows: Sequence[dict[str, str]]) -> bool:
+    """Return whether a cell is a name such as "Nan", which earlier versions took for a missing number."""
+    return any(cell.lower() == "nan" for row in rows for cell in row.values() if len(cell) == 3)
 
 
 def _check_columns(config: RowsConfig, manifest: Manifest, chosen: Sequence[str | None]) -> None:
