@@ -112,7 +112,7 @@ def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(pres
         ({"frames": 2, "order": "split"}, "not a number in row 0"),
         ({"frames": 2, "order": "nothing"}, "unknown column"),
         ({"frames": 2, "order": "label_late"}, "two rows of touch"),
-        ({"frames": 0}, "frames 0: give"),
+        ({"frames": 0}, "num_frames 0: give"),
         ({"frames": 2, "stride": 0.0}, r"stride 0\.0: give"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import mvitac
 from mvitac.data.build import build
 from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Grasps, GraspsConfig
 from mvitac.deploy.policy import ObservationEncoder
@@ -28,6 +30,9 @@ class Felt(Grasps):
 
     def __init__(self) -> None:
         super().__init__(GraspsConfig(num=THINGS * EACH, size=16))
+
+    def spec(self) -> DataSpec:
+        return replace(super().spec(), values=())
 
     def read(self, item: int) -> list[Sample]:
         thing, index = item % THINGS, item // THINGS

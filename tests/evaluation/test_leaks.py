@@ -46,7 +46,7 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 @pytest.fixture
 def run(smoke_run: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(smoke_run, tmp_path / "run")
+    return shutil.copytree(smoke_run, tmp_path / "run", ignore=shutil.ignore_patterns("probe.json"))
 
 
 def test_scores_of_rows_that_were_trained_on_are_refused(

@@ -606,6 +606,9 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
         shutil.copytree(onnx, out)
 
     monkeypatch.setattr("mvitac.deploy.export.export", exported)
+    monkeypatch.setattr(
+        "mvitac.deploy.publish.own_data", lambda model, instead: None
+    )  # that of an artifact is not opened
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "cache"))
     for model in (artifact, other, artifact):
         assert _engine(str(model), 1, Console(quiet=True)).classes.keys() == {"pattern", "bright"}

@@ -30,7 +30,7 @@ from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
-from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order, training_rows
+from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order
 from mvitac.training.validation import evaluate
 from mvitac.training.views import make_views
 from support.processes import begin, finish
@@ -397,7 +397,7 @@ def test_partners_of_the_same_press(tmp_path: Path) -> None:
     wide = partners(pack, rows, torch.Generator().manual_seed(0))
     assert (pack.presses[wide] != pack.presses[rows]).mean() > 0.3
     run = replace(recipe("smoke", PackConfig(path=pack.path)), positives="same-press")
-    assert np.array_equal(training_rows(run, pack), pack.rows("train"))
+    assert np.array_equal(run.method.training_rows(pack), pack.rows("train"))
     asked: list[np.ndarray] = []
 
     class Spy(Feed):
@@ -413,9 +413,10 @@ def test_partners_of_the_same_press(tmp_path: Path) -> None:
     assert all(np.array_equal(pack.presses[found], pack.presses[rows]) for found in asked)
 
 
-def test_same_press_needs_to_know_the_press(pack: Pack) -> None:
+def test_same_press_needs_to_know_the_press(pack: Pack, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="same-press positives need a column 'press'"):
-        training_rows(smoke(pack, positives="same-press"), pack)
+        train(smoke(pack, positives="same-press"), tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run" / "run.json").exists()
 
 
 def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:

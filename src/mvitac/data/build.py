@@ -97,7 +97,8 @@ def build(
     """
     out = Path(out)
     check_request(size, workers, max_damaged, store=store, quality=quality)
-    if not out.exists() or any(out.with_name(out.name + left).exists() for left in (".partial", ".lock")):
+    beside = [out.absolute().with_name(f"{out.absolute().name}{left}") for left in (".partial", ".lock")]
+    if not out.exists() or any(left.exists() for left in beside):
         with hold_lock(out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet):
             if not out.exists():
                 return _build(source, out, size, workers, max_damaged, quiet, store, quality)

@@ -47,11 +47,17 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
             # LEAK on a line of its own, else the table is too wide.
             table.add_row(source, *(cell_text(task, source, m).replace(" LEAK", "\nLEAK") for m in modalities))
         console.print(table)
-    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
+    console.print(f"95 % intervals: {covered(result['group_by'], _seeds_of(result['summary']))}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
     for leak in result.get("leaks", ()):
         console.print(f"LEAK: {leak}", markup=False, highlight=False)
+
+
+def _seeds_of(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """Source and seed of everything in ``summary``, as for ``covered``."""
+    cells = ((name, cell) for task in summary.values() for column in task.values() for name, cell in column.items())
+    return [{"source": name, "seed": seed} for name, cell in cells for seed in cell["seeds"]]
 
 
 def print_retrieval(result: dict[str, Any], console: Console) -> None:
