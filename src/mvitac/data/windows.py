@@ -31,8 +31,8 @@ def windowed(pack: Pack, window: Window) -> Pack:
         window: Number of frames, their distance, and what is done at the start of a touch.
 
     Raises:
-        ValueError: If the pack has no column that orders its frames, two frames of a touch have the same place, or no
-            touch is as long as a window.
+        ValueError: If the pack has no column that orders its frames, two frames of a touch have the same place, the
+            frames of a touch are farther apart than the stride, or no touch is as long as a window.
     """
     if not window.active:
         return pack
@@ -85,11 +85,16 @@ def _frames(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
         rows = rows[np.argsort(place[rows], kind="stable")]
         times = place[rows]
         if (same := np.diff(times) == 0).any():
-            touch = pack.column("touch_group" if "touch_group" in pack.table.column_names else "group")[rows[0]]
             at = times[int(np.flatnonzero(same)[0])]
             raise ValueError(
-                f"frames: two rows of touch {touch!r} have {name} {at:g}: name the column of the recording with"
-                " --touch-group when the data is packed, or another column with --data.order"
+                f"frames: two rows of touch {_touch(pack, rows)!r} have {name} {at:g}: name the column of the recording"
+                " with --touch-group when the data is packed, or another column with --data.order"
+            )
+        if window.frames > 1 and len(times) > 2 and (step := np.median(np.diff(times))) > 1.25 * window.stride:
+            raise ValueError(
+                f"frames: stride {window.stride:g} is shorter than the distance of frames in touch"
+                f" {_touch(pack, rows)!r}, {step:g} (column {name}), so a frame would be shown twice: give a stride of at"
+                " least the longest distance, or another column with --data.order"
             )
         asked = times[:, None] - back  # the newest frame that is old enough, else the first
         index[rows] = rows[np.maximum(np.searchsorted(times, asked + 1e-9, side="right") - 1, 0)]
@@ -100,6 +105,11 @@ def _frames(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
             " fewer frames or a smaller stride"
         )
     return index, whole
+
+
+def _touch(pack: Pack, rows: np.ndarray) -> str:
+    """The name of the touch that ``rows`` are of."""
+    return str(pack.column("touch_group" if "touch_group" in pack.table.column_names else "group")[rows[0]])
 
 
 def _places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
