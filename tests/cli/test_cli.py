@@ -150,7 +150,7 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert main(["probe", str(run), "--probes", "knn", "--json", str(scores)]) == 0
     shown = capsys.readouterr().out
     summary = json.loads(scores.read_text())["summary"]
-    assert set(summary) == {"category", "soft", "rough"}
+    assert set(summary) == {"category", "soft", "rough", "force"}
     mean = summary["category"]["touch"]["mvitac"]["mean"]
     assert f"{100 * mean:.1f} [" in shown
     assert "95 % intervals: over test instances only, for this one seed" in shown
