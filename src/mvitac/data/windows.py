@@ -41,7 +41,7 @@ def windowed(pack: Pack, window: Window) -> Pack:
     for modality in window.of:
         if modality not in pack.spec.modalities:
             raise unknown("modality of windows", modality, pack.spec.modalities)
-    index, whole = _frames(pack, window)
+    index, whole = frames_of(pack, window)
     made = copy.copy(pack)
     made.spec = replace(pack.spec, window=window)
     made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
@@ -75,9 +75,9 @@ class Windows(Lazy):
         return found.transpose(0, 2, 3, 1, 4).reshape(num, height, width, frames * channels)
 
 
-def _frames(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
+def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """Row numbers of each row's frames [N, F], newest first, and bool [N]: whether its touch is long enough for all."""
-    name, place = _places(pack, window)
+    name, place = places(pack, window)
     back = window.stride * np.arange(window.frames)
     index, whole = np.zeros((pack.num, window.frames), np.int64), np.zeros(pack.num, bool)
     for group in range(int(pack.touch_groups.max()) + 1):
@@ -112,7 +112,7 @@ def _touch(pack: Pack, rows: np.ndarray) -> str:
     return str(pack.column("touch_group" if "touch_group" in pack.table.column_names else "group")[rows[0]])
 
 
-def _places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
+def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     """Name and values [N] of the column that orders the frames."""
     name = window.order or next((column for column in ORDER if column in pack.table.column_names), None)
     if name is None:
@@ -135,7 +135,7 @@ def _places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
 
 def _first_rows(pack: Pack, window: Window) -> np.ndarray:
     """int64 [N]: the first row of each row's touch."""
-    _, place = _places(pack, window)
+    _, place = places(pack, window)
     order = np.lexsort((place, pack.touch_groups))
     _, start = np.unique(pack.touch_groups[order], return_index=True)
     return order[start][pack.touch_groups]
