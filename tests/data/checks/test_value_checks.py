@@ -59,6 +59,8 @@ class Recordings(Source):
             tilt = np.rad2deg(tilt) * 5
         if (fault == "outlier" and item == 100) or (fault == "spike" and k == 2 and i in (20, 21)):
             force = {"outlier": 60.0, "spike": 0.2}[fault]
+        if fault == "negative" and k == 1 and 10 <= i < 16:  # too slow for a glitch
+            force = -0.12 * min(i - 9, 16 - i)
         if fault == "stuck" and k == 4 and 10 <= i < 24:
             force = 2.0
         if fault == "outside" and k == 7:
@@ -100,6 +102,12 @@ def test_healthy_values_and_windows(healthy: Pack) -> None:
         ("degrees", "values of pose", "more likely degrees than rad", []),
         ("outlier", "values of force", "1 outliers, e.g. 60 in row 100", [100]),
         ("spike", "values of force", "2 frames jump away and back, first row 100 (0.2)", [100, 101]),
+        (
+            "negative",
+            "values of force",
+            "6 rows are below -0.12, down to -0.36, although 99 % are above; the first is row 50",
+            [50],
+        ),
         ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 170", [170]),
         ("outside", "values of force", "test rows are outside train (0.1", []),
     ],

@@ -103,14 +103,18 @@ def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
 
 
 def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
+    """Values far outside the usual range, and rare negative ones of a quantity that is positive otherwise."""
     low, high = np.percentile(known, [1, 99])
     far = np.maximum(known - high, low - known) > 1.5 * (high - low)
-    if high <= low or not far.any():
-        return "", []
-    text = (
-        f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} (most are {low:.4g} to {high:.4g})"
-    )
-    return text, rows[far].tolist()
+    negative = (known < -0.04 * high) & (low >= -0.04 * high)
+    notes = []
+    if high > low and far.any():
+        usual = f"(most are {low:.4g} to {high:.4g})"
+        notes.append(f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} {usual}")
+    if high > 0 and negative.any():
+        text = f"{int(negative.sum())} rows are below {-0.04 * high:.3g}, down to {known.min():.4g}, although 99 % are above"
+        notes.append(f"{text}; the first is row {rows[negative][0]}")
+    return "; ".join(notes), rows[(far & (high > low)) | (negative & (high > 0))].tolist()
 
 
 def _spikes(found: np.ndarray, recordings: list[np.ndarray]) -> Note:
