@@ -283,7 +283,7 @@ VALUES: list[tuple[str, str, list[str]]] = [
     ("no-such-column", PACKED + "--values farce:N", ["'farce'", "did you mean 'force'"]),
     ("class-and-value", PACKED + "--labels force --values force:N", ["task 'force' occurs twice", "its own name"]),
     ("two-units", PACKED + "--values force:N weight=force:mN", ["'force' has two units, N and mN", "one unit"]),
-    ("packed-window", PACKED + "--num-frames 3", ["every frame once", "no effect", "--data.num-frames"]),
+    ("packed-window", PACKED + "--num-frames 3", ["every frame once", "no effect", "--num-frames"]),
     ("packed-stride", "data simulate materials --stride 2 --out {out}", ["every frame once", "no effect"]),
     ("no-order", PRETRAIN + "--data.num-frames 2", ["none of the columns frame, seq, time", "--data.order"]),
     ("order-of-words", WINDOWS + "2 --data.order text", ["column 'text' is not a number in row 0", "another order"]),

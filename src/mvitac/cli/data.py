@@ -72,7 +72,7 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
     if data.frame_window() != Window():
         raise ValueError(
             "a pack stores every frame once, so options of windows (--num-frames, --stride, ...) have no effect here:"
-            " leave them out, and give --data.num-frames to the commands that read the pack"
+            " leave them out, and give them to the commands that read the pack"
         )
     pack = build(
         data.source(),

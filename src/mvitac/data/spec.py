@@ -77,7 +77,7 @@ class Window:
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= 64:
-            raise ValueError(f"frames {self.frames}: give 1 (single images) to 64")
+            raise ValueError(f"num_frames {self.frames}: give 1 (single images) to 64")
         if not 0 < self.stride < math.inf:
             raise ValueError(f"stride {self.stride}: give a positive number of frames, or of units of --data.order")
 
