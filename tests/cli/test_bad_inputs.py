@@ -268,6 +268,51 @@ def test_options(
     refused(command, *says)
 
 
+# -- values and windows -----------------------------------------------------------------------------------------------
+
+PACKED = "data pack --data folder --path {tmp}/presses.csv --touch-group press --group thing --out {out} "
+WINDOWS = PRETRAIN.replace("--data pack --data.path {pack}", "--data folder --data.path {tmp}/presses.csv") + (
+    "--data.touch-group press --data.group thing --data.size 16 --data.num-frames "
+)
+VALUES: list[tuple[str, str, list[str]]] = [
+    ("text", PACKED + "--values text:N", ["presses.csv row 1", "text is 'hard'", "finite number in N"]),
+    ("with-its-unit", PACKED + "--values united:N", ["row 1", "'3.2 mN'", "without the unit"]),
+    ("infinite", PACKED + "--values endless:N", ["row 3", "'inf'", "finite number"]),
+    ("constant", PACKED + "--values still:N", ["'still'", "fewer than two different values"]),
+    ("no-unit", PACKED + "--values force", ["values 'force'", "force_n:N"]),
+    ("no-such-column", PACKED + "--values farce:N", ["'farce'", "did you mean 'force'"]),
+    ("class-and-value", PACKED + "--labels force --values force:N", ["task 'force' occurs twice", "its own name"]),
+    ("two-units", PACKED + "--values force:N weight=force:mN", ["'force' has two units, N and mN", "one unit"]),
+    ("packed-window", PACKED + "--num-frames 3", ["every frame once", "no effect", "--num-frames"]),
+    ("packed-stride", "data simulate materials --stride 2 --out {out}", ["every frame once", "no effect"]),
+    ("no-order", PRETRAIN + "--data.num-frames 2", ["none of the columns frame, seq, time", "--data.order"]),
+    ("order-of-words", WINDOWS + "2 --data.order text", ["column 'text' is not a number in row 0", "another order"]),
+    ("too-long", WINDOWS + "9 --data.order seq", ["frames 9 at stride 1", "longer than every touch", "fewer frames"]),
+    ("two-rates", WINDOWS + "2 --data.order time", ["stride 1 is shorter", "'slow', 4", "longest distance"]),
+    ("same-moment", WINDOWS + "2 --data.order still", ["two rows of touch", "have still 1", "--touch-group"]),
+    ("endless-stride", WINDOWS + "2 --data.stride inf", ["stride inf", "positive number"]),
+]
+
+
+def presses(folder: Path) -> None:
+    """Five recordings of eight frames, one of them at a quarter of the others' rate, with good and bad columns."""
+    lines = ["touch,press,thing,seq,time,force,text,united,endless,still"]
+    for i in range(40):
+        Image.new("RGB", (16, 16), (6 * i, 0, 0)).save(folder / f"{i}.png")
+        press, seq = divmod(i, 8)
+        bad = f"{'hard' if i == 0 else i},{'3.2 mN' if i == 0 else i},{'inf' if i == 2 else i},1"
+        slow = press == 4
+        lines.append(f"{i}.png,{'slow' if slow else press},o{press},{seq},{seq * (4 if slow else 1)},{i % 4},{bad}")
+    (folder / "presses.csv").write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize(("command", "says"), cases(VALUES))
+def test_values_and_windows(refused: Callable[..., str], tmp_path: Path, command: str, says: list[str]) -> None:
+    presses(tmp_path)
+    windows = command.startswith(WINDOWS)  # they are found in the pack of single frames, which stays in the cache
+    refused(command, *says, left=("cache",) if windows else (), work=windows)
+
+
 # Every number of every config, found by reflection: a new field that checks nothing fails here until it does.
 
 HARMLESS_IF_HUGE = {"log_every", "eval_every", "checkpoint_every", "touches"}  # they only mean "never" or "always"

@@ -183,11 +183,15 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
         cell = summary["category"][modality]["mvitac"]
         assert set(cell) == {"mean", "low", "high", "seeds", "groups"} and cell["seeds"] == [0, 1]
         assert cell["low"] <= cell["mean"] <= cell["high"]
+    force = summary["force"]  # a value, next to the classes
+    assert set(force) == {"none", "touch", "vision", "both"} and set(force["none"]) == {"mean"}
+    assert force["touch"]["pixels"]["mean"] > 0.3  # R2: a harder press is a larger imprint
     trained = json.loads((tmp_path / "demo" / "seed0" / "run.json").read_text())["run"]
     assert trained["recipe"] == "quick" and trained["method"]["keys"] == "end-to-end"
     shown = capsys.readouterr().out
     assert "recipe quick: " in shown and "2 steps of 16 pairs" in shown
-    assert "report.html" in shown and "majority" in shown
+    assert "report.html" in shown and "majority" in shown and "materials: force" in shown
+    assert (tmp_path / "demo" / "report" / "figures" / "probe-force.png").exists()
     assert "pre-training: 4/4 steps in" in shown  # of both seeds; no terminal: a line instead of bars
     weights = tmp_path / "demo" / "seed1" / "model.safetensors"
     before = weights.stat().st_mtime_ns

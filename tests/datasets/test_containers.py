@@ -19,6 +19,7 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
+from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.hub import HubConfig
 from mvitac.datasets.lerobot import writer
 from mvitac.datasets.lerobot.reader import LeRobotConfig, choose
@@ -85,7 +86,7 @@ def make_lerobot(root: Path, *, gel_rate: int = 10, version: str = "v3.0") -> Pa
         for i in range(length):
             row = {"frame_index": i, "episode_index": e, "index": len(rows), "task_index": e % 2, "kind": e % 2}
             image = {"bytes": png(10 * e + i), "path": None}
-            rows.append({FRONT: image, "timestamp": i / 10, "observation.state": [1.0, 2.0], **row})
+            rows.append({FRONT: image, "timestamp": i / 10, "observation.state": [len(rows) / 4, 2.0], **row})
     for file, part in enumerate((rows[:12], rows[12:])):
         path = root / f"data/chunk-000/file-{file:03d}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -249,6 +250,75 @@ def test_export_leaves_gaps_out_and_never_overwrites(tmp_path: Path) -> None:
         write_lerobot(pack, tmp_path / "other", fps=0)
 
 
+# -- values -----------------------------------------------------------------------------------------------------------
+
+
+def measured(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
+    """The targets of the only task with values, [N, T], and the rows' images in the order they were made [N]."""
+    (task,) = pack.spec.values
+    return pack.values(task), np.array([level(image) for image in pack.images["vision"]])
+
+
+def test_lerobot_reads_values_and_elements_of_vectors(tmp_path: Path) -> None:
+    root = make_lerobot(tmp_path / "set")
+    plain = LeRobotConfig(path=root, size=16).source()
+    config = LeRobotConfig(path=root, size=16, values=("pose=observation.state[0]:mm,timestamp:s",))
+    pack = packed(config, tmp_path / "pack")
+    assert [(t.name, t.unit) for t in pack.spec.values[0].targets] == [
+        ("observation.state[0]", "mm"),
+        ("timestamp", "s"),
+    ]
+    at = np.array([e * 100 + i for e, length in enumerate(LENGTHS) for i in range(length)])
+    assert (pack.column("episode").astype(int) * 100 + pack.column("frame").astype(int) == at).all()
+    values, _ = measured(pack)
+    assert np.allclose(values, np.stack([np.arange(30) / 4, at % 100 / 10], axis=1))
+    assert "observation.state" not in str(plain.read(0))  # without such values, nothing changes
+    with pytest.raises(ValueError, match=r"state\[2\] does not exist: observation.state has 2 numbers, .*state\[1\]"):
+        LeRobotConfig(path=root, size=16, values=("observation.state[2]:mm",)).source()
+
+
+def test_webdataset_hub_and_manifests_read_values(tmp_path: Path) -> None:
+    tars = make_tars(tmp_path / "tars")
+    config = WebDatasetConfig(path=tars, size=16, allow_missing=True, values=("pose=pose[1]:mm,force:N",))
+    values, shown = measured(packed(config, tmp_path / "w"))
+    assert np.allclose(values, np.stack([shown / 4, shown / 2], axis=1))
+    hub = HubConfig(path=make_hub(tmp_path / "hub"), size=16, vision="photo", values=("both=depth:mm,pose[2]:deg",))
+    values, shown = measured(packed(hub, tmp_path / "h"))
+    number = np.where(shown == 104, np.nan, shown - 100)
+    assert np.array_equal(values, np.stack([number / 8, number / 4], axis=1), equal_nan=True)
+    with pytest.raises(ValueError, match="'pose\\[1\\]' has fewer than two different values"):
+        HubConfig(path=tmp_path / "hub", size=16, vision="photo", values=("pose[1]:mm",)).source()
+
+    rows = [{"vision": f"{i}.png", "pose": [i / 2, None, -i / 4]} for i in range(12)]
+    for i in range(12):
+        (tmp_path / f"{i}.png").write_bytes(png(i))
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "m.parquet")
+    (tmp_path / "m.jsonl").write_text("\n".join(json.dumps(row) for row in rows))
+    lines = [f'{row["vision"]},"{json.dumps(row["pose"])}"' for row in rows]
+    (tmp_path / "m.csv").write_text("\n".join(["vision,pose", *lines]).replace("null", "NaN"))
+    for kind in ("parquet", "jsonl", "csv"):
+        config = FolderConfig(path=tmp_path / f"m.{kind}", size=16, values=("p=pose[0]:mm,pose[2]:mm",))
+        values, shown = measured(packed(config, tmp_path / kind))
+        assert np.array_equal(values, np.stack([shown / 2, -shown / 4], axis=1)), kind
+
+
+def test_values_and_their_units_leave_as_lerobot_and_come_back(tmp_path: Path) -> None:
+    pack = build(Toy(values=True), tmp_path / "pack", size=32, workers=1, quiet=True)
+    write_lerobot(pack, tmp_path / "set")
+    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    assert features["weight"] == {"dtype": "float64", "shape": [1], "names": ["weight (N)"]}
+    assert features["noise"]["names"] is None
+    weight = pack.column("weight")
+    stats = json.loads((tmp_path / "set/meta/stats.json").read_text(), parse_constant=pytest.fail)  # no NaN
+    assert stats["weight"]["mean"] == [pytest.approx(np.nanmean(weight))]
+    assert stats["weight"]["count"] == [np.isfinite(weight).sum()]
+    config = LeRobotConfig(path=tmp_path / "set", size=32, group="group", values=("weight:N", "level:levels"))
+    back = packed(config, tmp_path / "back")
+    at = np.argsort(pack.touch_groups, kind="stable")[back.column("id").astype(int)]
+    for task in back.spec.values:
+        assert np.array_equal(back.values(task)[:, 0], pack.column(task.name)[at], equal_nan=True)
+
+
 # -- WebDataset -------------------------------------------------------------------------------------------------------
 
 
@@ -263,7 +333,12 @@ def make_tars(root: Path, mode: str = "w") -> Path:
     for shard in (0, 1):
         with tarfile.open(root / f"shard-{shard}.tar", mode) as tar:  # type: ignore[call-overload]
             for i in range(12 * shard, 12 * shard + 12):
-                known = {"material": ("wood", "metal")[i // 2 % 2], "object": i // 2, "force": i / 2, "pose": [1, 2]}
+                known = {
+                    "material": ("wood", "metal")[i // 2 % 2],
+                    "object": i // 2,
+                    "force": i / 2,
+                    "pose": [1, i / 4],
+                }
                 add(tar, f"set/{i:04d}.vision.png", png(i))
                 add(tar, f"set/{i:04d}.json", json.dumps(known).encode())
                 if i != 5:
@@ -335,6 +410,7 @@ def make_hub(root: Path) -> Path:
                 image["bytes"] = None
             rows.append(
                 {"touch": image, "photo": png(100 + i), "kind": -1 if i == 4 else i // 2 % 2, "thing": f"t{i // 2}"}
+                | {"depth": None if i == 4 else i / 8, "pose": None if i == 4 else [1.0, float("nan"), i / 4]}
             )
         table = pa.Table.from_pylist(rows)
         pq.write_table(table.replace_schema_metadata(note), root / f"{name}.parquet", row_group_size=4)

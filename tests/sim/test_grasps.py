@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+from mvitac.datasets.simulated import GraspsConfig
 from mvitac.sim import gel, grasps, objects, physics, skin
 
 SIZE = 40
@@ -150,6 +151,21 @@ def test_a_harder_grip_prints_a_wider_patch():
                 imprint = grasps._imprint(bench, smooth, moment.data, 0, moment.left.normal_n, 64)
                 patch.append(np.mean(imprint > 0.03))
     assert patch[0] < patch[1] < patch[2]
+
+
+def test_measured_contacts_are_of_each_gel_and_change_no_picture():
+    plain, measured = GraspsConfig(num=2, size=32), GraspsConfig(num=2, size=32, contact=True)
+    assert "contact" not in plain.source().fingerprint()
+    rows = {sample.columns["phase"]: sample for sample in measured.source().read(0)}
+    during = rows["during"].columns
+    targets = [target for task in measured.source().spec().values for target in task.targets]
+    assert all(np.isfinite(during[target.name]) for target in targets)
+    assert {target.unit for target in targets} == {"N", "mm", "mm2"} and len(targets) == 14
+    for side in ("left", "right"):
+        assert 0 < during[f"depth_{side}_mm"] < 3 and 0 < during[f"patch_{side}_mm2"] < grasps.FIELD_MM**2
+        assert rows["before"].columns[f"patch_{side}_mm2"] == 0
+    for one, other in zip(plain.source().read(0), measured.source().read(0), strict=True):
+        assert np.array_equal(one.touch, other.touch) and np.array_equal(one.vision, other.vision)
 
 
 def test_outcomes_are_mixed_and_the_solver_is_stable():

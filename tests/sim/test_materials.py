@@ -14,6 +14,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.registry import from_json, to_json
 from mvitac.sim import gel
+from mvitac.sim.contact import contact
 from mvitac.sim.gel import GEL_STIFFNESS, area_resize, background, press, pressure, relax, render
 from mvitac.sim.materials import CLASSES, draw_instance, touch
 from mvitac.sim.relief import KINDS, Relief, draw_tables, noise
@@ -155,6 +156,33 @@ def test_a_dome_on_a_rigid_plane_is_the_closed_form():
     p = pressure(plane, force_n=force, stiffness=1e9, pixel_mm=0.1, dome_radius_mm=radius)
     depth = np.sqrt(force / (np.pi * GEL_STIFFNESS * radius))
     assert p.max() / GEL_STIFFNESS == pytest.approx(depth, rel=0.01)
+
+
+def test_contact_is_that_of_the_closed_form():
+    """A paraboloid in Winkler springs: depth d, area 2 pi R d; a tilt of a moves the centre by R a."""
+    x = (np.arange(301) - 150) * 0.1
+    known = {"force_n": 1.5, "stiffness": 1e9, "pixel_mm": 0.1, "dome_radius_mm": 20.0}
+    depth = np.sqrt(1.5 / (np.pi * GEL_STIFFNESS * 20.0))
+    flat = contact(np.zeros((301, 301), np.float32), **known)
+    assert flat["depth_mm"] == pytest.approx(depth, rel=0.01)
+    assert flat["patch_mm2"] == pytest.approx(2 * np.pi * 20.0 * depth, rel=0.02)
+    assert (flat["contact_x_mm"], flat["contact_y_mm"]) == pytest.approx((0, 0), abs=1e-6)
+    tilted = contact(np.tile(0.1 * x, (301, 1)).astype(np.float32), **known)
+    assert (tilted["contact_x_mm"], tilted["contact_y_mm"]) == pytest.approx((2.0, 0), abs=0.02)
+    lifted = contact(np.zeros((301, 301), np.float32), **{**known, "force_n": 0.0})
+    assert lifted["depth_mm"] == lifted["patch_mm2"] == 0 and np.isnan(lifted["contact_x_mm"])
+
+
+def test_measuring_the_contact_changes_no_picture_and_no_digest():
+    plain, measured = MaterialsConfig(num=40, size=32), MaterialsConfig(num=40, size=32, contact=True)
+    assert "contact" not in plain.source().fingerprint() and "contact" not in to_json(plain)
+    assert measured.source().fingerprint() != plain.source().fingerprint()
+    ((one,), (other,)) = (config.source().read(7) for config in (plain, measured))
+    assert np.array_equal(one.touch, other.touch) and np.array_equal(one.vision, other.vision)
+    new = {target.name: target.unit for task in measured.source().spec().values[1:] for target in task.targets}
+    assert new == {"depth_mm": "mm", "contact_x_mm": "mm", "contact_y_mm": "mm", "patch_mm2": "mm2"}
+    assert other.columns.keys() - one.columns.keys() == set(new)
+    assert {**other.columns, **one.columns} == other.columns
 
 
 def test_softer_is_wider_and_shallower():

@@ -15,7 +15,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.sharding import write_shards
-from mvitac.data.spec import Task
+from mvitac.data.spec import Task, Window
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.lerobot.writer import write_lerobot
 from mvitac.datasets.simulated import SimulatedConfig
@@ -69,6 +69,11 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
     options = parse(_BuildOptions, argv, prog, default=usual, description=type(config).__doc__ or "")
     check_place(options.out)
     data: Any = options.data
+    if data.frame_window() != Window():
+        raise ValueError(
+            "a pack stores every frame once, so options of windows (--num-frames, --stride, ...) have no effect here:"
+            " leave them out, and give them to the commands that read the pack"
+        )
     pack = build(
         data.source(),
         options.out,

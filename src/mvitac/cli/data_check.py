@@ -15,13 +15,15 @@ from mvitac.cli.options import check_json, console, parse, save_json, selectors,
 from mvitac.data.checks.examine import examine_pack, examine_source
 from mvitac.data.checks.finding import exit_code
 from mvitac.data.image_grid import Block, draw
+from mvitac.data.spec import Window
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
 from mvitac.system.files import check_place, write_atomic
 
 _COLOURS = {"ok": "green", "look": "yellow", "broken": "bold red", "not checkable": "dim"}
-_MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step.
+_MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step;
+    values with glitches or outside train.
 
     Exit code: 0 all is well, 1 a person should look, 2 something is broken (or the command could not be run).
     Heuristics only report "look", with their figures; "broken" is a fact. Nothing is changed.
@@ -40,6 +42,12 @@ class _Options:
 class _PackOptions(_Options):
     pack: Positional[Path]
     """Folder of the pack; for a source that is not packed yet: mvitac data check --data NAME ..."""
+    num_frames: int = 1
+    """Also check that the pack has windows of so many frames: their rate, gaps and length."""
+    stride: float = 1.0
+    """Distance of these frames, in units of --order."""
+    order: str | None = None
+    """Column that orders the frames of a touch; default: frame, seq or time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +67,8 @@ def check(argv: list[str]) -> int:
     if "--data" not in chosen:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         _check_places(options)
-        return _report(str(options.pack), *examine_pack(options.pack), options)
+        window = Window(frames=options.num_frames, stride=options.stride, order=options.order)
+        return _report(str(options.pack), *examine_pack(options.pack, window), options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
     rest = short(rest)
@@ -73,7 +82,12 @@ def check(argv: list[str]) -> int:
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     findings, blocks = examine_source(
-        source, num=options.items, size=options.thumbnail, workers=data.workers, quiet=options.quiet
+        source,
+        num=options.items,
+        size=options.thumbnail,
+        workers=data.workers,
+        quiet=options.quiet,
+        window=data.frame_window(),
     )
     return _report(name, findings, blocks, options)
 

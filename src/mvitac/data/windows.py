@@ -31,8 +31,8 @@ def windowed(pack: Pack, window: Window) -> Pack:
         window: Number of frames, their distance, and what is done at the start of a touch.
 
     Raises:
-        ValueError: If the pack has no column that orders its frames, two frames of a touch have the same place, or no
-            touch is as long as a window.
+        ValueError: If the pack has no column that orders its frames, two frames of a touch have the same place, the
+            frames of a touch are farther apart than the stride, or no touch is as long as a window.
     """
     if not window.active:
         return pack
@@ -41,7 +41,7 @@ def windowed(pack: Pack, window: Window) -> Pack:
     for modality in window.of:
         if modality not in pack.spec.modalities:
             raise unknown("modality of windows", modality, pack.spec.modalities)
-    index, whole = _frames(pack, window)
+    index, whole = frames_of(pack, window)
     made = copy.copy(pack)
     made.spec = replace(pack.spec, window=window)
     made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
@@ -75,9 +75,9 @@ class Windows(Lazy):
         return found.transpose(0, 2, 3, 1, 4).reshape(num, height, width, frames * channels)
 
 
-def _frames(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
+def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """Row numbers of each row's frames [N, F], newest first, and bool [N]: whether its touch is long enough for all."""
-    name, place = _places(pack, window)
+    name, place = places(pack, window)
     back = window.stride * np.arange(window.frames)
     index, whole = np.zeros((pack.num, window.frames), np.int64), np.zeros(pack.num, bool)
     for group in range(int(pack.touch_groups.max()) + 1):
@@ -85,11 +85,16 @@ def _frames(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
         rows = rows[np.argsort(place[rows], kind="stable")]
         times = place[rows]
         if (same := np.diff(times) == 0).any():
-            touch = pack.column("touch_group" if "touch_group" in pack.table.column_names else "group")[rows[0]]
             at = times[int(np.flatnonzero(same)[0])]
             raise ValueError(
-                f"frames: two rows of touch {touch!r} have {name} {at:g}: name the column of the recording with"
-                " --touch-group when the data is packed, or another column with --data.order"
+                f"frames: two rows of touch {_touch(pack, rows)!r} have {name} {at:g}: name the column of the recording"
+                " with --touch-group when the data is packed, or another column with --data.order"
+            )
+        if window.frames > 1 and len(times) > 2 and (step := np.median(np.diff(times))) > 1.25 * window.stride:
+            raise ValueError(
+                f"frames: stride {window.stride:g} is shorter than the distance of frames in touch"
+                f" {_touch(pack, rows)!r}, {step:g} (column {name}), so a frame would be shown twice: give a stride of at"
+                " least the longest distance, or another column with --data.order"
             )
         asked = times[:, None] - back  # the newest frame that is old enough, else the first
         index[rows] = rows[np.maximum(np.searchsorted(times, asked + 1e-9, side="right") - 1, 0)]
@@ -102,7 +107,12 @@ def _frames(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
     return index, whole
 
 
-def _places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
+def _touch(pack: Pack, rows: np.ndarray) -> str:
+    """The name of the touch that ``rows`` are of."""
+    return str(pack.column("touch_group" if "touch_group" in pack.table.column_names else "group")[rows[0]])
+
+
+def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
     """Name and values [N] of the column that orders the frames."""
     name = window.order or next((column for column in ORDER if column in pack.table.column_names), None)
     if name is None:
@@ -125,7 +135,7 @@ def _places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
 
 def _first_rows(pack: Pack, window: Window) -> np.ndarray:
     """int64 [N]: the first row of each row's touch."""
-    _, place = _places(pack, window)
+    _, place = places(pack, window)
     order = np.lexsort((place, pack.touch_groups))
     _, start = np.unique(pack.touch_groups[order], return_index=True)
     return order[start][pack.touch_groups]

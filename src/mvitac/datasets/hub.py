@@ -7,6 +7,7 @@ Class numbers are replaced by the class names in the file's metadata (ClassLabel
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -40,7 +41,7 @@ class HubConfig(RowsConfig):
         sides = [SPLITS.get(file.stem.split("-")[0]) for file in files]
         for file, side in zip(files, sides, strict=True):
             before = len(rows)
-            images = _read(file, rows, found)
+            images = _read(file, rows, found, self.vectors())
             if not images:
                 raise ValueError(f"{file} has no image column (struct<bytes, path> or binary): is it the right file?")
             if all(sides):
@@ -59,14 +60,19 @@ class HubConfig(RowsConfig):
         return Manifest(self.path, self.path, names, rows, digest([rows, sorted(found)]), found)
 
 
-def _read(file: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]]) -> list[str]:
-    """Add the rows of ``file`` and the references of its images; return the names of its image columns."""
+def _read(
+    file: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]], vectors: Collection[str]
+) -> list[str]:
+    """Add the rows of ``file`` and the references of its images; return the names of its image columns.
+
+    Nested columns are left out, except those in ``vectors``.
+    """
     try:
         opened = pq.ParquetFile(file)
         images = [field.name for field in opened.schema_arrow if _is_image(field.type)]
         classes = _classes(opened.schema_arrow)
-        texts = [field.name for field in opened.schema_arrow if not pa.types.is_nested(field.type)]
-        texts = [name for name in texts if name not in images]
+        flat = [f.name for f in opened.schema_arrow if not pa.types.is_nested(f.type) or f.name in vectors]
+        texts = [name for name in flat if name not in images]
         for group in range(opened.num_row_groups):
             num = opened.metadata.row_group(group).num_rows
             table = opened.read_row_group(group, columns=texts).to_pylist() if texts else [{}] * num

@@ -5,6 +5,7 @@ They are the default data: every experiment runs without a download. Results are
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar
 
@@ -15,10 +16,18 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import LATER_IN_DIGEST
+from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.sim import grasps, materials
 
 LICENCE = "Apache-2.0 (made by this package)"
+CONTACT = {"depth": ["depth_mm"], "position": ["contact_x_mm", "contact_y_mm"], "patch": ["patch_mm2"]}
+"""Tasks of option ``contact`` and their columns."""
+
+
+def _targets(columns: Sequence[str]) -> tuple[Target, ...]:
+    """Return the targets of columns that end in their unit."""
+    units = {"n": "N", "mm": "mm", "mm2": "mm2"}
+    return tuple(Target(name=column, unit=units[column.rpartition("_")[2]]) for column in columns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +44,8 @@ class SimulatedConfig(DatasetConfig):
     """Side of the rendered and stored images in pixels."""
     held_out_sensor: bool = False
     """Use the sensor that is otherwise never used, to test transfer to a new sensor."""
+    contact: bool = field(default=False, metadata=LATER)
+    """Also measure depth, position and size of the contact, as tasks with values (grasps: and the shear force)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -45,6 +56,8 @@ class SimulatedConfig(DatasetConfig):
 
     def _fingerprint(self, version: int) -> dict[str, Any]:
         own = {key: value for key, value in asdict(self).items() if key == "size" or key not in KEEPING}
+        if not self.contact:  # omitted, to keep old digests valid
+            del own["contact"]
         return {"simulator": self.name, "version": version, **own}
 
 
@@ -89,7 +102,10 @@ class Materials(Source):
                 Task(name="soft", classes=("hard", "soft")),
                 Task(name="rough", classes=("smooth", "rough")),
             ),
-            values=(ValueTask(name="force", targets=(Target(name="force_n", unit="N"),)),),
+            values=(
+                ValueTask(name="force", targets=(Target(name="force_n", unit="N"),)),
+                *([ValueTask(name=task, targets=_targets(CONTACT[task])) for task in CONTACT] * self.config.contact),
+            ),
             group_by="instance",
             licence=LICENCE,
             source=f"mvitac.sim.materials version {materials.VERSION}",
@@ -124,6 +140,7 @@ class Materials(Source):
             held_out_sensor=self.config.held_out_sensor,
             background=self.config.difference,
             moment=moment,
+            measured=self.config.contact,
         )
         labels = {f"label_{task}": int(made.pop(task)) for task in ("category", "soft", "rough")}
         vision, pressed = made.pop("vision"), made.pop("touch")
@@ -160,18 +177,22 @@ class Grasps(Source):
         self.config = config
 
     def spec(self) -> DataSpec:
+        known = {"normal force": ["normal_n"]}
+        if self.config.contact:
+            known |= {**CONTACT, "shear force": ["shear_x_n", "shear_y_n"]}
         return DataSpec(
             name="grasps",
             vision_channels=3,
             touch_channels=6,
             # 'after' shows the outcome, so only 'during' (fingers closed, before the lift) has the label.
             tasks=(Task(name="success", classes=("failure", "success"), only={"phase": "during"}),),
-            values=(
+            values=tuple(
                 ValueTask(
-                    name="normal force",
-                    targets=tuple(Target(name=f"normal_{side}_n", unit="N") for side in ("left", "right")),
+                    name=task,
+                    targets=_targets([grasps.side_name(name, side) for name in names for side in ("left", "right")]),
                     only={"phase": "during"},
-                ),
+                )
+                for task, names in known.items()
             ),
             group_by="object",
             controls={"contact only": ("contact_left", "contact_right")},
@@ -194,7 +215,12 @@ class Grasps(Source):
         split = "test" if place < 26 else "val" if place < 42 else "train"
         samples = []
         for made in grasps.grasp(
-            self.config.seed, obj, index, size=self.config.size, held_out_sensor=self.config.held_out_sensor
+            self.config.seed,
+            obj,
+            index,
+            size=self.config.size,
+            held_out_sensor=self.config.held_out_sensor,
+            measured=self.config.contact,
         ):
             vision = made.pop("vision")
             both = np.concatenate([made.pop("touch_left"), made.pop("touch_right")], axis=2)

@@ -11,6 +11,7 @@ Images are read from inside the tar. A .json gives a column per scalar, .cls and
 from __future__ import annotations
 
 import tarfile
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -71,14 +72,18 @@ class WebDatasetConfig(RowsConfig):
                     elif last in ("json", "cls", "txt"):
                         file = tar.extractfile(member)
                         text = file.read().decode() if file else ""
-                        row.update(_known(text) if last == "json" else {last: text.strip()})
+                        row.update(_known(text, self.vectors()) if last == "json" else {last: text.strip()})
         except (tarfile.TarError, OSError, ValueError) as error:
             raise ValueError(f"{shard} cannot be read as an uncompressed tar ({brief(error)})") from None
 
 
-def _known(text: str) -> dict[str, str]:
-    """Return the scalars of a JSON object as text."""
+def _known(text: str, vectors: Collection[str]) -> dict[str, str]:
+    """Return the scalars of a JSON object, and its lists ``vectors``, as text."""
     value = parse_json(text)
     if not isinstance(value, dict):
         return {}
-    return {name: text_of(v) for name, v in value.items() if isinstance(v, (str, int, float, bool)) or v is None}
+    return {
+        name: text_of(v)
+        for name, v in value.items()
+        if isinstance(v, (str, int, float, bool)) or v is None or name in vectors
+    }

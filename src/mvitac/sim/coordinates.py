@@ -25,6 +25,25 @@ def turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
     return cos * x + sin * y + np.float32(place[0]), cos * y - sin * x + np.float32(place[1])
 
 
+def outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -> F:
+    """Return the approximate distance in mm [n, n] inside an outline (< 0 outside): corners for curl 0, lobes for curl 1."""
+    cx, cy = rng.normal(0, 0.22 * radius, 2)
+    x, y = x - np.float32(cx), y - np.float32(cy)
+    sides, turn = int(rng.integers(3, 6)), rng.uniform(0, 2 * np.pi)
+    phases, heights = rng.uniform(0, 2 * np.pi, 3), rng.normal(0, 1, 3)
+    inside = np.full(x.shape, np.float32(4 * radius))
+    for k in range(sides):
+        a = turn + 2 * np.pi * (k + rng.uniform(-0.18, 0.18)) / sides
+        inside = np.minimum(inside, np.float32(radius * 0.82) - np.float32(np.cos(a)) * x - np.float32(np.sin(a)) * y)
+    if curl > 0:
+        theta = np.arctan2(y, x)
+        waves = ((k + 2, h, p) for k, (h, p) in enumerate(zip(heights, phases, strict=True)))
+        lobes = sum(h / (k - 0.5) * np.cos(k * theta + p) for k, h, p in waves)
+        round_ = np.float32(radius) * (1 + np.float32(0.3) * lobes) - np.hypot(x, y)
+        inside = np.float32(1 - curl) * inside + np.float32(curl) * round_
+    return inside.astype(np.float32)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """What changes from moment 0 of a press to a later one: camera and hand move a little, and the hand presses harder.

@@ -29,6 +29,7 @@ import mujoco
 import numpy as np
 
 from mvitac.sim import camera, gel, objects, physics, skin
+from mvitac.sim.contact import contact
 from mvitac.sim.objects import object_name
 from mvitac.sim.physics import PHASES
 
@@ -89,6 +90,7 @@ def grasp(
     size: int,
     held_out_sensor: bool = False,
     phases: tuple[str, ...] = PHASES,
+    measured: bool = False,
 ) -> list[dict[str, Any]]:
     """Simulate one grasp.
 
@@ -99,6 +101,8 @@ def grasp(
         size: Side of the pictures in pixels.
         held_out_sensor: Use the sensor that is not used otherwise.
         phases: Phases to render; fewer are faster.
+        measured: Also return what physics knows of the contact of each gel: ``contact.KNOWN`` and the shear force in N,
+            right and down in the gel's picture, with names such as ``depth_left_mm`` and ``shear_x_right_n``.
 
     Returns:
         A dict per phase with ``vision``, ``touch_left``, ``touch_right`` (uint8 [size, size, 3]), ``phase``, ``success``
@@ -126,6 +130,7 @@ def grasp(
         size=size,
         held_out_sensor=held_out_sensor,
         phases=phases,
+        measured=measured,
     )
 
 
@@ -143,6 +148,7 @@ def _record(
     size: int,
     held_out_sensor: bool,
     phases: tuple[str, ...],
+    measured: bool = False,
 ) -> list[dict[str, Any]]:
     """Simulate a plan and render it; ``key`` is (seed, object, grasp), which determines view and sensor."""
     thing = bench.thing
@@ -162,6 +168,8 @@ def _record(
             row[f"touch_{name}"] = gels.render(side, imprint, touch, touch_rng, size)
             row[f"contact_{name}"] = float(imprint.mean())
             row[f"normal_{name}_n"] = touch.normal_n
+            if measured:
+                row |= _measured(bench, patch, moment.data, side, touch, size)
         row["vision"] = camera.photograph(bench.model, moment.data, thing, view, view_rng, size=size)
         rows.append(row)
     assert moment is not None, "there are three phases"
@@ -222,8 +230,15 @@ def _imprint(
 ) -> np.ndarray:
     """Return the imprint [grid, grid] in mm of the object in one gel, seen from behind the gel; row 0 is up."""
     grid = max(GRID, size)
-    if normal_n <= 0:
+    relief = _relief(bench, patch, data, side, grid) if normal_n > 0 else None
+    if relief is None:
         return np.zeros((grid, grid), np.float32)
+    imprint = gel.press(relief, force_n=normal_n, **_physics(bench, grid))
+    return np.minimum(imprint, np.float32(2.5))  # thickness of the gel; only corners at the rim come near it
+
+
+def _relief(bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, grid: int) -> np.ndarray | None:
+    """Return the height [grid, grid] in mm of the object in front of one gel; None if there is nothing."""
     sign = 1.0 if side == 0 else -1.0  # the left gel looks along +x, the right one along -x
     apex = data.geom_xpos[bench.pads[side]] + [sign * objects.PAD_DEPTH_M, 0, 0]
     axis = ((np.arange(grid) + 0.5) / grid - 0.5) * FIELD_MM / 1000
@@ -238,13 +253,31 @@ def _imprint(
     hit = geom >= 0
     relief = np.full(grid * grid, -np.inf, np.float32)
     relief[hit] = 1000 * (BEHIND_M - distance[hit]) + patch.relief_mm(1000 * local[hit])
-    if not hit.any():
-        return np.zeros((grid, grid), np.float32)
-    imprint = gel.press(
-        relief.reshape(grid, grid),
-        force_n=normal_n,
-        stiffness=bench.thing.stiffness,
-        pixel_mm=FIELD_MM / grid,
-        dome_radius_mm=objects.DOME_RADIUS_MM,
-    )
-    return np.minimum(imprint, np.float32(2.5))  # thickness of the gel; only corners at the rim come near it
+    return relief.reshape(grid, grid) if hit.any() else None
+
+
+def _physics(bench: physics.Bench, grid: int) -> dict[str, float]:
+    return {
+        "stiffness": bench.thing.stiffness,
+        "pixel_mm": FIELD_MM / grid,
+        "dome_radius_mm": objects.DOME_RADIUS_MM,
+    }
+
+
+def _measured(
+    bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, touch: physics.Touch, size: int
+) -> dict[str, float]:
+    """Return what physics knows of the contact of one gel, named after its side: depth_left_mm, shear_x_left_n, ..."""
+    grid = max(GRID, size)
+    relief = _relief(bench, patch, data, side, grid) if touch.normal_n > 0 else None
+    force = touch.normal_n if relief is not None else 0.0
+    relief = np.zeros((grid, grid), np.float32) if relief is None else relief
+    found = contact(relief, force_n=force, **_physics(bench, grid))
+    found |= {"shear_x_n": touch.shear_n[0], "shear_y_n": touch.shear_n[1]}
+    return {side_name(name, ("left", "right")[side]): value for name, value in found.items()}
+
+
+def side_name(name: str, side: str) -> str:
+    """Return the column of one gel: depth_mm of left is depth_left_mm."""
+    start, _, unit = name.rpartition("_")
+    return f"{start}_{side}_{unit}"

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mvitac.sim.coordinates import Motion, grid, turn
+from mvitac.sim.contact import contact
+from mvitac.sim.coordinates import Motion, grid, outline, turn
 from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS
@@ -161,6 +162,7 @@ def touch(
     held_out_sensor: bool = False,
     background: bool = False,
     moment: int = 0,
+    measured: bool = False,
 ) -> dict[str, Any]:
     """Simulate one pair.
 
@@ -170,6 +172,7 @@ def touch(
         held_out_sensor: Use the sensor that is not used otherwise; everything else is the same.
         background: Also return "background", the same copy of the sensor before contact.
         moment: 0, or the number of a later moment of the same press (`motion.Motion`).
+        measured: Also return depth, position and size of the contact (`contact.KNOWN`).
 
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
@@ -181,7 +184,9 @@ def touch(
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
     motion = Motion.draw(_TAG, seed, category, instance, touch, moment) if moment else None
     vision = _look(thing, eye, angle + eye.normal(0, 0.1), place, size, motion)
-    pressed = _feel(thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor, background, motion)
+    pressed = _feel(
+        thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor, background, motion, measured
+    )
     return {
         "vision": vision,
         "category": category,
@@ -209,25 +214,6 @@ def _check_request(seed: int, category: int, instance: int, touch: int, size: in
         raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
 
 
-def _outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) -> F:
-    """Return the approximate distance in mm [n, n] inside an outline (< 0 outside): corners for curl 0, lobes for curl 1."""
-    cx, cy = rng.normal(0, 0.22 * radius, 2)
-    x, y = x - np.float32(cx), y - np.float32(cy)
-    sides, turn = int(rng.integers(3, 6)), rng.uniform(0, 2 * np.pi)
-    phases, heights = rng.uniform(0, 2 * np.pi, 3), rng.normal(0, 1, 3)
-    inside = np.full(x.shape, np.float32(4 * radius))
-    for k in range(sides):
-        a = turn + 2 * np.pi * (k + rng.uniform(-0.18, 0.18)) / sides
-        inside = np.minimum(inside, np.float32(radius * 0.82) - np.float32(np.cos(a)) * x - np.float32(np.sin(a)) * y)
-    if curl > 0:
-        theta = np.arctan2(y, x)
-        waves = ((k + 2, h, p) for k, (h, p) in enumerate(zip(heights, phases, strict=True)))
-        lobes = sum(h / (k - 0.5) * np.cos(k * theta + p) for k, h, p in waves)
-        round_ = np.float32(radius) * (1 + np.float32(0.3) * lobes) - np.hypot(x, y)
-        inside = np.float32(1 - curl) * inside + np.float32(curl) * round_
-    return inside.astype(np.float32)
-
-
 def _look(
     thing: Instance,
     rng: np.random.Generator,
@@ -242,7 +228,7 @@ def _look(
     if motion:
         x, y = motion.seen(x, y, width)
     curl = thing.curl
-    inside = _outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)
+    inside = outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)
     texture = thing.sight(*turn(x, y, angle, place))
     lines = marks(x, y, rng, curl=curl, extent_mm=width, count=int(rng.integers(2, 4)))
     steep = np.float32(np.exp(rng.uniform(*np.log((0.05, 0.11)))) * thing.sight.wavelength_mm)
@@ -299,7 +285,7 @@ def _table(x: F, y: F, rng: np.random.Generator, width: float, pixel: float) -> 
     for _ in range(int(rng.integers(1, 4))):
         cx, cy = rng.uniform(-0.5, 0.5, 2) * width
         radius, bend = rng.uniform(0.08, 0.25) * width, float(rng.integers(2))
-        inside = _outline(x - np.float32(cx), y - np.float32(cy), rng, radius, bend)
+        inside = outline(x - np.float32(cx), y - np.float32(cy), rng, radius, bend)
         cover = np.clip(inside / np.float32(pixel) + 0.5, 0, 1)
         picture = picture + cover[..., None] * (rng.uniform(0.1, 0.7, 3).astype(np.float32) - picture)
     return picture
@@ -314,6 +300,7 @@ def _feel(
     held_out: bool,
     background: bool,
     motion: Motion | None,
+    measured: bool,
 ) -> dict[str, Any]:
     """Press the object into a gel: "touch" and, if requested, "background" (uint8 [size, size, 3]), sensor and force."""
     choice = [s for s in SENSORS.values() if s.held_out == held_out]
@@ -334,7 +321,7 @@ def _feel(
     relief = amplitude * thing.feel(u, v)
     depth = np.float32(0.14 * (1 + yielding) * np.exp(rng.normal(0, 0.25)))
     relief = relief + depth * marks(x, y, rng, curl=curl, extent_mm=_TOUCH_MM, count=int(rng.integers(2, 4)))
-    inside = _outline(x, y, rng, rng.uniform(0.45, 0.75) * _TOUCH_MM, curl)
+    inside = outline(x, y, rng, rng.uniform(0.45, 0.75) * _TOUCH_MM, curl)
     beyond = np.maximum(-inside, 0)
     roll = np.float32(0.2 + 1.5 * curl)
     fall = np.where(beyond < roll, beyond * beyond / (2 * roll), beyond - roll / 2)
@@ -342,11 +329,17 @@ def _feel(
     # Soft objects bulge, otherwise the width of the contact would reveal them.
     bulge = np.float32(yielding * rng.uniform(0.6, 1.2) / (2 * dome))
     relief = relief + tilt[0] * x + tilt[1] * y - bulge * (x * x + y * y)
-    imprint = press(relief, force_n=force, stiffness=thing.stiffness, pixel_mm=pixel, dome_radius_mm=dome)
+    physics: dict[str, Any] = {"stiffness": thing.stiffness, "pixel_mm": pixel, "dome_radius_mm": dome}
+    imprint = press(relief, force_n=force, **physics)
     unit = int(rng.integers(2**31))
     noise = motion.noise if motion else rng
     draw = partial(render, sensor=sensor, rng=noise, pixel_mm=pixel, size=size, unit=unit, gain=gain)
     made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
     if background:  # rendered last, so that other pictures do not change
         made["background"] = draw(np.zeros_like(imprint))
-    return {**made, "sensor": sensor.name, "force_n": force}
+    return {
+        **made,
+        "sensor": sensor.name,
+        "force_n": force,
+        **(contact(relief, force_n=force, **physics) if measured else {}),
+    }

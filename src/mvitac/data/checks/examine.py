@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.build import build
-from mvitac.data.checks import duplicates, image_checks, name_checks, table_checks
+from mvitac.data.checks import duplicates, image_checks, name_checks, table_checks, value_checks
 from mvitac.data.checks.contact_sheet import blocks_of
 from mvitac.data.checks.finding import Finding
 from mvitac.data.checks.image_stats import look_at
 from mvitac.data.image_grid import Block
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Lost, Sample, Source
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import DataSpec, Window
+
+SINGLE = Window()
 
 
 class ThumbnailSource(Source):
@@ -59,16 +61,19 @@ class ThumbnailSource(Source):
         return samples
 
 
-def examine(pack: Pack, counts: list[Count] | None = None, *, part: bool = False) -> list[Finding]:
+def examine(
+    pack: Pack, counts: list[Count] | None = None, *, part: bool = False, window: Window = SINGLE
+) -> list[Finding]:
     """Run every check on ``pack``.
 
     Args:
         pack: The pack.
         counts: Published counts, from the source.
         part: Whether the pack is a part of the source. Classes missing here may be in the rest, so they are not "broken".
+        window: Frames that a row will show; checked if it is more than one.
     """
     looks = look_at(pack)
-    labels = [table_checks.missing_labels(pack), *table_checks.class_balance(pack)]
+    labels = [table_checks.missing_labels(pack), *table_checks.class_balance(pack), *value_checks.values(pack)]
     if part:
         note = "in the items examined: "
         milder = [replace(f, verdict="look", evidence=note + f.evidence) for f in labels]
@@ -90,10 +95,11 @@ def examine(pack: Pack, counts: list[Count] | None = None, *, part: bool = False
         duplicates.near_copies(pack, looks),
         table_checks.numbers(pack),
         table_checks.give_aways(pack),
+        *([value_checks.windows(pack, window, part=part)] if window.active else []),
     ]
 
 
-def examine_pack(path: Path) -> tuple[list[Finding], list[Block]]:
+def examine_pack(path: Path, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
     """Check the pack at ``path``; return the findings and the blocks of the contact sheet."""
     try:
         pack = Pack(path)
@@ -105,12 +111,18 @@ def examine_pack(path: Path) -> tuple[list[Finding], list[Block]]:
         )
         return [found], [Block(f"broken: pack. {error}")]
     whole = Finding(item="pack", verdict="ok", evidence=f"{pack.num} rows, every digest matches")
-    findings = [whole, *examine(pack)]
+    findings = [whole, *examine(pack, window=window)]
     return findings, blocks_of(pack, findings)
 
 
 def examine_source(
-    source: Source, *, num: int = 0, size: int = 64, workers: int = 1, quiet: bool = False
+    source: Source,
+    *,
+    num: int = 0,
+    size: int = 64,
+    workers: int = 1,
+    quiet: bool = False,
+    window: Window = SINGLE,
 ) -> tuple[list[Finding], list[Block]]:
     """Check ``source``, which is read into a temporary pack of ``size`` px.
 
@@ -122,6 +134,7 @@ def examine_source(
         size: Side of the thumbnails in pixels.
         workers: Number of processes; 0 = one per core.
         quiet: Show no progress.
+        window: Frames that a row will show.
 
     Returns:
         The findings, and the blocks of the contact sheet.
@@ -130,7 +143,9 @@ def examine_source(
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         options: dict[str, Any] = {"size": size, "workers": workers, "quiet": quiet}
         pack = build(thumbnails, Path(folder) / "pack", max_damaged=1.0, **options)
-        findings = examine(pack, thumbnails.expected(), part=len(thumbnails.items()) < len(source.items()))
+        findings = examine(
+            pack, thumbnails.expected(), part=len(thumbnails.items()) < len(source.items()), window=window
+        )
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
         return findings, blocks_of(pack, findings)

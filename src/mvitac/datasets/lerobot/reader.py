@@ -14,7 +14,7 @@ used, so cameras may have different rates. If it is farther away than ``toleranc
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -67,7 +67,8 @@ class LeRobotConfig(RowsConfig):
         info = _info(self.path)
         cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
         names = choose(cameras, self.vision, self.touch, self.path)
-        rows, cells = _frames(self.path, info, [key for key in names.values() if key in _embedded(info)], self.every)
+        embedded = [key for key in names.values() if key in _embedded(info)]
+        rows, cells = _frames(self.path, info, embedded, self.every, self.vectors())
         found: dict[str, list[ImageRef | None]] = {}
         for column, key in names.items():
             found[column] = cells[key] if key in cells else self._in_videos(info, key, rows)
@@ -178,9 +179,9 @@ def _tasks(root: Path) -> dict[int, str]:
 
 
 def _frames(
-    root: Path, info: dict[str, Any], images: Sequence[str], every: int
+    root: Path, info: dict[str, Any], images: Sequence[str], every: int, vectors: Collection[str]
 ) -> tuple[list[dict[str, str]], dict[str, list[ImageRef | None]]]:
-    """Return the table rows as text (scalar features only), and the references of embedded ``images``."""
+    """Return the table rows as text (scalar features and ``vectors``), and the references of embedded ``images``."""
     tasks = _tasks(root)
     scalars = [k for k, f in info["features"].items() if f["dtype"] in SCALARS and list(f.get("shape", [1])) == [1]]
     rows: list[dict[str, str]] = []
@@ -194,7 +195,9 @@ def _frames(
             if name not in opened.schema_arrow.names:
                 raise ValueError(f"{file} has no column {name!r}: fetch it again")
         names = [
-            name for name in opened.schema_arrow.names if name in scalars or name in RENAMED or name == "timestamp"
+            name
+            for name in opened.schema_arrow.names
+            if name in scalars or name in vectors or name in RENAMED or name == "timestamp"
         ]
         for group in range(opened.num_row_groups):
             for place, values in enumerate(opened.read_row_group(group, columns=names).to_pylist()):

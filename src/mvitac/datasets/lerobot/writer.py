@@ -125,9 +125,10 @@ def _features(pack: Pack) -> dict[str, Any]:
     indices = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
     carried = {name: kind for name, (_, kind) in _carried(pack).items()}
     scalars = {**carried, "timestamp": "float32", **indices}
+    units = {target.name: [f"{target.name} ({target.unit})"] for task in pack.spec.values for target in task.targets}
     return {
         **dict.fromkeys(_cameras(pack), image),
-        **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in scalars.items()},
+        **{name: {"dtype": kind, "shape": [1], "names": units.get(name)} for name, kind in scalars.items()},
     }
 
 
@@ -242,7 +243,9 @@ def _stats(pack: Pack, rows: np.ndarray, starts: np.ndarray, fps: int) -> dict[s
     numbers |= {"index": places, "episode_index": episodes, "frame_index": places - starts[episodes]}
     numbers |= {"timestamp": numbers["frame_index"] / fps, "task_index": np.zeros(len(rows))}
     for name, values in numbers.items():
-        stats[name] = _summary(np.asarray(values, float), (0,), (1,))
+        measured = np.asarray(values, float)
+        if len(measured := measured[~np.isnan(measured)]):
+            stats[name] = _summary(measured, (0,), (1,))
     return stats
 
 

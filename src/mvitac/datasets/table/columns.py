@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import AnyTask, Target, Task, ValueTask
 from mvitac.datasets.table.image_columns import Background, Refs
-from mvitac.datasets.table.manifest import Manifest, number_of
+from mvitac.datasets.table.manifest import Manifest, number_of, text_of
 from mvitac.datasets.table.splits import BY_GROUP, assign_splits, check_leak, check_sides, check_split_names
 
 MAX_ONE_HOT = 64
@@ -86,6 +87,37 @@ def read_task(selected: Selection, column: str, counts: Sequence[bool]) -> tuple
         classes = sorted(names)
     labels = {name: i for i, name in enumerate(classes)}
     return Task(name=column, classes=tuple(classes)), [labels.get(cell, -1) for cell in cells]
+
+
+def element_of(name: str) -> tuple[str, int]:
+    """Return the vector and the number of the element that ``name`` is: state[2] is ("state", 2); else ("", 0)."""
+    found = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    return (found[1], int(found[2])) if found else ("", 0)
+
+
+def with_elements(manifest: Manifest, names: Iterable[str]) -> Manifest:
+    """Return ``manifest`` with a column for each of ``names`` that is an element of a vector, e.g. state[2], from 0.
+
+    Raises:
+        ValueError: If no cell of the vector is that long.
+    """
+    made: dict[str, list[str]] = {}
+    for name in names:
+        vector, number = element_of(name)
+        if name in manifest.columns or vector not in manifest.columns:
+            continue
+        cells = [[part.strip() for part in row.get(vector, "").strip("[]()").split(",")] for row in manifest.rows]
+        if number >= (longest := max(map(len, cells))):
+            raise ValueError(
+                f"{manifest.file}: {name} does not exist: {vector} has {longest} numbers, {vector}[0] to"
+                f" {vector}[{longest - 1}]"
+            )
+        found = (cell[number] if number < len(cell) else "" for cell in cells)
+        made[name] = ["" if text == "None" else text_of(text) for text in found]
+    if not made:
+        return manifest
+    rows = [{**row, **{name: cells[i] for name, cells in made.items()}} for i, row in enumerate(manifest.rows)]
+    return replace(manifest, columns=(*manifest.columns, *made), rows=rows)
 
 
 def value_task(text: str) -> ValueTask:

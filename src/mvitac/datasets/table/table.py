@@ -20,11 +20,13 @@ from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.table.columns import (
     Grouping,
     Selection,
+    element_of,
     read_controls,
     read_task,
     read_values,
     split_rows,
     value_task,
+    with_elements,
 )
 from mvitac.datasets.table.image_columns import (
     Background,
@@ -69,7 +71,7 @@ class RowsConfig(DatasetConfig, ABC):
     forms and blanks are made equal."""
     values: tuple[str, ...] = field(default=(), metadata=LATER)
     """Columns of numbers to predict, as column:unit, e.g. force_n:N; or several as one task: pose=z_mm:mm,tilt_deg:deg.
-    An empty cell or NaN is not measured."""
+    state[2] is the third number of a column of lists. An empty cell or NaN is not measured."""
     group: str | None = None
     """Column of the group (object, recording), the unit of splits and confidence intervals; default: "group" if it
     exists, else the video of the row's frame, else each row is its own group."""
@@ -151,6 +153,15 @@ class RowsConfig(DatasetConfig, ABC):
             raise ValueError(f"controls {' '.join(self.controls)}: give every control a name of its own")
         return {name.strip(): tuple(c.strip() for c in columns.split(",")) for name, _, columns in pairs}
 
+    def numbers(self) -> list[str]:
+        """Return the manifest columns that hold numbers: those of values, and those of controls."""
+        named = [target.name for text in self.values for target in value_task(text).targets]
+        return [*named, *(column for columns in self.control_columns().values() for column in columns)]
+
+    def vectors(self) -> set[str]:
+        """Return the columns of lists of numbers of which an element is named, such as state of state[2]."""
+        return {element_of(name)[0] for name in self.numbers()} - {""}
+
     @abstractmethod
     def manifest(self) -> Manifest:
         """Return the table; ValueError if it does not exist or is invalid."""
@@ -165,7 +176,7 @@ class Rows(Source):
     sizes_at = "file_sizes"
 
     def __init__(self, config: RowsConfig) -> None:
-        manifest = config.manifest()
+        manifest = with_elements(config.manifest(), config.numbers())
         self._config = config
         self._manifest_digest = manifest.digest
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name

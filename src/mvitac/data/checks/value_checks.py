@@ -1,0 +1,208 @@
+"""Checks of tasks with values (units, outliers, glitches, stuck sensors, test outside train), and of windows of frames."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from mvitac.data.checks.finding import Finding, Verdict, share, some
+from mvitac.data.pack import Pack
+from mvitac.data.spec import Target, ValueTask, Window
+from mvitac.data.windows import frames_of, places
+
+UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", "g", "Nm", "Pa", "kPa")
+"""Units whose name at the end of a column's name, as in depth_mm, is taken for the unit of the column."""
+SPIKE_FRAMES, OUTLYING_FRAMES = 3, 15
+"""Longest glitch, a value that leaves and comes back: within the usual range, and beyond it."""
+STUCK_FRAMES = 10
+"""Shortest constant stretch that is reported."""
+
+
+def values(pack: Pack) -> list[Finding]:
+    """Return one finding per target of a task with values."""
+    recordings = _recordings(pack, Window())
+    return [
+        _finding(pack, task, target, pack.values(task)[:, t], recordings)
+        for task in pack.spec.values
+        for t, target in enumerate(task.targets)
+    ]
+
+
+def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, recordings: list[np.ndarray]) -> Finding:
+    item = f"values of {task.name}" + (f": {target.name}" if len(task.targets) > 1 else "")
+    sides = {side: pack.rows(*splits, only=task.only, by=task.split) for side, splits in _SIDES.items()}
+    measured = {side: rows[np.isfinite(found[rows])] for side, rows in sides.items()}
+    if lacking := [side for side, rows in measured.items() if not len(rows)]:
+        evidence = f"no row of {' and '.join(lacking)} has a value"
+        return Finding(
+            item=item, verdict="broken", evidence=evidence, advice="measure some, or assign the splits again"
+        )
+    rows = np.sort(np.concatenate(list(measured.values())))
+    known = found[rows]
+    low, middle, high = np.percentile(known, [0, 50, 100])
+    evidence = [f"{len(rows)} rows, {low:.4g} to {high:.4g} {target.unit}, median {middle:.4g}"]
+    if missing := sum(map(len, sides.values())) - len(rows):
+        evidence.append(f"{share(missing, missing + len(rows))} rows of train, val and test have none")
+    checks = {
+        "check the unit": _unit(target, known, pack.column("group")[rows].astype(str)),
+        "repair these cells, or leave them empty": _outliers(rows, known),
+        "glitches of the sensor: repair these cells, or leave them empty": _spikes(found, recordings),
+        "a stuck or saturated sensor: leave these cells empty": _stuck(found, recordings),
+        "expect larger errors there, or split so that train covers test": _outside(found, measured, target),
+    }
+    wrong = {advice: note for advice, note in checks.items() if note[0]}
+    verdict: Verdict = "look" if wrong else "ok"
+    return Finding(
+        item=item,
+        verdict=verdict,
+        evidence="; ".join([*evidence, *(text for text, _ in wrong.values())]),
+        advice="; ".join(wrong),
+        rows=tuple(row for _, suspicious in wrong.values() for row in suspicious),
+    )
+
+
+_SIDES = {"train": ("train", "val"), "test": ("test",)}
+Note = tuple[str, list[int]]
+"""What is wrong ("" = nothing), and the rows to look at."""
+
+
+def _recordings(pack: Pack, window: Window) -> list[np.ndarray]:
+    """Rows of each touch in the order of time; empty if no column orders them."""
+    try:
+        _, place = places(pack, window)
+    except ValueError:
+        return []
+    return [
+        rows[np.argsort(place[rows], kind="stable")]
+        for rows in map(pack.rows_of, range(int(pack.touch_groups.max()) + 1))
+    ]
+
+
+def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
+    """The column's name says another unit, angles in rad are too large, or one group has another scale."""
+    notes, rows = [], []
+    ending = re.search(r"_([A-Za-z]+)$", target.name)
+    named = next((unit for unit in UNITS if ending and unit.lower() == ending[1].lower()), None)
+    if named and target.unit in UNITS and target.unit.lower() != named.lower():
+        notes.append(f"the name {target.name} says {named}, the unit is {target.unit}")
+    if target.unit == "rad" and np.percentile(abs(known), 95) > 8 * np.pi:
+        notes.append(f"angles to {abs(known).max():.4g} are more likely degrees than rad")
+    names, counts = np.unique(groups, return_counts=True)
+    names = names[counts >= 20]
+    sizes = np.array([np.median(abs(known[groups == name])) for name in names])
+    usual = np.median(sizes) if len(sizes) else 0
+    if (
+        len(names) >= 4
+        and usual > 0
+        and len(odd := names[(sizes > 300 * usual) | ((sizes > 0) & (sizes < usual / 300))])
+    ):
+        times = sizes[np.isin(names, odd)][0] / usual
+        notes.append(f"values of {some(odd.tolist())} are about {times:.2g} times those of other groups")
+    return "; ".join(notes), rows
+
+
+def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
+    """Values far outside the usual range, and rare negative ones of a quantity that is positive otherwise."""
+    low, high = np.percentile(known, [1, 99])
+    far = np.maximum(known - high, low - known) > 1.5 * (high - low)
+    negative = (known < -0.04 * high) & (low >= -0.04 * high)
+    notes = []
+    if high > low and far.any():
+        usual = f"(most are {low:.4g} to {high:.4g})"
+        notes.append(f"{int(far.sum())} outliers, e.g. {known[far][0]:.4g} in row {rows[far][0]} {usual}")
+    if high > 0 and negative.any():
+        text = f"{int(negative.sum())} rows are below {-0.04 * high:.3g}, down to {known.min():.4g}, although 99 % are above"
+        notes.append(f"{text}; the first is row {rows[negative][0]}")
+    return "; ".join(notes), rows[(far & (high > low)) | (negative & (high > 0))].tolist()
+
+
+def _spikes(found: np.ndarray, recordings: list[np.ndarray]) -> Note:
+    """Values that jump away for a few frames of a recording and come back to where they were."""
+    spikes: list[int] = []
+    usual = np.percentile(found[np.isfinite(found)], [1, 99])
+    usual += np.array([-0.1, 0.1]) * (usual[1] - usual[0])
+    for rows in (rows[np.isfinite(found[rows])] for rows in recordings):
+        if len(rows) < 8:
+            continue
+        y = found[rows]
+        low, high = np.percentile(y, [5, 95])
+        least = max(8 * float(np.median(abs(np.diff(y)))), 0.2 * (high - low))
+        first = 1
+        while least > 0 and first < len(y) - 1:
+            last = _back(y, first, least, usual)
+            spikes += rows[first:last].tolist()
+            first = max(first + 1, last)
+    if not spikes:
+        return "", []
+    text = f"{len(spikes)} frames jump away and back, first row {spikes[0]} ({found[spikes[0]]:.4g})"
+    return text, spikes
+
+
+def _back(y: np.ndarray, first: int, least: float, usual: np.ndarray) -> int:
+    """The frame at which values that jumped at frame ``first`` are back; 0 if they did not jump, or stay away."""
+    longest = SPIKE_FRAMES if usual[0] <= y[first] <= usual[1] else OUTLYING_FRAMES
+    for last in range(first + 1, min(first + longest + 1, len(y))):
+        before, after, away = y[first - 1], y[last], y[first:last]
+        beyond = away - max(before, after), min(before, after) - away
+        if abs(after - before) < least / 2 and any((side > least).all() for side in beyond):
+            return last
+    return 0
+
+
+def _stuck(found: np.ndarray, recordings: list[np.ndarray]) -> Note:
+    """Stretches of one recording with the same value other than 0, which is what no contact measures."""
+    parts: list[np.ndarray] = []
+    for rows in (rows[np.isfinite(found[rows])] for rows in recordings):
+        parts += np.split(rows, np.flatnonzero(np.diff(found[rows])) + 1)
+    short = [len(part) for part in parts if 0 < len(part) < STUCK_FRAMES]
+    stretches = [part for part in parts if len(part) >= STUCK_FRAMES and found[part[0]] != 0]
+    # Coarse numbers, such as a gripper's width, and those given once per press repeat themselves anyway.
+    if not stretches or sum(short) > 1.1 * len(short) or sum(map(len, stretches)) > 0.5 * sum(map(len, parts)):
+        return "", []
+    longest = max(stretches, key=len)
+    text = f"{len(stretches)} constant stretches, the longest {len(longest)} frames of {found[longest[0]]:.4g}"
+    return f"{text} from row {longest[0]}", [int(part[0]) for part in stretches]
+
+
+def _outside(found: np.ndarray, measured: dict[str, np.ndarray], target: Target) -> Note:
+    train, test = found[measured["train"]], measured["test"]
+    margin = 0.05 * (train.max() - train.min())
+    beyond = test[(found[test] < train.min() - margin) | (found[test] > train.max() + margin)]
+    if len(beyond) <= 0.01 * len(test):
+        return "", []
+    text = f"{share(len(beyond), len(test))} test rows are outside train ({train.min():.4g} to {train.max():.4g}"
+    return f"{text} {target.unit})", beyond.tolist()
+
+
+def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
+    """Return whether the recordings of ``pack`` have the frames that ``window`` asks for: gaps, rates and length."""
+    item = f"windows of {window.frames} frames, stride {window.stride:g}"
+    if part:
+        return Finding(item=item, verdict="not checkable", evidence="a part of the items has gaps: examine all of them")
+    try:
+        name, place = places(pack, window)
+        _, whole = frames_of(pack, window)
+    except ValueError as error:
+        return Finding(item=item, verdict="broken", evidence=str(error), advice="training refuses these windows, too")
+    steps = [np.diff(place[rows]) for rows in _recordings(pack, window) if len(rows) > 2]
+    rates = np.array([np.median(step) for step in steps])
+    gaps = sum(int((step > 2.5 * rate).sum()) for step, rate in zip(steps, rates, strict=True))
+    evidence = [f"{share(int(whole.sum()), pack.num)} rows have all frames before them, by column {name}"]
+    advice = []
+    if gaps:
+        with_gaps = sum((step > 2.5 * rate).any() for step, rate in zip(steps, rates, strict=True))
+        longest = max(step.max() / rate for step, rate in zip(steps, rates, strict=True))
+        evidence.append(
+            f"{gaps} gaps in {share(int(with_gaps), len(steps))} touches, the longest of {longest:.3g} frames"
+        )
+        advice.append("a window across a gap shows an older frame than asked: split the touches there")
+    if len(rates) and rates.max() > 1.25 * rates.min():
+        evidence.append(f"frames are {rates.min():.3g} apart in some touches and {rates.max():.3g} in others")
+        advice.append("give the stride in seconds with --data.order, or it means another time in each")
+    if too_short := set(pack.touch_groups.tolist()) - set(pack.touch_groups[whole].tolist()):
+        evidence.append(f"{share(len(too_short), int(pack.touch_groups.max()) + 1)} touches are shorter than a window")
+        advice.append("their first frame repeats in every row: give fewer frames or a smaller stride")
+    return Finding(
+        item=item, verdict="look" if advice else "ok", evidence="; ".join(evidence), advice="; ".join(advice)
+    )

@@ -1,0 +1,186 @@
+"""The doctor on values and windows: a healthy recording is called healthy, and each fault by its name and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.checks import value_checks
+from mvitac.data.checks.examine import examine
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec, Target, ValueTask, Window
+
+NUM, LENGTH = 16, 40
+TEST = (3, 7, 11, 15)
+
+
+@dataclass
+class Recordings(Source):
+    """16 objects, each pressed for 40 frames at 10 Hz: force rises to some 3 N and falls. ``fault`` breaks one thing."""
+
+    fault: str = ""
+
+    def spec(self) -> DataSpec:
+        unit = "mN" if self.fault == "unit" else "N"
+        force = ValueTask(name="force", targets=(Target(name="force_n", unit=unit),))
+        tilt = ValueTask(name="pose", targets=(Target(name="tilt", unit="rad"),))
+        return DataSpec(
+            name="recordings",
+            vision_channels=0,
+            touch_channels=3,
+            tasks=(),
+            values=(force, tilt),
+            group_by="object",
+            licence="none",
+            source="tests/data/checks/test_value_checks.py",
+        )
+
+    def items(self) -> list[str]:
+        return [f"{k} {i}" for k in range(NUM) for i in range(LENGTH)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"recordings": self.fault}
+
+    def read(self, item: int) -> list[Sample]:
+        (k, i), fault = divmod(item, LENGTH), self.fault
+        rng = np.random.default_rng([11, item])
+        force = 0.2 + (2.5 + 0.1 * (k // 2 % 4)) * np.sin(np.pi * i / LENGTH) + 0.01 * rng.normal()
+        tilt = 0.3 * np.sin(k + i / 5)
+        if fault == "group of another unit" and k == 5:
+            force *= 1000
+        if fault == "degrees":
+            tilt = np.rad2deg(tilt) * 5
+        if (fault == "outlier" and item == 100) or (fault == "spike" and k == 2 and i in (20, 21)):
+            force = {"outlier": 60.0, "spike": 0.2}[fault]
+        if fault == "negative" and k == 1 and 10 <= i < 16:  # too slow for a glitch
+            force = -0.12 * min(i - 9, 16 - i)
+        if fault == "stuck" and k == 4 and 10 <= i < 24:
+            force = 2.0
+        if fault == "outside" and k == 7:
+            force += 2
+        if (fault == "missing" and i % 4 == 0) or (fault == "no test" and k in TEST):
+            force = float("nan")
+        gap = 8 * (fault == "gap" and k == 4 and i > 20)
+        rate = 2 if fault == "two rates" and k == 9 else 1
+        seq = {"short": i if k else i % 2}.get(fault, rate * i + gap)
+        touch = f"{k}-{i // 2}" if fault == "short" and k == 0 else str(k)
+        columns = {"id": f"{k:02d}-{i:02d}", "group": str(k), "touch_group": touch, "seq": seq}
+        columns |= {"split": "test" if k in TEST else "train", "force_n": force, "tilt": tilt}
+        image = rng.integers(0, 255, (16, 16, 3), np.uint8)
+        return [Sample(vision=None, touch=image, columns=columns)]
+
+
+def packed(path: Path, fault: str = "") -> Pack:
+    return build(Recordings(fault), path, size=16, workers=1, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return packed(tmp_path_factory.mktemp("healthy") / "pack")
+
+
+def test_healthy_values_and_windows(healthy: Pack) -> None:
+    found = {finding.item: finding for finding in examine(healthy, window=Window(frames=3))}
+    values = found["values of force"], found["values of pose"], found["windows of 3 frames, stride 1"]
+    assert all(finding.verdict == "ok" for finding in values), values
+    assert "640 rows, 0.1" in values[0].evidence and " N, median" in values[0].evidence
+    assert "608 of 640 (95.0 %) rows have all frames before them, by column seq" in values[2].evidence
+
+
+@pytest.mark.parametrize(
+    ("fault", "item", "says", "rows"),
+    [
+        ("unit", "values of force", "the name force_n says N, the unit is mN", []),
+        ("group of another unit", "values of force", "values of 5 are about", []),
+        ("degrees", "values of pose", "more likely degrees than rad", []),
+        ("outlier", "values of force", "1 outliers, e.g. 60 in row 100", [100]),
+        ("spike", "values of force", "2 frames jump away and back, first row 100 (0.2)", [100, 101]),
+        (
+            "negative",
+            "values of force",
+            "6 rows are below -0.12, down to -0.36, although 99 % are above; the first is row 50",
+            [50],
+        ),
+        ("stuck", "values of force", "1 constant stretches, the longest 14 frames of 2 from row 170", [170]),
+        ("outside", "values of force", "test rows are outside train (0.1", []),
+    ],
+)
+def test_each_fault_of_values_is_found_and_no_other(
+    tmp_path: Path, fault: str, item: str, says: str, rows: list[int]
+) -> None:
+    pack = packed(tmp_path / "pack", fault)
+    if fault == "outlier":  # an outlier of one frame is a glitch as well
+        pack.table = pack.table.drop_columns("seq")
+    if fault == "group of another unit":  # and so are its steps
+        pack.table = pack.table.drop_columns("seq")
+    found = {finding.item: finding for finding in value_checks.values(pack)}
+    assert found[item].verdict == "look" and says in found[item].evidence, found[item]
+    assert set(rows) <= set(found[item].rows)
+    assert [f.item for f in found.values() if f.verdict != "ok"] == [item]
+    assert ";" not in found[item].advice  # one thing to do
+
+
+def test_missing_values(tmp_path: Path) -> None:
+    (force, _) = value_checks.values(packed(tmp_path / "a", "missing"))
+    assert force.verdict == "ok" and "160 of 640 (25.0 %) rows of train, val and test have none" in force.evidence
+    (force, _) = value_checks.values(packed(tmp_path / "b", "no test"))
+    assert force.verdict == "broken" and "no row of test has a value" in force.evidence
+
+
+@pytest.mark.parametrize(
+    ("fault", "verdict", "says"),
+    [
+        ("gap", "look", "1 gaps in 1 of 16 (6.2 %) touches, the longest of 9 frames"),
+        ("two rates", "broken", "stride 1 is shorter than the distance of frames in touch '9', 2"),
+        ("short", "look", "20 of 35 (57.1 %) touches are shorter than a window"),
+    ],
+)
+def test_each_fault_of_windows_is_found(tmp_path: Path, fault: str, verdict: str, says: str) -> None:
+    pack = packed(tmp_path / "pack", fault)
+    finding = value_checks.windows(pack, Window(frames=3))
+    assert finding.verdict == verdict and says in finding.evidence, finding
+    if fault == "two rates":
+        finding = value_checks.windows(pack, Window(frames=3, stride=2))
+        assert finding.verdict == "look" and "1 apart in some touches and 2 in others" in finding.evidence
+    assert value_checks.windows(pack, Window(frames=3), part=True).verdict == "not checkable"
+
+
+def test_the_command_checks_windows_when_asked(
+    healthy: Pack, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    main(["data", "check", str(healthy.path)])
+    assert "windows of" not in capsys.readouterr().out
+    assert main(["data", "check", str(healthy.path), "--num-frames", "50"]) == 2
+    assert "longer than every touch" in capsys.readouterr().out
+
+
+def test_a_value_that_is_missing_is_no_broken_number(tmp_path: Path) -> None:
+    found = {finding.item: finding for finding in examine(packed(tmp_path / "pack", "missing"))}
+    assert found["numbers"].verdict == "ok"
+
+
+def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:
+    pack = Pack(healthy.path)
+    force = pack.column("force_n")
+    force[:15] = 0
+    at = pack.table.column_names.index("force_n")
+    pack.table = pack.table.set_column(at, "force_n", [force])
+    assert "constant" not in value_checks.values(pack)[0].evidence
+    force[:15] = 1
+    pack.table = pack.table.set_column(at, "force_n", [force])
+    assert "constant" in value_checks.values(pack)[0].evidence
+
+
+def test_tasks_with_other_rows_have_their_own_check(healthy: Pack) -> None:
+    pack = Pack(healthy.path)
+    pack.spec = replace(pack.spec, values=(replace(pack.spec.values[0], only={"group": "3"}),))
+    (force,) = value_checks.values(pack)
+    assert force.verdict == "broken" and "no row of train" in force.evidence
