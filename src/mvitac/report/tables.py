@@ -44,7 +44,9 @@ def probe_name(kind: str, score: str) -> str:
 
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
     """Print one table per task: accuracy or R2 in percent, mean and 95 % interval. Values have a table of targets too."""
+    trained = []
     for name, task in result["summary"].items():
+        trained += [{"source": s, "seed": seed} for m in task.values() for s, v in m.items() for seed in v["seeds"]]
         modalities, score = columns_of(task), score_name(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
         about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
@@ -59,7 +61,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         console.print(table)
         if score == "R2":
             console.print(_targets(name, task))
-    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
+    console.print(f"95 % intervals: {covered(result['group_by'], trained)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
     for leak in result.get("leaks", ()):
