@@ -38,7 +38,7 @@ LEAST = -0.5
 """Where figures cut off R2, which has no lower limit."""
 WIDTH = 3.8
 """Inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high."""
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # class names may contain a dollar sign
     "font.size": 9,
     "svg.fonttype": "none",  # keep text as text, in the page's font
@@ -49,7 +49,8 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def _figure(title: str, height: float) -> tuple[Figure, Axes]:
+def new_figure(title: str, height: float) -> tuple[Figure, Axes]:
+    """Axes ``WIDTH`` wide."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     axes = figure.subplots()
     axes.set_title(shorten(title, 40), color=colour("ink"))
@@ -64,7 +65,7 @@ def shorten(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
-def _below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
+def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
     """Put a legend below the axes, where it hides nothing."""
     options: dict[str, Any] = {"handlelength": 1.4, "columnspacing": 1.2, "fontsize": 9, "handletextpad": 0.5}
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, labelcolor=colour("ink"), **options)
@@ -73,7 +74,7 @@ def _below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], column
 # -- figures ----------------------------------------------------------------------------------------------------------
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def bars(
     title: str, groups: Mapping[str, Mapping[str, Mapping[str, float]]], lines: Mapping[str, float], what: str
 ) -> Figure:
@@ -86,7 +87,7 @@ def bars(
         what: Label of the axis.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
-    figure, axes = _figure(title, 0.85 + 0.21 * num_rows)
+    figure, axes = new_figure(title, 0.85 + 0.21 * num_rows)
     y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
     lows = [cell[k] for group in groups.values() for cell in group.values() for k in ("mean", "low")]
     least = max(LEAST, min(0.0, *(low for low in lows if low is not None)))
@@ -118,7 +119,7 @@ def bars(
         handles.append(Line2D([], [], **look))
         labels.append(f"{shorten(name, 28)} {percent(value)}")
     if handles:
-        _below(figure, handles, labels, 3)
+        legend_below(figure, handles, labels, 3)
     return figure
 
 
@@ -150,7 +151,7 @@ class Dot:
     score: str = "accuracy"
 
 
-@matplotlib.rc_context({**_STYLE, "font.size": 10})
+@matplotlib.rc_context({**STYLE, "font.size": 10})
 def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
     """A panel per task, a line per source, a dot with its 95 % interval per modality.
 
@@ -181,7 +182,7 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
         axes.spines[["top", "right", "left"]].set_visible(False)
     entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
     order = [name for name in ("touch", "vision", "both", "printed", *ONE_ANSWER) if name in entries]
-    _below(figure, [entries[name] for name in order], order, 5)
+    legend_below(figure, [entries[name] for name in order], order, 5)
     return figure
 
 
@@ -212,10 +213,10 @@ class Line:
     dash: str = "-"
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | None = None) -> Figure:
     """Curves over steps; ``references`` are horizontal lines such as chance."""
-    figure, axes = _figure(title, 2.75)
+    figure, axes = new_figure(title, 2.75)
     handles: dict[str, Any] = {}
     several = len({line.label for line in lines}) < len(lines)  # seeds: thinner lines
     for line in lines:
@@ -234,15 +235,15 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
     axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
     axes.set_xlabel("step", color=colour("soft"), fontsize=9)
     labels = [shorten(label, 30) for label in handles]
-    _below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
+    legend_below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     """Row-normalised confusion matrix of ``counts`` [true, predicted]; correct cells blue, mistakes vermilion."""
     num = len(classes)
-    figure, axes = _figure(title, 3.4 if num <= 4 else 4.3)
+    figure, axes = new_figure(title, 3.4 if num <= 4 else 4.3)
     totals = counts.sum(1, keepdims=True)
     shares = counts / np.maximum(totals, 1)
     axes.add_patch(Rectangle((-0.5, -0.5), num, num, facecolor=colour("panel"), edgecolor="none"))
@@ -274,14 +275,14 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> Figure:
     """Points [N, 2] by label [N] (-1 = unlabelled). Each further eight classes repeat the hues with another marker."""
     shown = [label for label in range(-1, len(classes)) if (labels == label).any()]
     longest = max((len(shorten(classes[label], 16)) for label in shown if label >= 0), default=0)
     columns = 4 if longest <= 10 else 3
     num_entries = min(len(shown), 40)
-    figure, axes = _figure(title, 3.5 + 0.16 * -(-num_entries // columns))
+    figure, axes = new_figure(title, 3.5 + 0.16 * -(-num_entries // columns))
     handles, names = [], []
     for label in shown:
         look: dict[str, Any] = {"color": colour("grey3"), "marker": "."}
@@ -299,14 +300,14 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
     for spine in axes.spines.values():
         spine.set_color(colour("rule"))
     if classes or len(shown) > 1:
-        _below(figure, handles, names, columns)
+        legend_below(figure, handles, names, columns)
     return figure
 
 
 # -- to files and into the page ---------------------------------------------------------------------------------------
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face: str, **options: Any) -> bytes:
     """Print the figure with ``canvas``. It is laid out once for all canvases; savefig would repeat that."""
     figure.set_facecolor(face)

@@ -152,6 +152,7 @@ def _page(study: Study) -> str:
         "loss": ("Loss", evidence.loss),
         "collapse": ("Learning or collapsing?", evidence.collapse),
         "confusion": ("Confusion", evidence.confusions),
+        "values": ("Predicted and true values", score_sections.values),
         "map": ("A map of the features", galleries.feature_maps),
         "gallery": ("Retrieval gallery", galleries.gallery),
         "settings": ("Settings", _settings),
@@ -223,16 +224,16 @@ def _worded(task: dict[str, Any], cell: dict[str, float]) -> str:
 
 def _tile(study: Study, task: str) -> str:
     modality, own, controls = evidence.headline(study, task)
-    score = score_name(study.result["summary"][task])
     below = [name for name, cell in controls.items() if _low(cell) > own["high"]]
     level = [name for name, cell in controls.items() if cell["high"] >= _low(own) and name not in below]
     found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
     verdict = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
     verdict = verdict if controls else ""
     number, _, ends = with_interval(own["mean"], own["low"], own["high"], own.get("leak", "")).partition(" ")
-    numbers = f"{number}<small> % {'R2 ' * (score == 'R2')}{ends}</small>"
+    numbers = f"{number}<small> % {ends}</small>"
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
-    what = f"<h3>{escape(task)} <small>{escape(WORDS[modality] + by)}</small></h3>"
+    about = ", ".join(["R2"] * (score_name(study.result["summary"][task]) == "R2") + [WORDS[modality] + by])
+    what = f"<h3>{escape(task)} <small>{escape(about)}</small></h3>"
     return f'<div class="card tile">{what}<div class="big">{numbers}</div>{verdict}</div>'
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.scores import (
     MODALITY_ORDER,
+    by_cell,
     cell_text,
     columns_of,
     error_text,
@@ -18,8 +19,9 @@ from mvitac.evaluation.scores import (
     tested_on,
     with_interval,
 )
-from mvitac.report import figures, html, tables
-from mvitac.report.sections import Study
+from mvitac.report import figures, html, tables, value_figures
+from mvitac.report.palette import MODALITY_HUES
+from mvitac.report.sections import WORDS, Study, headline
 
 
 def probe(study: Study) -> str:
@@ -112,3 +114,40 @@ def _every_probe(records: Sequence[dict[str, Any]]) -> list[str]:
         heads = (*columns, "target", "R2 %", "mean absolute error", "root mean squared error")
         found.append(html.fold("Every probe of values with its errors", html.table(heads, values)))
     return found
+
+
+def values(study: Study) -> str:
+    """Predicted against true values of the first method and the error by range beside the controls, for each target."""
+    records = study.result["records"]
+    cells = by_cell(records, records[0]["probe"]) if records else {}
+    drawn = []
+    for task, found in study.result["summary"].items():
+        if score_name(found) == "accuracy":
+            continue
+        modality, own, controls = headline(study, task)
+        mine = cells[task, modality, study.sources[0]]
+        beside = {s: cells.get((task, modality, s)) or cells[task, "none", s] for s in controls}
+        for t, target in enumerate(own["targets"]):
+            name = target["name"] if target["name"] == task else f"{task}: {target['name']}"
+            hue, unit = MODALITY_HUES[modality], target["unit"]
+            points = [pair for record in mine for pair in record["points"][t]]
+            drawing = value_figures.predicted(f"{name}, {WORDS[modality]}", points, unit, hue)
+            text = f"R2 {percent(target['mean'])} %, mean absolute error {error_text(target)}; {len(points)} test rows"
+            text += f" of {len(mine)} seeds." if len(mine) > 1 else "."
+            drawn.append(study.figure(f"predicted {name}", drawing, f"Predicted against true {name}. {text}", text))
+            ranges = {s: _mean_ranges(each, t) for s, each in {study.sources[0]: mine, **beside}.items()}
+            drawing = value_figures.error_ranges(f"{name}: error by range", ranges, unit, hue)
+            alt = f"Mean absolute error of {name} by range of the true value"
+            drawn.append(study.figure(f"error {name}", drawing, alt, "Ranges hold equally many test rows."))
+    if not drawn:
+        return ""
+    intro = (
+        f"A point is a test row ({study.sources[0]}). A flat cloud means that the probe answers about the same for all."
+    )
+    return html.paragraph(intro) + html.grid(drawn)
+
+
+def _mean_ranges(records: Sequence[dict[str, Any]], t: int) -> list[dict[str, float]]:
+    """Error by range of target ``t``: mean over seeds, which share the ranges."""
+    each = [record["targets"][t]["ranges"] for record in records]
+    return [{**parts[0], "mae": sum(part["mae"] for part in parts) / len(parts)} for parts in zip(*each, strict=True)]
