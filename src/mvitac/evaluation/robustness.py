@@ -104,7 +104,9 @@ def _fewer_or_leaked(case: _Case) -> Scores:
     for kind, share in SHARES.items():
         yield kind, case.probe(*_few(case.rows, _strata(case), share, case.seed))
     for kind, leaks in LEAK.items():
-        keep, halved = _halved(case.rows, case.pack.column("group"), leaks, case.seed)
+        # One half for all seeds: of values, others could lack other measurements, and seeds must share their test rows.
+        seed = 0 if isinstance(case.task, ValueTask) else case.seed
+        keep, halved = _halved(case.rows, case.pack.column("group"), leaks, seed)
         if len(halved.test):
             yield kind, case.probe(keep, halved)
 
