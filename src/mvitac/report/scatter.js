@@ -37,7 +37,7 @@ function bar(given) {  // the colours from the lowest to the highest value, inst
   const [low, high, target] = given.bar, box = document.createElement("div"), strip = document.createElement("i");
   box.className = "bar";
   strip.style.background = `linear-gradient(to right, ${given.hues.map(colour).join(", ")})`;
-  box.append(low, strip, high, target);
+  box.append(`${target}: ${low}`, strip, high);
   return box;
 }
 
