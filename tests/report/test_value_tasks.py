@@ -17,7 +17,9 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from mvitac.cli.main import main
 from mvitac.data.build import build
+from mvitac.data.notebook import pack_html
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
@@ -32,7 +34,7 @@ from mvitac.experiments.table import lines_of, target_lines
 from mvitac.model import load
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
-from mvitac.report import figures
+from mvitac.report import contact_sheet, figures
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_summary
 from mvitac.report.value_figures import predicted
@@ -226,6 +228,28 @@ def test_stress_of_values(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
     other = {(r["task"], r["probe"]): r for r in stress(model, pack, pack.spec.values, ["touch"])}
     for kind in LEAK:  # one half for all seeds, as half of the weights is missing
         assert other["both", kind]["group_sums"]["n"] == found["both", kind]["group_sums"]["n"]
+
+
+def test_packs_list_their_values(
+    scored: tuple[Path, Pack, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, pack, _ = scored
+    weight = pack.column("weight")[pack.rows("test")]
+    low, high = np.nanmin(weight), np.nanmax(weight)
+    assert f"<td>{low:.3g} to {high:.3g}</td>" in pack_html(pack) and "<th>weight, N</th>" in pack_html(pack)
+    assert main(["data", "info", str(pack.path), "--json", str(tmp_path / "info.json")]) == 0
+    found = json.loads((tmp_path / "info.json").read_text())["splits"]["test"]["values"][-1]
+    assert found == {
+        "task": "both",
+        "target": "weight",
+        "unit": "N",
+        "rows": int(np.isfinite(weight).sum()),
+        "low": low,
+        "high": high,
+    }
+    page = contact_sheet.to_html(pack, *contact_sheet.strips(pack, num=50))
+    (row, *_) = np.flatnonzero(np.isfinite(pack.column("weight")))
+    assert f"weight: {pack.column('weight')[row]:.3g} N" in page
 
 
 def test_a_target_without_values_in_test_is_named(tmp_path: Path) -> None:
