@@ -23,7 +23,7 @@ from PIL import Image
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
-from mvitac.report.explorer_data import ExplorerData
+from mvitac.report.explorer_data import LEVELS, ExplorerData
 from mvitac.report.guard import MAX_BODY, Guard, as_text
 from mvitac.report.palette import COLOURS, MAP_HUES
 from support.browser import CHROMIUM, Browser
@@ -161,6 +161,26 @@ def test_a_run_that_is_not_finished_is_named(tmp_path: Path, capsys: pytest.Capt
     (tmp_path / "run" / "checkpoint.pt").touch()
     assert main(["explore", str(tmp_path / "run")]) == 2
     assert "the run is not finished" in capsys.readouterr().err
+
+
+def test_values_colour_the_map(land: ExplorerData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lowest and the highest value have the ends of the scale, a row without one is gray; captions tell the value."""
+    force = np.arange(len(land.rows), dtype=float)
+    force[3] = np.nan
+    monkeypatch.setattr(land, "values", {"force_n (N)": force})
+    value = decode(land.points("both", "label", "all", "force_n (N)"))
+    names = np.array(value["legend"])[value["group"]]
+    assert names[3] == "not measured" and (names[0], names[-1]) == ("0", str(LEVELS - 1))
+    assert "not measured" not in value["coloured"] and len(value["hues"]) == len(value["coloured"]) == LEVELS
+    measured = names[~np.isnan(force)].astype(int)
+    assert (np.diff(measured) >= 0).all() and len(set(measured)) == LEVELS
+    low, high = np.nanpercentile(force, [1, 99])
+    assert value["bar"] == [f"{low:.3g}", f"{high:.3g}", "force_n (N)"]
+    some = decode(land.points("both", "label", "test", "force_n (N)"))
+    assert some["bar"] == value["bar"]  # a filter leaves the scale
+    assert land.describe(5).endswith(" · force_n 5 N") and "force_n" not in land.describe(3)
+    assert land.name(5, "force_n (N)") == f"{land.name(5)}, force_n 5 N" and land.name(5, "pattern") == land.name(5)
+    assert land.same_class(0, 1, "force_n (N)") is None
 
 
 @pytest.fixture(scope="module")

@@ -133,19 +133,16 @@ def noise(tmp_path: Path, source: Noise, **changes: Any) -> tuple[Path, Pack]:
 
 def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any]) -> None:
     html = (materials / "out" / "report.html").read_text()
-    body = re.search(r"<tbody>(.*?)</tbody>", html, re.DOTALL)
-    assert body
-    rows = [re.findall(r">([^<]*)</t[hd]>", row) for row in body[1].split("</tr>")]
     shown: dict[tuple[str, str], list[str]] = {}
-    task = ""
-    for row in filter(None, rows):
-        task = row[0].split(" (")[0] if len(row) == 1 else task  # category (24 test instances)
-        shown[task, row[0]] = [unescape(value).replace("\xa0", " ") for value in row[1:]]
-    assert {"category", "soft", "rough"} <= set(result["summary"])
-    for task in ("category", "soft", "rough"):
-        found = result["summary"][task]
+    for body in re.findall(r'aria-label="(?:accuracy|R2)">.*?<tbody>(.*?)</tbody>', html, re.DOTALL):
+        task = ""
+        for row in filter(None, (re.findall(r">([^<]*)</t[hd]>", row) for row in body.split("</tr>"))):
+            task = row[0].split(" (")[0] if len(row) == 1 else task  # category (24 test instances)
+            shown[task, row[0]] = [unescape(value).replace("\xa0", " ") for value in row[1:]]
+    assert set(result["summary"]) == {"category", "soft", "rough", "force"}
+    for task, found in result["summary"].items():
         sources = {source for cells in found.values() for source in cells}
-        assert sources == {"mvitac", "untrained", "pixels", "border", "majority"}
+        assert sources == {"mvitac", "untrained", "pixels", "border", "mean" if task == "force" else "majority"}
         for source in sources:
             assert shown[task, source] == [cell_text(found, source, m) for m in columns_of(found)]
 

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, check_json, console, parse, save_json, selectors, short
 from mvitac.data.build import build
+from mvitac.data.notebook import measured
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.sharding import write_shards
@@ -200,10 +201,12 @@ def info(argv: list[str]) -> None:
     title = f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px{stored}"
     table = Table(title=title, title_justify="left")
     groups = "groups" if pack.spec.group_by == "row" else f"{pack.spec.group_by}s"
-    for column in ("split", "rows", groups, *(f"{t.name}: majority" for t in pack.spec.tasks)):
+    values = [f"{v['target']}, {v['unit']}" for v in next(iter(found["splits"].values()), {}).get("values", ())]
+    for column in ("split", "rows", groups, *(f"{t.name}: majority" for t in pack.spec.tasks), *values):
         table.add_column(column)
     for name, split in found["splits"].items():
         cells = [f"{m['class']} {100 * m['share']:.1f} %" if m else "" for m in split["majority"].values()]
+        cells += [f"{v['low']:.3g} to {v['high']:.3g}" if v["rows"] else "" for v in split.get("values", ())]
         table.add_row(name, str(split["rows"]), str(split["groups"]), *cells)
     say.print(table)
     if lacking := ", ".join(f"{num} rows without {m}" for m, num in found["rows_without"].items()):
@@ -223,6 +226,8 @@ def _describe(pack: Pack) -> dict[str, Any]:
             groups = len(set(pack.column("group")[rows]))
             majority = {task.name: _majority(pack, task, split) for task in pack.spec.tasks}
             splits[split] = {"rows": len(rows), "groups": groups, "majority": majority}
+            if pack.spec.values:
+                splits[split]["values"] = _values(pack, rows)
     has = {m: pack.has(m) for m in pack.spec.modalities}
     return {
         "path": str(pack.path),
@@ -240,6 +245,17 @@ def _describe(pack: Pack) -> dict[str, Any]:
         "notes": list(pack.spec.notes),
         "digest": pack.digest,
     }
+
+
+def _values(pack: Pack, rows: np.ndarray) -> list[dict[str, Any]]:
+    """Each target with its unit, the number of measured rows, and their lowest and highest value."""
+    targets = [(task.name, target) for task in pack.spec.values for target in task.targets]
+    return [
+        {"task": task, "target": target.name, "unit": target.unit, "rows": num, "low": low, "high": high}
+        if num
+        else {"task": task, "target": target.name, "unit": target.unit, "rows": 0, "low": None, "high": None}
+        for (task, target), (num, low, high) in zip(targets, measured(pack, rows), strict=True)
+    ]
 
 
 def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:

@@ -24,16 +24,28 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[str] = ()) -> str:
 
 
 def pack_html(pack: Pack) -> str:
-    """Rows, groups and labels of every split, and a few pairs from all over the pack."""
+    """Rows, groups, labels and values of every split, and a few pairs from all over the pack."""
     rows, tasks = [], pack.spec.tasks
     for split in dict.fromkeys(pack.column("split").tolist()):
         chosen = pack.rows(split)
         labelled = [int((pack.labels(task.name)[chosen] >= 0).sum()) for task in tasks]
-        rows.append((split, len(chosen), len(np.unique(pack.column("group")[chosen])), *labelled))
-    head = ("split", "rows", "groups", *(f"{task.name} ({len(task.classes)} classes), labelled" for task in tasks))
+        ranges = [f"{low:.3g} to {high:.3g}" if num else "" for num, low, high in measured(pack, chosen)]
+        rows.append((split, len(chosen), len(np.unique(pack.column("group")[chosen])), *labelled, *ranges))
+    head = ["split", "rows", "groups", *(f"{task.name} ({len(task.classes)} classes), labelled" for task in tasks)]
+    head += [f"{target.name}, {target.unit}" for task in pack.spec.values for target in task.targets]
     shown = np.unique(np.linspace(0, pack.num - 1, min(NUM_PAIRS, pack.num)).astype(int))
     pictures = "<br>".join(_strip(pack, modality, shown) for modality in pack.spec.modalities)
     return f"<p>{escape(repr(pack))}</p>{table(rows, head)}{pictures}"
+
+
+def measured(pack: Pack, rows: np.ndarray) -> list[tuple[int, float, float]]:
+    """Number, lowest and highest value of each target of each task among ``rows``; NaN without any."""
+    found = []
+    for task in pack.spec.values:
+        for values in pack.values(task)[rows].T:
+            have = values[np.isfinite(values)]
+            found.append((len(have), *((float(have.min()), float(have.max())) if len(have) else (np.nan, np.nan))))
+    return found
 
 
 def _strip(pack: Pack, modality: str, rows: np.ndarray) -> str:

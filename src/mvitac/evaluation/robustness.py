@@ -1,7 +1,8 @@
 """Stress tests of features: few labels, noisy images, a modality missing at test time, and a split that leaks.
 
-Each is scored by logistic regression and recorded under its own probe name (``STRESSES``). Compare scores within one
-name only. The exception is the pair in ``LEAK``: its difference is what a split by frames adds to a split by groups.
+Each is scored by logistic regression (ridge for values) and recorded under its own probe name (``STRESSES``). Compare
+scores within one name only. The exception is the pair in ``LEAK``: its difference is what a split by frames adds to a
+split by groups.
 """
 
 from __future__ import annotations
@@ -15,21 +16,22 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, Task
+from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.evaluation.features import features
 from mvitac.evaluation.probe import (
     ProbeSplit,
     fit_probe,
+    fit_values,
     names_in,
     probe_features,
+    score_predictions,
     score_rows,
     split_rows,
-    with_classes,
 )
 from mvitac.model import Model
 
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}
-"""Fraction of the labelled training and validation rows that a probe sees; at least one row per class."""
+"""Fraction of the labelled training and validation rows that a probe sees; at least one row per class, two of values."""
 NOISE = "noisy images"
 NOISE_LEVELS = 20.0
 """Standard deviation of the noise added to each 8-bit channel of test images."""
@@ -52,7 +54,7 @@ class _Case:
     """One task and modality of a model, with clean features [train + val + test rows, D] by modality."""
 
     pack: Pack
-    task: Task
+    task: AnyTask
     rows: ProbeSplit
     clean: dict[str, np.ndarray]
     seed: int
@@ -61,7 +63,10 @@ class _Case:
         return np.concatenate(list(self.clean.values()), axis=1)
 
     def fit(self, x: np.ndarray, rows: ProbeSplit) -> Callable[[np.ndarray], dict[str, Any]]:
-        """Fit logistic regression; returns a function from features of the test rows to scores."""
+        """Fit logistic regression, or ridge; returns a function from features of the test rows to scores."""
+        if isinstance(self.task, ValueTask):
+            guess, found = fit_values(x, self.pack, self.task, rows, "linear")
+            return lambda z: {**score_predictions(self.pack, self.task, rows.test, guess(z)), **found}
         predict, extra = fit_probe(x, self.pack, self.task, rows, "linear", self.seed)
         return lambda z: {**score_rows(self.pack, self.task, rows.test, predict(z)), **extra}
 
@@ -70,13 +75,13 @@ class _Case:
 
 
 def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> list[dict[str, Any]]:
-    """Records of every stress for each task with classes and each modality that ``model`` has an encoder for.
+    """Records of every stress for each task and each modality that ``model`` has an encoder for.
 
     Rows and noise are drawn alike for all models of one seed, so that differences are paired.
     """
     seed, records = model.run.seed, []
     noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
-    for task, modality in product(with_classes(tasks), modalities):
+    for task, modality in product(tasks, modalities):
         names = names_in(modality, pack)
         if not set(names) <= set(model.encoders):
             continue
@@ -97,11 +102,25 @@ def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Seque
 def _fewer_or_leaked(case: _Case) -> Scores:
     """Few labels, and the two splits of ``LEAK``."""
     for kind, share in SHARES.items():
-        yield kind, case.probe(*_few(case.rows, case.pack.labels(case.task.name), share, case.seed))
+        yield kind, case.probe(*_few(case.rows, _strata(case), share, case.seed))
     for kind, leaks in LEAK.items():
-        keep, halved = _halved(case.rows, case.pack.column("group"), leaks, case.seed)
+        # One half for all seeds: of values, others could lack other measurements, and seeds must share their test rows.
+        seed = 0 if isinstance(case.task, ValueTask) else case.seed
+        keep, halved = _halved(case.rows, case.pack.column("group"), leaks, seed)
         if len(halved.test):
             yield kind, case.probe(keep, halved)
+
+
+def _strata(case: _Case) -> np.ndarray:
+    """What few labels keep one row of, for each row of the pack: its class, or which values it has and whether they are low.
+
+    So every target keeps a row, and a single one two different values.
+    """
+    if isinstance(case.task, Task):
+        return case.pack.labels(case.task.name)
+    values = case.pack.values(case.task)
+    low = (values < np.nanmedian(values[case.rows.train], axis=0)).any(axis=1)
+    return np.unique(np.column_stack([np.isnan(values), low]), axis=0, return_inverse=True)[1]
 
 
 def _worse_images(case: _Case, noisy: np.ndarray) -> Scores:

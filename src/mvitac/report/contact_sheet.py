@@ -103,15 +103,18 @@ def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96
 
 
 def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128) -> str:
-    """All strips as one HTML page, each pair with its id, group, split and labels."""
+    """All strips as one HTML page, each pair with its id, group, split, labels and values."""
     from mvitac.report import html
 
     tasks = {task.name: (task.classes, pack.column(f"{TASK}{task.name}")) for task in pack.spec.tasks}
     names = {name: pack.column(name).astype(str) for name in ("id", "group", "split")}
 
+    values = [pair for task in pack.spec.values for pair in zip(task.targets, pack.values(task).T, strict=True)]
+
     def caption(row: int) -> str:
         labels = [f"{task_title(t, classes)}: {classes[v[row]]}" for t, (classes, v) in tasks.items() if v[row] >= 0]
-        return "; ".join([*(found[row] for found in names.values()), *labels])
+        numbers = [f"{t.name}: {v[row]:.3g} {t.unit}" for t, v in values if np.isfinite(v[row])]
+        return "; ".join([*(found[row] for found in names.values()), *labels, *numbers])
 
     sections = []
     for number, strip in enumerate(found):

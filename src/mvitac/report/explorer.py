@@ -47,6 +47,8 @@ canvas:focus-visible, button:focus-visible { outline: 3px solid #4fb0e2; outline
                  background: none; cursor: pointer; opacity: .7; }
 .legend button[aria-pressed=true] { border-color: var(--border-color-primary); opacity: 1; }
 .legend i { display: inline-block; width: 10px; height: 10px; margin-right: 5px; }
+.legend .bar { display: flex; align-items: center; gap: 6px; font-size: 13px; margin: 4px 0; }
+.legend .bar i { width: min(240px, 45vw); height: 12px; margin: 0; border-radius: 2px; }
 .count { font-size: 12px; opacity: .7; }
 """
 FOUND = f"""
@@ -95,12 +97,15 @@ def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
 
 def _controls(land: ExplorerData) -> list[Any]:
     """The choices above the map: features, colour, task, split, mistakes only."""
-    tasks, splits = list(land.classes), ["all", *sorted(set(land.split))]
+    tasks, splits = [*land.classes, *land.values], ["all", *sorted(set(land.split))]
     with gr.Row():
         return [
             gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of", min_width=120),
             gr.Dropdown(
-                ["label", "error", "split"], value="label" if tasks else "split", label="colour by", min_width=120
+                [("label or value", "label"), "error", "split"],
+                value="label" if tasks else "split",
+                label="colour by",
+                min_width=120,
             ),
             gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task", min_width=120),
             gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split", min_width=120),
@@ -139,8 +144,8 @@ def _on_click(land: ExplorerData) -> Callable[[str | None, gr.EventData], list[A
 
     def click(task: str | None, event: gr.EventData) -> list[str]:
         i = int(event.row)
-        title = task_title(task, land.classes[task]) if task else ""
-        legend = f"; ✓ same {title}, ✕ another" if task and land.labels[task][i] >= 0 else ""
+        title = task_title(task, land.classes[task]) if task in land.labels else ""
+        legend = f"; ✓ same {title}, ✕ another" if task in land.labels and land.labels[task][i] >= 0 else ""
         lists = [
             _found(land, f"nearest by {m}" + legend, land.neighbours(x[i : i + 1], m, K, without=i), m, i, task)
             for m, x in land.x.items()
@@ -166,7 +171,7 @@ def _found(
         if task and mark:
             mark += f" {land.classes[task][land.labels[task][i]]}"
         image = html.picture(land.picture(i, modality), f"{modality} of {land.name(i)}", 224)
-        cells.append(html.cell(css, image, mark, f"{land.name(i)} · {score:.2f}"))
+        cells.append(html.cell(css, image, mark, f"{land.name(i, task)} · {score:.2f}"))
     return f'<h4>{escape(title)}</h4><div class="found">{"".join(cells)}</div>'
 
 

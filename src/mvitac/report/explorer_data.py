@@ -20,7 +20,10 @@ from mvitac.deploy.search import check_pack, nearest
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.registry import unknown
-from mvitac.report.palette import COLOURS, MAP_HUES
+from mvitac.report.palette import COLOURS, MAP_HUES, ramp
+
+LEVELS = 32
+"""Number of colours between the lowest and the highest value."""
 
 
 class ExplorerData:
@@ -49,6 +52,10 @@ class ExplorerData:
         self.split = pack.column("split")[self.rows].astype(str)
         self.labels = {t.name: pack.column(f"label_{t.name}")[self.rows].astype(int) for t in pack.spec.tasks}
         self.classes: dict[str, tuple[str, ...]] = {t.name: t.classes for t in pack.spec.tasks}
+        self.values: dict[str, np.ndarray] = {}  # target and its unit -> [N]; NaN = not measured
+        for task in pack.spec.values:
+            for target, found in zip(task.targets, pack.values(task)[self.rows].T, strict=True):
+                self.values[f"{target.name} ({target.unit})"] = found
         self.guess: dict[str, np.ndarray] = {}
         for task in tuple(self.classes):
             readout = self.model.readouts.get(f"{task}.{self.modalities[-1]}")
@@ -95,8 +102,10 @@ class ExplorerData:
         return np.flatnonzero(keep)
 
     def points(self, modality: str, colour: str, split: str, task: str | None, *, mistakes: bool = False) -> str:
-        """The map as JSON for scatter.js; ``colour`` is "label", "error" or "split"."""
+        """The map as JSON for scatter.js; ``colour`` is "label", "error" or "split". A target is coloured by its value."""
         index = self.shown(split, task, mistakes=mistakes)
+        if task in self.values and colour != "split":
+            return self._by_value(modality, index, task)
         if colour == "split" or task is None:
             names: Sequence[str] = sorted(set(self.split))
             values = np.searchsorted(names, self.split)
@@ -111,20 +120,39 @@ class ExplorerData:
         hues = ("sky", "vermilion", "amber") if colour == "error" else MAP_HUES
         largest = [u for u in np.argsort(-counts, kind="stable") if names[used[u]] != "unlabelled"][: len(hues)]
         first = [names[0], names[1]] if colour == "error" else [names[used[u]] for u in sorted(largest)]
-        xy = (65535 * self.plane(modality)[index].T).astype("<u2")
-        return json.dumps(
-            {
-                "xy": _base64(xy),
-                "group": _base64(np.searchsorted(used, values[index]).astype("<u2")),
-                "row": _base64(index.astype("<i4")),
-                "legend": [str(names[v]) for v in used.tolist()],
-                "coloured": first,
-                "hues": [COLOURS[hue] for hue in hues],
-                "gray": COLOURS["grey4"],
-                "by": task if colour == "label" else colour,
-                "axes": self.axes(modality),
-            }
+        return self._json(
+            modality,
+            index,
+            np.searchsorted(used, values[index]),
+            legend=[str(names[v]) for v in used.tolist()],
+            coloured=first,
+            hues=[COLOURS[hue] for hue in hues],
+            by=task if colour == "label" else colour,
         )
+
+    def _by_value(self, modality: str, index: np.ndarray, target: str) -> str:
+        """The map coloured by the values of ``target``; "bar" is the range of the colours. 1 % at either end share one."""
+        values = self.values[target]
+        low, high = np.nanpercentile(values, [1, 99]).tolist()
+        share = np.clip((values[index] - low) / max(high - low, 1e-12), 0, 1)
+        levels = [str(level) for level in range(LEVELS)]
+        return self._json(
+            modality,
+            index,
+            np.where(np.isnan(share), LEVELS, np.nan_to_num(share) * (LEVELS - 1)).round(),
+            legend=[*levels, "not measured"],
+            coloured=levels,
+            hues=ramp(LEVELS),
+            by=target,
+            bar=[f"{low:.3g}", f"{high:.3g}", target],
+        )
+
+    def _json(self, modality: str, index: np.ndarray, group: np.ndarray, **legend: Any) -> str:
+        """The points ``index``, each with the number of its group in the legend."""
+        xy = (65535 * self.plane(modality)[index].T).astype("<u2")
+        points = {"xy": xy, "group": group.astype("<u2"), "row": index.astype("<i4")}
+        found = {name: _base64(array) for name, array in points.items()}
+        return json.dumps({**found, **legend, "gray": COLOURS["grey4"], "axes": self.axes(modality)})
 
     def neighbours(self, queries: np.ndarray, modality: str, k: int, without: int = -1) -> list[tuple[int, float]]:
         """(index, cosine) of the k rows nearest to a unit vector [1, D], without row ``without``."""
@@ -134,12 +162,12 @@ class ExplorerData:
 
     def same_class(self, i: int, j: int, task: str | None) -> bool | None:
         """Whether rows ``i`` and ``j`` have the same label of ``task``; None where one has no label."""
-        if task is None or self.labels[task][i] < 0 or self.labels[task][j] < 0:
+        if task not in self.labels or self.labels[task][i] < 0 or self.labels[task][j] < 0:
             return None
         return bool(self.labels[task][i] == self.labels[task][j])
 
     def describe(self, i: int) -> str:
-        """One line about row ``i``: id, split, labels, and wrong predictions."""
+        """One line about row ``i``: id, split, labels, wrong predictions, and values."""
         row = int(self.rows[i])
         parts = [str(self.pack.table.column("id")[row]), str(self.split[i])]
         for task, labels in self.labels.items():
@@ -148,12 +176,21 @@ class ExplorerData:
                 if task in self.guess and self.guess[task][i] != labels[i]:
                     text += f" (probe: {self.classes[task][self.guess[task][i]]})"
                 parts.append(text)
+        parts += [self._measured(i, target) for target in self.values if np.isfinite(self.values[target][i])]
         return " · ".join(parts)
 
-    def name(self, i: int) -> str:
-        """The labels of row ``i``, or its id where it has none."""
+    def _measured(self, i: int, target: str) -> str:
+        """The value of a target, such as "force_n 3.2 N"."""
+        name, _, unit = target.removesuffix(")").partition(" (")
+        return f"{name} {self.values[target][i]:.3g} {unit}"
+
+    def name(self, i: int, target: str | None = None) -> str:
+        """The labels of row ``i``, or its id where it has none; and its value of ``target``, if that is one."""
         said = [self.classes[task][labels[i]] for task, labels in self.labels.items() if labels[i] >= 0]
-        return ", ".join(said) or str(self.pack.table.column("id")[int(self.rows[i])])
+        said = said or [str(self.pack.table.column("id")[int(self.rows[i])])]
+        if target in self.values and np.isfinite(self.values[target][i]):
+            said.append(self._measured(i, target))
+        return ", ".join(said)
 
     def picture(self, i: int, modality: str) -> np.ndarray:
         """uint8 [S, S, 3], or [S, 2 S, 3] for two sensors."""

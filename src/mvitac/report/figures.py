@@ -7,6 +7,7 @@ and a dark page. No pyplot: no global state, nothing to close.
 from __future__ import annotations
 
 import io
+import math
 import re
 import textwrap
 import warnings
@@ -31,9 +32,13 @@ from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, c
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
 
+ONE_ANSWER = {"majority": ":", "mean": "--"}
+"""Controls that give one answer for all rows, and their lines."""
+LEAST = -0.5
+"""Where figures cut off R2, which has no lower limit."""
 WIDTH = 3.8
 """Inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high."""
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # class names may contain a dollar sign
     "font.size": 9,
     "svg.fonttype": "none",  # keep text as text, in the page's font
@@ -44,7 +49,8 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def _figure(title: str, height: float) -> tuple[Figure, Axes]:
+def new_figure(title: str, height: float) -> tuple[Figure, Axes]:
+    """Axes ``WIDTH`` wide."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     axes = figure.subplots()
     axes.set_title(shorten(title, 40), color=colour("ink"))
@@ -59,7 +65,7 @@ def shorten(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
-def _below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
+def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
     """Put a legend below the axes, where it hides nothing."""
     options: dict[str, Any] = {"handlelength": 1.4, "columnspacing": 1.2, "fontsize": 9, "handletextpad": 0.5}
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, labelcolor=colour("ink"), **options)
@@ -68,7 +74,7 @@ def _below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], column
 # -- figures ----------------------------------------------------------------------------------------------------------
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def bars(
     title: str, groups: Mapping[str, Mapping[str, Mapping[str, float]]], lines: Mapping[str, float], what: str
 ) -> Figure:
@@ -76,26 +82,30 @@ def bars(
 
     Args:
         title: Title of the figure.
-        groups: Group (modality or direction) -> source -> mean, low and high in 0 .. 1.
+        groups: Group (modality or direction) -> source -> mean, low and high, at most 1. ``low`` None: no whisker.
         lines: Vertical lines across the bars of all groups, such as majority or chance.
         what: Label of the axis.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
-    figure, axes = _figure(title, 0.85 + 0.21 * num_rows)
+    figure, axes = new_figure(title, 0.85 + 0.21 * num_rows)
     y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
+    lows = [cell[k] for group in groups.values() for cell in group.values() for k in ("mean", "low")]
+    least = max(LEAST, min(0.0, *(low for low in lows if low is not None)))
     for number, (group, cells) in enumerate(groups.items()):
         hue = MODALITY_HUES.get(group, HUES[2 + 2 * (number % 2)])
-        axes.text(0, y, group.replace("->", "→"), color=colour(hue), fontweight="bold", va="center", ha="left")
+        axes.text(
+            100 * least, y, group.replace("->", "→"), color=colour(hue), fontweight="bold", va="center", ha="left"
+        )
         spans.append((y + 0.5, y + len(cells) + 0.5))
         for source, cell in cells.items():
             y += 1
-            _bar(axes, y, source, cell, hue)
+            _bar(axes, y, source, cell, hue, least)
             ticks[y] = shorten(source, 22)
             top = max(top, cell["high"])
         y += 1.25
     axes.set_yticks(list(ticks), list(ticks.values()), color=colour("ink"))
     axes.set_ylim(y - 0.6, -0.7)
-    axes.set_xlim(0, max(1.0, 100 * top * 1.15))
+    axes.set_xlim(100 * least, max(1.0, 100 * (top + 0.15 * (top - least))))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
     axes.set_axisbelow(True)
@@ -105,20 +115,22 @@ def bars(
     for number, (name, value) in enumerate(lines.items()):
         look: dict[str, Any] = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3]}
         for low, high in spans:  # not through the names of the groups
-            axes.plot([100 * value] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
+            axes.plot([100 * max(least, value)] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
         handles.append(Line2D([], [], **look))
         labels.append(f"{shorten(name, 28)} {percent(value)}")
     if handles:
-        _below(figure, handles, labels, 3)
+        legend_below(figure, handles, labels, 3)
     return figure
 
 
-def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, float], hue: str) -> None:
-    """One bar with its whisker and its value."""
-    mean, low, high = (100 * cell[k] for k in ("mean", "low", "high"))
+def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, least: float) -> None:
+    """One bar with its whisker, if it has one, and its value. Nothing is drawn below ``least``."""
+    ends = [cell["low"], cell["high"]] if cell["low"] is not None else [cell["mean"]] * 2
+    mean, low, high = (100 * max(least, value) for value in (cell["mean"], *ends))
     axes.barh(y, mean, 0.74, color=colour(CONTROL_GREYS.get(source, hue)))
-    axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
-    axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
+    if low < high:
+        axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
+        axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
     look: dict[str, Any] = {"va": "center", "fontsize": 9, "color": colour("ink"), "textcoords": "offset points"}
     look["fontweight"] = "normal" if source in CONTROL_GREYS else "bold"
     look["bbox"] = {"facecolor": colour("card"), "edgecolor": "none", "pad": 0.5}  # no line runs through the value
@@ -127,7 +139,7 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, float], hue: str)
 
 @dataclass(frozen=True)
 class Dot:
-    """A score of one source at one modality ("none" = a control without features), in 0 .. 1."""
+    """A score, "accuracy" or "R2", of one source at one modality ("none" = a control without features), at most 1."""
 
     source: str
     modality: str
@@ -136,9 +148,10 @@ class Dot:
     high: float
     printed: float | None
     control: bool
+    score: str = "accuracy"
 
 
-@matplotlib.rc_context({**_STYLE, "font.size": 10})
+@matplotlib.rc_context({**STYLE, "font.size": 10})
 def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
     """A panel per task, a line per source, a dot with its 95 % interval per modality.
 
@@ -148,7 +161,7 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
     best: dict[tuple[bool, str], float] = {}
     for dot in dots:
         key = dot.control, dot.source
-        best[key] = max(best.get(key, 0.0), dot.mean if dot in next(iter(panels.values())) else 0.0)
+        best[key] = max(best.get(key, -math.inf), dot.mean if dot in next(iter(panels.values())) else -math.inf)
     rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
     names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
     size = (3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows))
@@ -163,25 +176,28 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
         axes.set_ylim(-0.7, len(rows) - 0.3)
         controls = sum(control for control, _ in best)
         axes.axhline(controls - 0.5, color=colour("soft"), linewidth=0.7)
-        axes.set_xlabel("accuracy %")
+        axes.set_xlabel(f"{panel[0].score} %")
         axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
         axes.tick_params(length=0)
         axes.spines[["top", "right", "left"]].set_visible(False)
     entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
-    order = [name for name in ("touch", "vision", "both", "printed", "majority") if name in entries]
-    _below(figure, [entries[name] for name in order], order, 5)
+    order = [name for name in ("touch", "vision", "both", "printed", *ONE_ANSWER) if name in entries]
+    legend_below(figure, [entries[name] for name in order], order, 5)
     return figure
 
 
 def _dot(axes: Axes, dot: Dot, rows: Sequence[str]) -> None:
     if dot.modality == "none":
-        if dot.source == "majority":
-            axes.axvline(100 * dot.mean, color=colour("soft"), linewidth=1, linestyle=":", label="majority")
+        if dot.source in ONE_ANSWER:
+            at = 100 * max(LEAST, dot.mean)
+            axes.axvline(at, color=colour("soft"), linewidth=1, linestyle=ONE_ANSWER[dot.source], label=dot.source)
         return
     hue = colour(MODALITY_HUES[dot.modality])
     y = rows.index(dot.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[dot.modality]
-    axes.plot([100 * dot.low, 100 * dot.high], [y, y], color=hue, linewidth=1.6)
-    axes.plot(100 * dot.mean, y, "o", markersize=4.5, color=hue, label=dot.modality)
+    if math.isfinite(dot.low):
+        axes.plot([100 * max(LEAST, v) for v in (dot.low, dot.high)], [y, y], color=hue, linewidth=1.6)
+    marker = "o" if dot.mean >= LEAST else "<"  # R2 may be lower than the axis goes
+    axes.plot(100 * max(LEAST, dot.mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
     if dot.printed is not None:
         axes.plot(100 * dot.printed, y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
 
@@ -197,10 +213,10 @@ class Line:
     dash: str = "-"
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | None = None) -> Figure:
     """Curves over steps; ``references`` are horizontal lines such as chance."""
-    figure, axes = _figure(title, 2.75)
+    figure, axes = new_figure(title, 2.75)
     handles: dict[str, Any] = {}
     several = len({line.label for line in lines}) < len(lines)  # seeds: thinner lines
     for line in lines:
@@ -219,15 +235,15 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
     axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
     axes.set_xlabel("step", color=colour("soft"), fontsize=9)
     labels = [shorten(label, 30) for label in handles]
-    _below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
+    legend_below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     """Row-normalised confusion matrix of ``counts`` [true, predicted]; correct cells blue, mistakes vermilion."""
     num = len(classes)
-    figure, axes = _figure(title, 3.4 if num <= 4 else 4.3)
+    figure, axes = new_figure(title, 3.4 if num <= 4 else 4.3)
     totals = counts.sum(1, keepdims=True)
     shares = counts / np.maximum(totals, 1)
     axes.add_patch(Rectangle((-0.5, -0.5), num, num, facecolor=colour("panel"), edgecolor="none"))
@@ -259,14 +275,14 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> Figure:
     """Points [N, 2] by label [N] (-1 = unlabelled). Each further eight classes repeat the hues with another marker."""
     shown = [label for label in range(-1, len(classes)) if (labels == label).any()]
     longest = max((len(shorten(classes[label], 16)) for label in shown if label >= 0), default=0)
     columns = 4 if longest <= 10 else 3
     num_entries = min(len(shown), 40)
-    figure, axes = _figure(title, 3.5 + 0.16 * -(-num_entries // columns))
+    figure, axes = new_figure(title, 3.5 + 0.16 * -(-num_entries // columns))
     handles, names = [], []
     for label in shown:
         look: dict[str, Any] = {"color": colour("grey3"), "marker": "."}
@@ -284,14 +300,14 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
     for spine in axes.spines.values():
         spine.set_color(colour("rule"))
     if classes or len(shown) > 1:
-        _below(figure, handles, names, columns)
+        legend_below(figure, handles, names, columns)
     return figure
 
 
 # -- to files and into the page ---------------------------------------------------------------------------------------
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face: str, **options: Any) -> bytes:
     """Print the figure with ``canvas``. It is laid out once for all canvases; savefig would repeat that."""
     figure.set_facecolor(face)

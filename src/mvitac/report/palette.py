@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 COLOURS: dict[str, tuple[str, str]] = {
     "card": ("#ffffff", "#171c23"),
     "ink": ("#1d232b", "#e7eaee"),
@@ -28,6 +30,19 @@ MAP_HUES = (*HUES, "ink", "indigo")
 """Ten colours for the explorer's map: as many as an eye can tell apart."""
 MODALITY_HUES = {"touch": "blue", "vision": "vermilion", "both": "green"}
 CONTROL_GREYS = {"imagenet": "grey1", "untrained": "grey2", "pixels": "grey3", "border": "grey4"}
+
+
+def ramp(num: int) -> list[tuple[str, str]]:
+    """``num`` colours from low to high (viridis), each for a light and a dark page, without the ends that vanish there."""
+    import matplotlib  # imported here: it is slow, and few pages need it
+
+    scale = matplotlib.colormaps["viridis"]
+    light, dark = (scale(np.linspace(*ends, num), bytes=True)[:, :3].tolist() for ends in ((0.0, 0.92), (0.15, 1.0)))
+    return [(_hex(a), _hex(b)) for a, b in zip(light, dark, strict=True)]
+
+
+def _hex(rgb: list[int]) -> str:
+    return "#" + "".join(f"{level:02x}" for level in rgb)
 
 
 def colour(name: str) -> str:

@@ -20,7 +20,8 @@ function load() {
   }
   data = { ...given, x: xy.subarray(0, xy.length / 2), y: xy.subarray(xy.length / 2),
            group: new Uint16Array(bytes(given.group).buffer), row: new Int32Array(bytes(given.row).buffer) };
-  legend.replaceChildren(...given.legend.map((name) => {
+  if (given.bar) legend.replaceChildren(bar(given));
+  else legend.replaceChildren(...given.legend.map((name) => {
     const item = document.createElement("button");
     item.type = "button";
     item.append(document.createElement("i"), name);
@@ -30,6 +31,14 @@ function load() {
   element.dataset.points = data.row.length;
   hide();
   paint();
+}
+
+function bar(given) {  // the colours from the lowest to the highest value, instead of a button for each group
+  const [low, high, target] = given.bar, box = document.createElement("div"), strip = document.createElement("i");
+  box.className = "bar";
+  strip.style.background = `linear-gradient(to right, ${given.hues.map(colour).join(", ")})`;
+  box.append(`${target}: ${low}`, strip, high);
+  return box;
 }
 
 function choose(name) {  // in colour or in gray; if all colours are taken, in that of the group chosen first
@@ -48,6 +57,11 @@ function choose(name) {  // in colour or in gray; if all colours are taken, in t
 function colour(pair) { return pair[document.body.classList.contains("dark") ? 1 : 0]; }
 
 function paint() {  // the legend
+  if (data.bar) {
+    count.textContent = data.row.length ? `${data.row.length} pairs; gray: not measured`
+      : "nothing to show: choose another split or filter";
+    return;
+  }
   const shown = data.legend.filter((name) => slots.includes(name)).length;
   data.legend.forEach((name, g) => {
     const item = legend.children[g], k = slots.indexOf(name);

@@ -1,0 +1,265 @@
+"""Tasks with values on the terminal, in the report and in comparisons: R2, errors in the unit, pictures, odd cases."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.notebook import pack_html
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.probe import split_rows
+from mvitac.evaluation.robustness import DROPOUT, LEAK, NOISE, SHARES, stress
+from mvitac.evaluation.scores import cell_text, summarise, summarise_again
+from mvitac.experiments import table_formats
+from mvitac.experiments.plan import Plan, Row
+from mvitac.experiments.table import lines_of, target_lines
+from mvitac.model import load
+from mvitac.recipes import recipe
+from mvitac.registry import to_json
+from mvitac.report import contact_sheet, figures
+from mvitac.report.report import write_report
+from mvitac.report.tables import print_summary
+from mvitac.report.value_figures import predicted
+from mvitac.training.loop import train
+from support.toy import Toy
+
+
+class OneTested(Toy):
+    """Values alone, of touch alone; all but one group to learn from."""
+
+    def spec(self) -> DataSpec:
+        return replace(super().spec(), tasks=())
+
+    def read(self, item: int) -> list[Sample]:
+        (made,) = super().read(item)
+        columns = {name: value for name, value in made.columns.items() if not name.startswith("label_")}
+        split = "test" if columns["group"] == "1-4" else "train"
+        return [replace(made, columns={**columns, "split": split, "weight": float(item)})]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"one": self.num}
+
+
+def scored_run(folder: Path, source: Toy, **session: Any) -> tuple[Path, Pack, dict[str, Any]]:
+    pack = build(source, folder / "pack", size=16, workers=1, quiet=True)
+    run = recipe("smoke", PackConfig(path=pack.path))
+    run = replace(run, augment=replace(run.augment, size=16), steps=2, eval_every=0, batch_size=8)
+    out = train(run, folder / "run", quiet=True)
+    return out, pack, probe_runs([out], ProbeConfig(**session))
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pack, dict[str, Any]]:
+    return scored_run(tmp_path_factory.mktemp("values"), Toy(values=True), probes=("paper", "linear", "knn"))
+
+
+def said(result: dict[str, Any], probe: str = "linear") -> str:
+    file = io.StringIO()
+    print_summary(result, Console(file=file, width=200, markup=False), probe=probe)
+    return file.getvalue()
+
+
+def test_the_terminal_says_what_each_task_is_scored_by(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
+    *_, result = scored
+    parts = dict(re.findall(r"^toy: (\w+) \((.*?)(?=^toy: |\Z)", said(result, "paper"), re.M | re.S))
+    assert "accuracy %" in parts["pattern"] and "the paper's probe" in parts["pattern"]
+    assert "R2 %" in parts["light"] and "ridge regression" in parts["light"]
+    assert "accuracy" not in parts["light"] + parts["both"]
+    for source in ("mvitac", "untrained", "pixels", "border", "mean", "noise only"):
+        assert cell_text(result["summary"]["light"], source, "touch") in parts["light"]
+    level, weight = result["summary"]["both"]["touch"]["mvitac"]["targets"]
+    assert f"{100 * weight['mean']:.1f}, {weight['mae']:.3g} N" in parts["both"]
+    assert f"{100 * level['mean']:.1f}, {level['mae']:.3g} levels" in parts["both"]
+
+
+def test_a_probe_that_values_lack_does_not_hide_them(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
+    """The paper's probe is of classes: values keep their first probe, and are not repeated by a second one."""
+    *_, result = scored
+    by_paper, ridge, near = (summarise(result["records"], kind) for kind in ("paper", "linear", "knn"))
+    assert by_paper["light"] == ridge["light"] != near["light"]
+    assert by_paper["pattern"]["touch"]["mvitac"] != ridge["pattern"]["touch"]["mvitac"]
+    again = [r for r in result["records"] if r["probe"] != "knn"]
+    assert set(summarise_again(again, "paper")) == {"pattern", "bright"}
+
+
+def test_targets_have_scores_of_their_own(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
+    *_, result = scored
+    cell = summarise(result["records"], "linear")["both"]["touch"]["pixels"]
+    (record,) = (r for r in result["records"] if (r["task"], r["source"], r["modality"]) == ("both", "pixels", "touch"))
+    assert cell["mean"] == pytest.approx(np.mean([target["mean"] for target in cell["targets"]]))
+    for found, target in zip(cell["targets"], record["targets"], strict=True):
+        assert (found["mean"], found["mae"], found["rmse"]) == pytest.approx(
+            (target["r2"], target["mae"], target["rmse"])
+        )
+        assert found["low"] < found["mean"] < found["high"]
+
+
+def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_path: Path) -> None:
+    run, _, result = scored
+    page = write_report([run], tmp_path, result=result, quiet=True).read_text().replace("\xa0", " ")
+    page = page.replace("&nbsp;", " ")
+    for target in result["summary"]["both"]["touch"]["mvitac"]["targets"]:
+        assert f"{target['mae']:.3g} {target['unit']}" in page
+    assert cell_text(result["summary"]["light"], "untrained", "vision") in page
+    drawn = {file.name for file in (tmp_path / "figures").iterdir()}
+    assert {"predicted-light--level.png", "predicted-both--weight.png", "error-both--weight.png"} <= drawn
+    assert "R2 %, mean and 95 % interval" in page and ">accuracy %, mean and 95 % interval" in page
+    classes = re.search(r"Every probe with balanced.*?</table>", page, re.S)
+    assert classes and "light" not in classes[0] and "pattern" in classes[0]
+
+
+def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
+    run, _, result = scored_run(tmp_path, OneTested(values=True, vision_channels=0, num=48))
+    stored = json.loads((run / "probe.json").read_text())
+    cell = stored["summary"]["both"]["touch"]["pixels"]
+    assert cell["low"] is None and cell["groups"] == 1 and cell["targets"][0]["low"] is None
+    assert stored == result
+    (run / "probe.json").unlink()  # the report probes values by itself
+    text = f"{100 * cell['mean']:.1f}"
+    assert cell_text(stored["summary"]["both"], "pixels", "touch") == text and "inf" not in said(stored)
+    page = write_report([run], tmp_path / "out", quiet=True).read_text().replace("&nbsp;", " ")
+    assert f"<td>{text}</td>" in page and "1 test instance, so no interval" in page and ">inf" not in page
+    best = result["summary"]["light"]["touch"]["mvitac"]["mean"]
+    assert f"Touch reaches R2 {100 * best:.1f} % on light" in page
+    assert "balanced accuracy" not in page and "Confusion" not in page
+    rows = csv.reader(io.StringIO(table_formats.comma(compared(stored))))
+    assert not any(value in ("inf", "-inf", "nan") for row in rows for value in row)
+    table_formats.figure(compared(stored), lines_of(compared(stored)))
+
+
+def compared(result: dict[str, Any]) -> dict[str, Any]:
+    """``result`` as that of a comparison of one row."""
+    kept: dict[str, Any] = {"left_out": {}, "failed": {}, "unfinished": [], "leaks": "", "cost": [], "commit": None}
+    plan = Plan(name="one", rows=(Row(label="mvitac"),), reference="mvitac", recipe="smoke", probes=("linear", "knn"))
+    return {**result, **kept, "device": "cpu", "plan": to_json(plan), "rows": ["mvitac"]}
+
+
+def test_tables_of_a_comparison_have_a_table_of_targets(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
+    whole = compared(scored[2])
+    lines = lines_of(whole)
+    text, tex = table_formats.markdown(whole, lines), table_formats.latex(whole, lines)
+    assert "| pattern % | to mvitac | bright % | to mvitac | light R2 % | to mvitac | both R2 % |" in text
+    assert "logistic regression or ridge regression on frozen features" in text
+    assert r"light ($R^2$, \%)" in tex and r"pattern (\%)" in tex and tex.count(r"\begin{tabular}") == 3
+    (line,) = (x for x in target_lines(whole)["both"] if (x.source, x.modality) == ("untrained", "touch"))
+    weight = line.cells["weight"]
+    cell = summarise(whole["records"], "linear")["both"]["touch"]["untrained"]["targets"][1]
+    assert (weight.mean, weight.low, weight.target) == (cell["mean"], cell["low"], cell) and weight.difference
+    for shown in (text, tex):
+        assert f"{100 * cell['mean']:.1f} [{100 * cell['low']:.1f}, {100 * cell['high']:.1f}]" in shown
+        assert f"{cell['mae']:.3g} N" in shown
+    rows = list(csv.DictReader(table_formats.comma(whole).splitlines()))
+    (found,) = (
+        r
+        for r in rows
+        if (r["row"], r["modality"], r["probe"], r["target"]) == ("untrained", "touch", "linear", "weight")
+    )
+    assert (found["task"], found["score"], found["unit"]) == ("both", "R2", "N")
+    assert float(found["mae"]) == cell["mae"] and float(found["accuracy"]) == cell["mean"]
+    keys = [(r["row"], r["probe"], r["modality"], r["task"], r["target"]) for r in rows]
+    assert len(keys) == len(set(keys))
+    assert {r["probe"] for r in rows if r["row"] == "pixels"} == {"linear"}
+
+
+def test_a_comparison_of_classes_has_the_columns_it_had(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
+    classes = [r for r in scored[2]["records"] if "targets" not in r]
+    head = table_formats.comma(compared({**scored[2], "records": classes})).splitlines()[0]
+    assert head.endswith(",p,leak")
+
+
+def test_figures_cut_off_what_no_axis_can_show() -> None:
+    cells = {"good": {"mean": 0.8, "low": 0.7, "high": 0.9}, "bad": {"mean": -40.0, "low": -90.0, "high": -3.0}}
+    unknown = {"mean": 0.2, "low": None, "high": 1.0}
+    drawn = figures.bars("force", {"touch": {**cells, "one": unknown}}, {"mean": -0.01}, "R2 %")
+    left, right = drawn.axes[0].get_xlim()
+    assert left == 100 * figures.LEAST and 90 < right < 130
+    assert "-4000.0" in {text.get_text() for text in drawn.axes[0].texts}
+    whiskers = [line.get_xdata() for line in drawn.axes[0].lines if line.get_linestyle() == "-"]
+    assert [20, 20] not in [list(x) for x in whiskers]
+    dots = [figures.Dot(s, "touch", c["mean"], c["low"], c["high"], None, False, "R2") for s, c in cells.items()]
+    axes = figures.comparison({"force": dots}).axes[0]
+    assert axes.get_xlabel() == "R2 %" and min(axes.get_xlim()) > -70
+    assert [line.get_marker() for line in axes.lines if line.get_label() == "touch"] == ["o", "<"]
+
+
+def test_predictions_that_are_exact_lie_on_the_line() -> None:
+    drawn: Figure = predicted("force", [[0, 0], [2, 2], [4, 1000]], "N", "blue")
+    (axes,) = drawn.axes
+    (line,) = axes.lines
+    assert list(line.get_xdata()) == list(line.get_ydata()) and axes.get_xlim() == axes.get_ylim()
+    at = axes.collections[0].get_offsets()
+    assert at[:2].tolist() == [[0, 0], [2, 2]] and at[2, 1] == axes.get_ylim()[1]  # far off: at the edge
+    assert axes.get_xlabel() == "true, N"
+
+
+def test_stress_of_values(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
+    run, pack, _ = scored
+    model, pack = load(run), copy.copy(pack)
+    at = pack.table.column_names.index("weight")
+    weight = np.where(np.arange(pack.num) // 3 % 2, np.arange(pack.num), np.nan)  # one row of each group has it
+    pack.table = pack.table.set_column(at, "weight", pa.array(weight))
+    found = {(r["task"], r["probe"]): r for r in stress(model, pack, pack.spec.values, ["both"])}
+    assert {(task, kind) for task in ("light", "both") for kind in (*SHARES, NOISE, DROPOUT, *LEAK)} <= set(found)
+    assert all(r["r2"] <= 1 and len(r["alpha"]) == len(r["targets"]) for r in found.values())
+    whole = next(
+        r for r in scored[2]["records"] if (r["task"], r["modality"], r["probe"]) == ("light", "both", "linear")
+    )
+    assert found["light", NOISE]["num_test"] == whole["num_test"]
+    assert found["light", "1 % of labels"]["r2"] < whole["r2"]
+    model.run = replace(model.run, seed=7)
+    other = {(r["task"], r["probe"]): r for r in stress(model, pack, pack.spec.values, ["touch"])}
+    for kind in LEAK:  # one half for all seeds, as half of the weights is missing
+        assert other["both", kind]["group_sums"]["n"] == found["both", kind]["group_sums"]["n"]
+
+
+def test_packs_list_their_values(
+    scored: tuple[Path, Pack, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, pack, _ = scored
+    weight = pack.column("weight")[pack.rows("test")]
+    low, high = np.nanmin(weight), np.nanmax(weight)
+    assert f"<td>{low:.3g} to {high:.3g}</td>" in pack_html(pack) and "<th>weight, N</th>" in pack_html(pack)
+    assert main(["data", "info", str(pack.path), "--json", str(tmp_path / "info.json")]) == 0
+    found = json.loads((tmp_path / "info.json").read_text())["splits"]["test"]["values"][-1]
+    assert found == {
+        "task": "both",
+        "target": "weight",
+        "unit": "N",
+        "rows": int(np.isfinite(weight).sum()),
+        "low": low,
+        "high": high,
+    }
+    page = contact_sheet.to_html(pack, *contact_sheet.strips(pack, num=50))
+    (row, *_) = np.flatnonzero(np.isfinite(pack.column("weight")))
+    assert f"weight: {pack.column('weight')[row]:.3g} N" in page
+
+
+def test_a_target_without_values_in_test_is_named(tmp_path: Path) -> None:
+    class Untested(Toy):
+        def read(self, item: int) -> list[Sample]:
+            (made,) = super().read(item)
+            weight = float("nan") if made.columns["split"] == "test" else float(item)
+            return [replace(made, columns={**made.columns, "weight": weight})]
+
+    pack = build(Untested(values=True), tmp_path / "pack", size=16, workers=1, quiet=True)
+    with pytest.raises(ValueError, match="task 'both': weight has fewer than two different values in split test"):
+        split_rows(pack, pack.spec.values[1])
+    assert len(split_rows(pack, pack.spec.values[0]).test)
