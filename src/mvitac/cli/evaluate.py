@@ -12,7 +12,7 @@ from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.robustness import STRESSES, stress
-from mvitac.evaluation.scores import summarise
+from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.model import load
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_summary
@@ -55,9 +55,10 @@ def probe(argv: list[str]) -> None:
     with shown(Console(stderr=True)):
         result = probe_runs(options.runs, options.config, pack, allow_leak=options.allow_leak)
     say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
-    for kind in options.config.probes:
-        print_summary({**result, "summary": summarise(result["records"], kind)}, say, probe=kind)
-    majority = [r for r in result["records"] if r["source"] == "majority"]
+    print_summary(result, say, probe=options.config.probes[0])
+    for kind in options.config.probes[1:]:
+        print_summary({**result, "summary": summarise_again(result["records"], kind)}, say, probe=kind)
+    majority = [r for r in result["records"] if r["source"] in ("majority", "mean")]
     for kind in STRESSES:
         if mine := [r for r in stressed if r["probe"] == kind]:
             print_summary({**result, "summary": summarise(mine + majority, kind)}, say, probe=kind)

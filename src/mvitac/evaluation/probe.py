@@ -67,7 +67,7 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
         modality: Rows must have an image of this modality; "both" asks for both, "none" for no image.
 
     Raises:
-        ValueError: If no labelled row is left in train or in test.
+        ValueError: If no labelled row is left in train or in test, or a target has no different values there.
     """
     having = names_in(modality, pack)
     known = pack.answered(task)
@@ -77,6 +77,8 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
         where = "train" if not len(train) else "test"
         lacking = f" with {' and '.join(having)}" if having else ""
         raise ValueError(f"task {task.name!r} has no labelled rows{lacking} in split {where}: nothing to probe")
+    if isinstance(task, ValueTask):
+        _check_measured(pack.values(task), task, {"train": np.concatenate([train, val]), "test": test})
     if not len(val):
         groups = pack.column("group")[train].astype(str)
         names = np.random.default_rng(0).permutation(np.unique(groups))
@@ -85,6 +87,17 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
             return ProbeSplit(train, train, test)
         train, val = train[~held], train[held]
     return ProbeSplit(train, val, test)
+
+
+def _check_measured(values: np.ndarray, task: ValueTask, rows: dict[str, np.ndarray]) -> None:
+    """Check that each target has two different values in each of ``rows``: without them it has no R2."""
+    for t, target in enumerate(task.targets):
+        for split, mine in rows.items():
+            if len(np.unique(values[mine, t][np.isfinite(values[mine, t])])) < 2:
+                raise ValueError(
+                    f"task {task.name!r}: {target.name} has fewer than two different values in split {split}: nothing to"
+                    " probe. Leave the target out, or split the groups otherwise"
+                )
 
 
 def names_in(modality: str, pack: Pack) -> tuple[str, ...]:

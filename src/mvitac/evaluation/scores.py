@@ -21,7 +21,7 @@ from scipy.special import expit, logit, stdtr, stdtrit
 from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
 
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.value_scores import pool_values, r2_without_each_group
+from mvitac.evaluation.value_scores import one_target, pool_values, r2_without_each_group
 
 
 def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_classes: int) -> dict[str, Any]:
@@ -256,11 +256,14 @@ Cell = tuple[str, str, str]
 
 
 def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[dict[str, Any]]]:
-    """Records of ``probe`` grouped by cell. A source without that probe (majority, pixels, ...) keeps the one it has."""
-    asked = {record["source"] for record in records if record["probe"] == probe}
+    """Records of ``probe`` grouped by cell.
+
+    A source without that probe on a task (majority, pixels, the paper's probe of values) keeps its first one.
+    """
+    kept = {(record["source"], record["task"]): probe for record in records if record["probe"] == probe}
     found: dict[Cell, list[dict[str, Any]]] = {}
     for record in records:
-        if record["probe"] == probe or record["source"] not in asked:
+        if record["probe"] == kept.setdefault((record["source"], record["task"]), record["probe"]):
             found.setdefault((record["task"], record["modality"], record["source"]), []).append(record)
     return found
 
@@ -271,17 +274,45 @@ def leaks_in(records: Sequence[dict[str, Any]]) -> str:
 
 
 def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[str, Any]:
-    """Accuracy as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``)."""
+    """Scores as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``).
+
+    Of values, the score is R2, and "targets" has the scores of each target (``targets_of``). With one test group R2 has
+    no lower end: ``low`` is None.
+    """
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
         mean, low, high = interval(found)
         seeds = [record["seed"] for record in found if record["seed"] is not None]
-        cell: dict[str, Any] = {"mean": mean, "low": low, "high": high, "seeds": seeds}
+        cell: dict[str, Any] = {"mean": mean, "low": _finite(low), "high": high, "seeds": seeds}
         cell["groups"] = num_groups_of(found[0])
+        if "targets" in found[0]:
+            cell["targets"] = targets_of(found)
         if leaks := leaks_in(found):
             cell["leak"] = leaks
         summary.setdefault(task, {}).setdefault(modality, {})[source] = cell
     return summary
+
+
+def summarise_again(records: Sequence[dict[str, Any]], probe: str) -> dict[str, Any]:
+    """``summarise`` by a further probe, without the tasks that have none of this kind: of values, the paper's."""
+    tasks = {record["task"] for record in records if record["probe"] == probe}
+    return summarise([record for record in records if record["task"] in tasks], probe)
+
+
+def targets_of(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Scores of each target over runs: name, unit, mean, low and high of R2, and MAE and RMSE in the unit."""
+    found = []
+    for t, target in enumerate(records[0]["targets"]):
+        mean, low, high = interval([one_target(record, t) for record in records])
+        errors = {key: float(np.mean([record["targets"][t][key] for record in records])) for key in ("mae", "rmse")}
+        about = {"name": target["name"], "unit": target["unit"]}
+        found.append({**about, "mean": mean, "low": _finite(low), "high": high, **errors})
+    return found
+
+
+def _finite(low: float) -> float | None:
+    """``low``, as JSON has no infinity."""
+    return low if math.isfinite(low) else None
 
 
 # -- as text ----------------------------------------------------------------------------------------------------------
@@ -294,9 +325,23 @@ def percent(value: float) -> str:
     return f"{100 * value:.1f}"
 
 
-def with_interval(mean: float, low: float, high: float, leak: str = "") -> str:
-    """A score and its 95 % interval, such as '57.6 [55.1, 60.2]', with LEAK if there is one (``evaluation.leaks``)."""
-    return f"{percent(mean)} [{percent(low)}, {percent(high)}]{leak_mark(leak)}"
+def with_interval(mean: float, low: float | None, high: float, leak: str = "") -> str:
+    """A score and its 95 % interval, such as '57.6 [55.1, 60.2]', with LEAK if there is one (``evaluation.leaks``).
+
+    Without a lower end it is the score alone.
+    """
+    ends = "" if low is None or not math.isfinite(low) else f" [{percent(low)}, {percent(high)}]"
+    return f"{percent(mean)}{ends}{leak_mark(leak)}"
+
+
+def score_name(task: dict[str, Any]) -> str:
+    """What one task's summary scores: "R2" of values, else "accuracy"."""
+    return "R2" if any("targets" in cell for cells in task.values() for cell in cells.values()) else "accuracy"
+
+
+def error_text(target: dict[str, Any], key: str = "mae") -> str:
+    """An error of one target with its unit, such as '0.41 N'."""
+    return f"{target[key]:.3g} {target['unit']}"
 
 
 def covered(group_by: str, records: Sequence[dict[str, Any]]) -> str:
@@ -330,7 +375,7 @@ def sources_of(task: dict[str, Any]) -> list[str]:
     found = list(dict.fromkeys(source for modality in task.values() for source in modality))
     fixed = list(task.get("none", {}))
     own = [s for s in found if s not in last and s not in fixed]
-    return [*own, *(s for s in last if s in found), *sorted(fixed, key=lambda s: s == "majority")]
+    return [*own, *(s for s in last if s in found), *sorted(fixed, key=lambda s: s in ("majority", "mean"))]
 
 
 def cell_text(task: dict[str, Any], source: str, modality: str) -> str:

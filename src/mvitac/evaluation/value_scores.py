@@ -92,6 +92,13 @@ def pool_values(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def one_target(record: dict[str, Any], t: int) -> dict[str, Any]:
+    """The record of target ``t`` alone."""
+    sums = {name: [found[t]] for name, found in record["group_sums"].items()}
+    target = record["targets"][t]
+    return {**record, "r2": target["r2"], "targets": [target], "group_sums": sums, "points": [record["points"][t]]}
+
+
 def r_squared(sums: dict[str, Any]) -> Any:
     """R2 from ``SUMS`` (numbers or arrays): 1 - squared error / squared deviation from the mean of the same rows."""
     spread = sums["squared_value"] - sums["value"] ** 2 / np.maximum(sums["n"], 1)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
 from mvitac.evaluation.robustness import STRESSES
-from mvitac.evaluation.scores import MODALITY_ORDER, by_cell, interval, leaks_in, paired_difference
+from mvitac.evaluation.scores import MODALITY_ORDER, by_cell, interval, leaks_in, paired_difference, targets_of
+from mvitac.evaluation.value_scores import one_target
 from mvitac.experiments.plan import ONE_ROW, Plan
 from mvitac.registry import from_json
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One accuracy with its interval, the printed number and the difference to the reference; in 0 .. 1."""
+    """One score with its interval, the printed number and the difference to the reference; in 0 .. 1."""
 
     mean: float
     low: float
@@ -26,6 +27,10 @@ class Cell:
     """To the reference row: mean, low, high, p (``paired_difference``)."""
     leak: str = ""
     """Which test rows were trained on (``evaluation.leaks``)."""
+    score: str = "accuracy"
+    """"accuracy", or "R2" of values."""
+    target: dict[str, Any] | None = None
+    """Unit, MAE and RMSE of one target (``target_lines``)."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +68,33 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
                     paper = None if trained or probe != "paper" else _printed(result, plan, task, modality, source)
                     seeds = max(1, sum(record["seed"] is not None for record in mine))
                     gap = paired_difference(mine, against) if against else None
-                    cells[task] = Cell(
-                        *interval(mine), seeds, None if paper is None else paper / 100, gap, leaks_in(mine)
-                    )
+                    score = "R2" if "targets" in mine[0] else "accuracy"
+                    paper = None if paper is None else paper / 100
+                    cells[task] = Cell(*interval(mine), seeds, paper, gap, leaks_in(mine), score)
             if cells:
                 lines.append(Line(source, modality, cells, control=source in controls))
     return lines
+
+
+def target_lines(result: dict[str, Any], probe: str | None = None) -> dict[str, list[Line]]:
+    """Of each task with values, its lines with a cell for each target instead of each task."""
+    found: dict[str, list[Line]] = {}
+    values = [record for record in result["records"] if "targets" in record]
+    for task in dict.fromkeys(record["task"] for record in values):
+        mine = [record for record in values if record["task"] == task]
+        split = [{**one_target(r, t), "task": each["name"]} for r in mine for t, each in enumerate(r["targets"])]
+        records = by_cell(split, probe or from_json(Plan, result["plan"], "plan").probes[0])
+        found[task] = [
+            replace(
+                line,
+                cells={
+                    name: replace(cell, target=targets_of(records[name, line.modality, line.source])[0])
+                    for name, cell in line.cells.items()
+                },
+            )
+            for line in lines_of({**result, "records": split}, probe)
+        ]
+    return found
 
 
 def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, source: str) -> float | None:
@@ -84,7 +110,7 @@ def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, sourc
 
 
 def stresses_of(result: dict[str, Any]) -> dict[str, list[Line]]:
-    """The lines of every stress test that was scored (``robustness``). Majority is the only comparable control."""
-    majority = [r for r in result["records"] if r["source"] == "majority"]
+    """The lines of every stress test that was scored (``robustness``), and the only comparable control: one answer."""
+    majority = [r for r in result["records"] if r["source"] in ("majority", "mean")]
     scored = {kind: [r for r in result["records"] if r["probe"] == kind] for kind in STRESSES}
     return {kind: lines_of({**result, "records": mine + majority}, kind) for kind, mine in scored.items() if mine}

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.scores import by_cell, covered, least_p, num_groups_of, percent, with_interval
+from mvitac.evaluation.scores import by_cell, covered, error_text, least_p, num_groups_of, percent, with_interval
 from mvitac.experiments.plan import Plan
-from mvitac.experiments.table import Cell, Line, lines_of, stresses_of
+from mvitac.experiments.table import Cell, Line, lines_of, stresses_of, target_lines
 from mvitac.registry import from_json
 from mvitac.report.figures import Dot, comparison, to_png
-from mvitac.report.tables import PROBE_NAMES, RETRIEVAL, retrieval_rows
+from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
 from mvitac.system.files import write_atomic, write_json
 
 
@@ -42,11 +43,13 @@ def _tasks(lines: Sequence[Line]) -> list[str]:
 
 
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """The whole comparison as Markdown: what was compared, the table, stress tests, AUROC, retrieval and cost."""
+    """The whole comparison as Markdown: what was compared, the tables, stress tests, AUROC, retrieval and cost."""
     plan = _plan(result)
     shown = any(cell.printed is not None for line in lines for cell in line.cells.values())
     text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, lines, shown), ""]
     text += _table(lines, plan.reference, shown)
+    for task, each in target_lines(result).items():
+        text += [f"**{task}**: every target, and its mean absolute error", "", *_table(each, plan.reference, False)]
     for kind, worse in stresses_of(result).items():
         text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
     text += [*_auroc(result, plan, lines), *_retrieval(result), *_cost(result)]
@@ -65,20 +68,28 @@ def _first_cells(line: Line) -> list[str]:
 
 
 def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
-    """Lines as a Markdown table, with the paper's numbers if ``shown``."""
-    tasks = _tasks(lines)
+    """Lines as a Markdown table, with the paper's numbers if ``shown``, and the error of targets."""
+    tasks, known = _tasks(lines), _columns(lines)
     heads = ["", "modality"]
     for task in tasks:
-        heads += [f"{task} %", *(["printed"] if shown else []), f"to {reference}"]
+        error = ["error"] if known[task].target else []
+        score = "R2 " * (known[task].score == "R2")
+        heads += [f"{task} {score}%", *error, *(["printed"] if shown else []), f"to {reference}"]
     rows = []
     for line in lines:
         row = _first_cells(line)
         for task in tasks:
             cell = line.cells.get(task)
             score = with_interval(cell.mean, cell.low, cell.high, cell.leak) if cell else ""
-            row += [score, *([_printed(cell)] if shown else []), _gap(cell)]
+            error = [error_text(cell.target) if cell and cell.target else ""] if known[task].target else []
+            row += [score, *error, *([_printed(cell)] if shown else []), _gap(cell)]
         rows.append(row)
     return _pipes(heads, rows)
+
+
+def _columns(lines: Sequence[Line]) -> dict[str, Cell]:
+    """One cell of each column."""
+    return {task: cell for line in lines for task, cell in line.cells.items()}
 
 
 def _printed(cell: Cell | None) -> str:
@@ -101,7 +112,7 @@ def _preface(result: dict[str, Any], plan: Plan, lines: Sequence[Line], shown: b
     seeds = max((c["seeds"] for c in result["cost"]), default=0)
     text = [
         f"Data {result['data']} (pack {result['pack'][:12]}), recipe {plan.recipe}, {seeds} seed{'s' * (seeds != 1)},"
-        f" {_budget(result)}; {PROBE_NAMES.get(plan.probes[0], plan.probes[0])} on frozen features;"
+        f" {_budget(result)}; {_probes(result, plan)} on frozen features;"
         f" {_made(result)}.",
         f"95 % intervals: {covered(result['group_by'], result['records'])}. {_significance(result, plan, lines)}"
         " Controls are in italics.",
@@ -122,6 +133,12 @@ def _preface(result: dict[str, Any], plan: Plan, lines: Sequence[Line], shown: b
     if result["unfinished"]:
         text.append(f"**Not finished: {', '.join(result['unfinished'])}.**")
     return [line for part in text for line in (part, "")][:-1]
+
+
+def _probes(result: dict[str, Any], plan: Plan) -> str:
+    """The probes of the main table: those of classes and of values."""
+    scores = ("R2" if "targets" in record else "accuracy" for record in result["records"])
+    return " or ".join(dict.fromkeys(probe_name(plan.probes[0], score) for score in scores))
 
 
 def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> str:
@@ -214,20 +231,14 @@ NAMES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "no
 
 
 def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """A booktabs table in the paper's layout: method, modality, accuracy per task, the paper's in parentheses."""
+    """A booktabs table in the paper's layout: method, modality, score per task, the paper's in parentheses.
+
+    A further table for each task with values has its targets.
+    """
     plan = _plan(result)
-    tasks = _tasks(lines)
-    text = [
-        r"\begin{tabular}{ll" + "r" * len(tasks) + "}",
-        r"\toprule",
-        " & ".join(["Method", "Modality", *(f"{_tex(t)} (\\%)" for t in tasks)]) + r" \\",
-        r"\midrule",
-    ]
-    for number, line in enumerate(lines):
-        if line.control and not any(earlier.control for earlier in lines[:number]):
-            text.append(r"\midrule")
-        cells = (_tex_cell(line, task, lines) for task in tasks)
-        text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
+    text = _tabular(lines)
+    for task, each in target_lines(result).items():
+        text += ["", f"% {task}: every target, and its mean absolute error", *_tabular(each)]
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if any(cell.printed is not None for line in lines for cell in line.cells.values()):
         note += f"; in parentheses: printed in the paper on {plan.printed_on}"
@@ -235,11 +246,39 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     notes = [note, *(f"% Note: {note}." for note in _notes(result)), intervals]
     if result["leaks"]:
         notes.append(f"% LEAK: {result['leaks']}.")
-    return "\n".join([*notes, *text, r"\bottomrule", r"\end{tabular}"]) + "\n"
+    return "\n".join([*notes, *text]) + "\n"
+
+
+def _tabular(lines: Sequence[Line]) -> list[str]:
+    """Lines as one LaTeX table."""
+    known = _columns(lines)
+    heads = ["Method", "Modality"]
+    for task in _tasks(lines):
+        heads.append(f"{_tex(task)} ({'$R^2$, ' * (known[task].score == 'R2')}\\%)")
+        heads += ["error"] * bool(known[task].target)
+    text = [
+        r"\begin{tabular}{ll" + "r" * (len(heads) - 2) + "}",
+        r"\toprule",
+        " & ".join(heads) + r" \\",
+        r"\midrule",
+    ]
+    for number, line in enumerate(lines):
+        if line.control and not any(earlier.control for earlier in lines[:number]):
+            text.append(r"\midrule")
+        cells = [text for task in _tasks(lines) for text in _tex_cells(line, task, lines)]
+        text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
+    return [*text, r"\bottomrule", r"\end{tabular}"]
+
+
+def _tex_cells(line: Line, task: str, lines: Sequence[Line]) -> list[str]:
+    """The cells of one task or target: its score, and the error of a target."""
+    cell = line.cells.get(task)
+    error = [_tex(error_text(cell.target)) if cell and cell.target else ""] * bool(_columns(lines)[task].target)
+    return [_tex_cell(line, task, lines), *error]
 
 
 def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
-    """Accuracy and its interval; the best method of a modality is bold."""
+    """A score and its interval; the best method of a modality is bold."""
     cell = line.cells.get(task)
     if cell is None:
         return ""
@@ -257,26 +296,43 @@ def _tex(text: str) -> str:
 
 
 def comma(result: dict[str, Any]) -> str:
-    """Every cell of every probe as one CSV line, in 0 .. 1. A source with one probe (majority) appears once."""
+    """Every cell of every probe as one CSV line, in 0 .. 1. A source with one probe (majority) appears once.
+
+    If there are tasks with values, further columns name the score and the target, with its unit and errors. A line without
+    a target is the mean over targets.
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     heads = ("row", "control", "probe", "modality", "task", "accuracy", "low", "high", "seeds", "printed")
-    writer.writerow((*heads, "difference", "difference_low", "difference_high", "p", "leak"))
-    tables = {**{probe: lines_of(result, probe) for probe in _plan(result).probes}, **stresses_of(result)}
-    scored: dict[str, dict[str, None]] = {}  # source -> its probes
+    values = any("targets" in record for record in result["records"])
+    more = ("score", "target", "unit", "mae", "rmse") if values else ()
+    writer.writerow((*heads, "difference", "difference_low", "difference_high", "p", "leak", *more))
+    probes = _plan(result).probes
+    tables = [("", probe, lines_of(result, probe)) for probe in probes]
+    tables += [(task, probe, lines) for probe in probes for task, lines in target_lines(result, probe).items()]
+    tables += [("", kind, lines) for kind, lines in stresses_of(result).items()]
+    scored: dict[tuple[str, str], dict[str, None]] = {}  # source and task -> its probes
     for record in result["records"]:
-        scored.setdefault(record["source"], {})[record["probe"]] = None
+        scored.setdefault((record["source"], record["task"]), {})[record["probe"]] = None
     written: set[tuple[str, ...]] = set()
-    for table, lines in tables.items():
+    for whole, table, lines in tables:
         for line in lines:
-            probe = table if table in scored[line.source] else next(iter(scored[line.source]))
-            for task, cell in line.cells.items():
-                if (key := (line.source, probe, line.modality, task)) in written:
-                    continue
-                written.add(key)
-                values = (line.source, int(line.control), probe, line.modality, task, cell.mean, cell.low, cell.high)
-                writer.writerow((*values, cell.seeds, cell.printed, *(cell.difference or ("",) * 4), cell.leak))
+            for name, cell in line.cells.items():
+                known = scored[line.source, task := whole or name]
+                key = line.source, table if table in known else next(iter(known)), line.modality, task, name
+                if key not in written:
+                    written.add(key)
+                    writer.writerow(_csv_row(key, cell, line.control)[: len(heads) + 5 + len(more)])
     return buffer.getvalue()
+
+
+def _csv_row(key: Sequence[str], cell: Cell, control: bool) -> list[Any]:
+    """One line of the CSV. An interval without an end is empty."""
+    source, probe, modality, task, name = key
+    numbers = [cell.mean, cell.low, cell.high, cell.seeds, cell.printed, *(cell.difference or ("",) * 4)]
+    ends = ["" if value in (math.inf, -math.inf) else value for value in numbers]
+    target = [name, *(cell.target[key] for key in ("unit", "mae", "rmse"))] if cell.target else [""] * 4
+    return [source, int(control), probe, modality, task, *ends, cell.leak, cell.score, *target]
 
 
 def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
@@ -284,6 +340,8 @@ def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
     panels: dict[str, list[Dot]] = {}
     for line in lines:
         for task, cell in line.cells.items():
-            dot = Dot(line.source, line.modality, cell.mean, cell.low, cell.high, cell.printed, line.control)
+            dot = Dot(
+                line.source, line.modality, cell.mean, cell.low, cell.high, cell.printed, line.control, cell.score
+            )
             panels.setdefault(task, []).append(dot)
     return to_png(comparison(panels), dpi=110)

@@ -7,6 +7,7 @@ and a dark page. No pyplot: no global state, nothing to close.
 from __future__ import annotations
 
 import io
+import math
 import re
 import textwrap
 import warnings
@@ -31,6 +32,10 @@ from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, c
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
 
+ONE_ANSWER = {"majority": ":", "mean": "--"}
+"""Controls that give one answer for all rows, and their lines."""
+LEAST = -0.5
+"""Where figures cut off R2, which has no lower limit."""
 WIDTH = 3.8
 """Inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high."""
 _STYLE: dict[Any, Any] = {
@@ -76,26 +81,30 @@ def bars(
 
     Args:
         title: Title of the figure.
-        groups: Group (modality or direction) -> source -> mean, low and high in 0 .. 1.
+        groups: Group (modality or direction) -> source -> mean, low and high, at most 1. ``low`` None: no whisker.
         lines: Vertical lines across the bars of all groups, such as majority or chance.
         what: Label of the axis.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
     figure, axes = _figure(title, 0.85 + 0.21 * num_rows)
     y, ticks, spans, top = 0.0, {}, [], max([0.0, *lines.values()])
+    lows = [cell[k] for group in groups.values() for cell in group.values() for k in ("mean", "low")]
+    least = max(LEAST, min(0.0, *(low for low in lows if low is not None)))
     for number, (group, cells) in enumerate(groups.items()):
         hue = MODALITY_HUES.get(group, HUES[2 + 2 * (number % 2)])
-        axes.text(0, y, group.replace("->", "→"), color=colour(hue), fontweight="bold", va="center", ha="left")
+        axes.text(
+            100 * least, y, group.replace("->", "→"), color=colour(hue), fontweight="bold", va="center", ha="left"
+        )
         spans.append((y + 0.5, y + len(cells) + 0.5))
         for source, cell in cells.items():
             y += 1
-            _bar(axes, y, source, cell, hue)
+            _bar(axes, y, source, cell, hue, least)
             ticks[y] = shorten(source, 22)
             top = max(top, cell["high"])
         y += 1.25
     axes.set_yticks(list(ticks), list(ticks.values()), color=colour("ink"))
     axes.set_ylim(y - 0.6, -0.7)
-    axes.set_xlim(0, max(1.0, 100 * top * 1.15))
+    axes.set_xlim(100 * least, max(1.0, 100 * (top + 0.15 * (top - least))))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
     axes.set_axisbelow(True)
@@ -105,7 +114,7 @@ def bars(
     for number, (name, value) in enumerate(lines.items()):
         look: dict[str, Any] = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3]}
         for low, high in spans:  # not through the names of the groups
-            axes.plot([100 * value] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
+            axes.plot([100 * max(least, value)] * 2, [low, high], linewidth=1.2, zorder=0.9, **look)
         handles.append(Line2D([], [], **look))
         labels.append(f"{shorten(name, 28)} {percent(value)}")
     if handles:
@@ -113,12 +122,14 @@ def bars(
     return figure
 
 
-def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, float], hue: str) -> None:
-    """One bar with its whisker and its value."""
-    mean, low, high = (100 * cell[k] for k in ("mean", "low", "high"))
+def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, least: float) -> None:
+    """One bar with its whisker, if it has one, and its value. Nothing is drawn below ``least``."""
+    ends = [cell["low"], cell["high"]] if cell["low"] is not None else [cell["mean"]] * 2
+    mean, low, high = (100 * max(least, value) for value in (cell["mean"], *ends))
     axes.barh(y, mean, 0.74, color=colour(CONTROL_GREYS.get(source, hue)))
-    axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
-    axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
+    if low < high:
+        axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
+        axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
     look: dict[str, Any] = {"va": "center", "fontsize": 9, "color": colour("ink"), "textcoords": "offset points"}
     look["fontweight"] = "normal" if source in CONTROL_GREYS else "bold"
     look["bbox"] = {"facecolor": colour("card"), "edgecolor": "none", "pad": 0.5}  # no line runs through the value
@@ -127,7 +138,7 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, float], hue: str)
 
 @dataclass(frozen=True)
 class Dot:
-    """A score of one source at one modality ("none" = a control without features), in 0 .. 1."""
+    """A score, "accuracy" or "R2", of one source at one modality ("none" = a control without features), at most 1."""
 
     source: str
     modality: str
@@ -136,6 +147,7 @@ class Dot:
     high: float
     printed: float | None
     control: bool
+    score: str = "accuracy"
 
 
 @matplotlib.rc_context({**_STYLE, "font.size": 10})
@@ -148,7 +160,7 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
     best: dict[tuple[bool, str], float] = {}
     for dot in dots:
         key = dot.control, dot.source
-        best[key] = max(best.get(key, 0.0), dot.mean if dot in next(iter(panels.values())) else 0.0)
+        best[key] = max(best.get(key, -math.inf), dot.mean if dot in next(iter(panels.values())) else -math.inf)
     rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
     names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
     size = (3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows))
@@ -163,25 +175,28 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
         axes.set_ylim(-0.7, len(rows) - 0.3)
         controls = sum(control for control, _ in best)
         axes.axhline(controls - 0.5, color=colour("soft"), linewidth=0.7)
-        axes.set_xlabel("accuracy %")
+        axes.set_xlabel(f"{panel[0].score} %")
         axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
         axes.tick_params(length=0)
         axes.spines[["top", "right", "left"]].set_visible(False)
     entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
-    order = [name for name in ("touch", "vision", "both", "printed", "majority") if name in entries]
+    order = [name for name in ("touch", "vision", "both", "printed", *ONE_ANSWER) if name in entries]
     _below(figure, [entries[name] for name in order], order, 5)
     return figure
 
 
 def _dot(axes: Axes, dot: Dot, rows: Sequence[str]) -> None:
     if dot.modality == "none":
-        if dot.source == "majority":
-            axes.axvline(100 * dot.mean, color=colour("soft"), linewidth=1, linestyle=":", label="majority")
+        if dot.source in ONE_ANSWER:
+            at = 100 * max(LEAST, dot.mean)
+            axes.axvline(at, color=colour("soft"), linewidth=1, linestyle=ONE_ANSWER[dot.source], label=dot.source)
         return
     hue = colour(MODALITY_HUES[dot.modality])
     y = rows.index(dot.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[dot.modality]
-    axes.plot([100 * dot.low, 100 * dot.high], [y, y], color=hue, linewidth=1.6)
-    axes.plot(100 * dot.mean, y, "o", markersize=4.5, color=hue, label=dot.modality)
+    if math.isfinite(dot.low):
+        axes.plot([100 * max(LEAST, v) for v in (dot.low, dot.high)], [y, y], color=hue, linewidth=1.6)
+    marker = "o" if dot.mean >= LEAST else "<"  # R2 may be lower than the axis goes
+    axes.plot(100 * max(LEAST, dot.mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
     if dot.printed is not None:
         axes.plot(100 * dot.printed, y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
 

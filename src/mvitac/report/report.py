@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,10 +17,10 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import cross_modal, split_rows
-from mvitac.evaluation.scores import covered, percent, summarise, with_interval
+from mvitac.evaluation.scores import covered, percent, score_name, summarise, with_interval
 from mvitac.model import load
 from mvitac.registry import to_json
-from mvitac.report import galleries, tables
+from mvitac.report import galleries, score_sections, tables
 from mvitac.report import html as page
 from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
@@ -108,7 +109,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     usable = []
-    for task in pack.spec.tasks:
+    for task in pack.spec.all_tasks:
         try:
             split_rows(pack, task, "both")
         except ValueError:  # no labelled rows to fit or to score
@@ -146,7 +147,7 @@ def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finishe
 def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
     sections = {
-        "scores": ("Scores of the frozen features", evidence.probe),
+        "scores": ("Scores of the frozen features", score_sections.probe),
         "retrieval": ("Finding the other modality", evidence.retrieval),
         "loss": ("Loss", evidence.loss),
         "collapse": ("Learning or collapsing?", evidence.collapse),
@@ -204,7 +205,7 @@ def verdicts(study: Study) -> list[str]:
         others = [f"{s} {percent(methods[s]['mean'])}" for s in study.sources[1:] if s in methods]
         by = f" with {study.sources[0]}" if others else ""
         clauses.append(
-            ", ".join([f"{WORDS[modality]} reaches {percent(own['mean'])} %{mark} on {task}{by}", *others, *beside])
+            ", ".join([f"{WORDS[modality]} reaches {_worded(methods, own)}{mark} on {task}{by}", *others, *beside])
         )
     found = tables.by_direction(study.result["retrieval"]).get((study.sources[0], "touch -> vision"))
     if found:
@@ -215,18 +216,29 @@ def verdicts(study: Study) -> list[str]:
     return clauses
 
 
+def _worded(task: dict[str, Any], cell: dict[str, float]) -> str:
+    """'61.6 %', or 'R2 61.6 %' of values."""
+    return f"{'R2 ' * (score_name({'': task}) == 'R2')}{percent(cell['mean'])} %"
+
+
 def _tile(study: Study, task: str) -> str:
     modality, own, controls = evidence.headline(study, task)
-    below = [name for name, cell in controls.items() if cell["low"] > own["high"]]
-    level = [name for name, cell in controls.items() if cell["high"] >= own["low"] and name not in below]
+    score = score_name(study.result["summary"][task])
+    below = [name for name, cell in controls.items() if _low(cell) > own["high"]]
+    level = [name for name, cell in controls.items() if cell["high"] >= _low(own) and name not in below]
     found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
     verdict = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
     verdict = verdict if controls else ""
     number, _, ends = with_interval(own["mean"], own["low"], own["high"], own.get("leak", "")).partition(" ")
-    numbers = f"{number}<small> % {ends}</small>"
+    numbers = f"{number}<small> % {'R2 ' * (score == 'R2')}{ends}</small>"
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
     what = f"<h3>{escape(task)} <small>{escape(WORDS[modality] + by)}</small></h3>"
     return f'<div class="card tile">{what}<div class="big">{numbers}</div>{verdict}</div>'
+
+
+def _low(cell: dict[str, float]) -> float:
+    """Lower end of an interval; R2 may have none."""
+    return -math.inf if cell["low"] is None else cell["low"]
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Sections of the report: scores and controls, retrieval, training curves, confusion matrices."""
+"""Sections of the report: retrieval, training curves, confusion matrices."""
 
 from __future__ import annotations
 
@@ -12,18 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import MIN_GALLERY
-from mvitac.evaluation.scores import (
-    MODALITY_ORDER,
-    cell_text,
-    columns_of,
-    interval,
-    percent,
-    sources_of,
-    summarise,
-    tested_on,
-)
+from mvitac.evaluation.scores import columns_of, interval, sources_of
 from mvitac.model import Model
 from mvitac.report import figures, html, tables
 from mvitac.report.figures import Line
@@ -87,55 +77,7 @@ class Study:
         return html.figure(figures.to_svg(drawing, safe, alt), caption)
 
 
-# -- scores ------------------------------------------------------------------------------------------------------------
-
-
-def probe(study: Study) -> str:
-    """Bars per task, then every number; '' if nothing is labelled."""
-    summary, records = study.result["summary"], study.result["records"]
-    if not summary:
-        return ""
-    kinds: list[str] = list(dict.fromkeys(r["probe"] for r in records))  # the first one is that of the summary
-    names: list[str] = [tables.PROBE_NAMES.get(kind) or kind for kind in kinds]
-    drawn = []
-    for task, found in summary.items():
-        order = sources_of(found)
-        groups = {m: {s: found[m][s] for s in order if s in found[m]} for m in columns_of(found)}
-        lines = {name: cell["mean"] for name, cell in found.get("none", {}).items()}
-        drawing = figures.bars(task, groups, lines, "accuracy %, mean and 95 % interval")
-        alt = f"Probe accuracy on {task}; the numbers are in the table below"
-        drawn.append(study.figure(f"probe {task}", drawing, alt))
-    numbers = [_scores(study, summary, names[0])]
-    for kind, name in zip(kinds[1:], names[1:], strict=True):
-        numbers.append(html.fold(f"The same by {name}", _scores(study, summarise(records, kind), name)))
-    scores = ("accuracy", "balanced_accuracy", "macro_f1", "auroc")
-    rows = [
-        [r["source"], "" if r["seed"] is None else str(r["seed"]), r["task"], r["modality"], r["probe"]]
-        + ["" if r.get(k) is None else percent(r[k]) + leak_mark(r.get("leak", "")) for k in scores]  # values have none
-        for r in records
-    ]
-    columns = ("", "seed", "task", "features", "probe", "accuracy", "balanced", "macro F1", "AUROC")
-    numbers.append(html.fold("Every probe with balanced accuracy, F1 and AUROC (%)", html.table(columns, rows)))
-    by = study.pack.spec.group_by
-    intro = f"A probe ({names[0]}) on frozen features, scored on {tables.unseen_groups(by, records)}."
-    for leak in study.result.get("leaks", ()):
-        intro += f" LEAK: {leak}."
-    if {r["source"] for r in records} - set(study.sources):
-        intro += " Grey bars are controls: the same probe on an untrained trunk, raw pixels, and the image border."
-    return html.paragraph(intro) + html.grid(drawn) + "".join(numbers)
-
-
-def _scores(study: Study, summary: dict[str, Any], probe: str) -> str:
-    columns = [m for m in MODALITY_ORDER if any(m in columns_of(found) for found in summary.values())]
-    rows, muted = [], set()
-    for task, found in summary.items():
-        order = sources_of(found)
-        rows += [
-            [f"{task} ({tested_on(found, study.pack.spec.group_by)})"],
-            *([s, *(cell_text(found, s, m) for m in columns)] for s in order),
-        ]
-        muted |= set(order) - set(study.sources)
-    return html.table(["accuracy %", *columns], rows, muted=muted, label=f"accuracy by {probe}")
+# -- retrieval ---------------------------------------------------------------------------------------------------------
 
 
 def retrieval(study: Study) -> str:

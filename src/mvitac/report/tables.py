@@ -8,19 +8,23 @@ from typing import Any
 from rich.table import Table
 
 from mvitac.evaluation.leaks import leak_mark
+from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.scores import (
     cell_text,
     columns_of,
     covered,
+    error_text,
     interval,
     leaks_in,
     percent,
+    score_name,
     sources_of,
     tested_on,
 )
 from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
+VALUE_PROBE_NAMES = {"linear": "ridge regression"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
 """Columns of a retrieval table, in percent."""
 
@@ -30,28 +34,66 @@ def unseen_groups(group_by: str, records: Sequence[dict[str, Any]]) -> str:
     return f"{'test' if leaks_in(records) else 'unseen'} {group_by}s"
 
 
+def probe_name(kind: str, score: str) -> str:
+    """The name of probe ``kind`` for a task with ``score`` (``scores.score_name``)."""
+    if score == "R2":  # by_cell shows another probe where values have none of this kind
+        kind = "linear" if kind in PROBE_NAMES and kind not in VALUE_PROBES else kind
+        return VALUE_PROBE_NAMES.get(kind) or PROBE_NAMES.get(kind, kind)
+    return PROBE_NAMES.get(kind, kind)
+
+
 def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
-    """Print one table per task: accuracy in percent, mean and 95 % interval."""
+    """Print one table per task: accuracy or R2 in percent, mean and 95 % interval. Values have a table of targets too."""
+    trained = []
     for name, task in result["summary"].items():
-        modalities = columns_of(task)
+        trained += [{"source": s, "seed": seed} for m in task.values() for s, v in m.items() for seed in v["seeds"]]
+        modalities, score = columns_of(task), score_name(task)
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
-        about = (
-            f"{PROBE_NAMES.get(probe, probe)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
-        )
+        about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
         title = f"{result['data']}: {name} ({about})"
         table = Table(title=title, title_justify="left", title_style="bold")
-        table.add_column("accuracy %")
+        table.add_column(f"{score} %")
         for modality in modalities:
             table.add_column(modality, justify="right", no_wrap=True)
         for source in sources_of(task):
             # LEAK on a line of its own, else the table is too wide.
             table.add_row(source, *(cell_text(task, source, m).replace(" LEAK", "\nLEAK") for m in modalities))
         console.print(table)
-    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
+        if score == "R2":
+            console.print(_targets(name, task))
+    console.print(f"95 % intervals: {covered(result['group_by'], trained)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
     for leak in result.get("leaks", ()):
         console.print(f"LEAK: {leak}", markup=False, highlight=False)
+
+
+def _targets(name: str, task: dict[str, Any]) -> Table:
+    """R2 in percent and mean absolute error of each target."""
+    modalities = columns_of(task)
+    table = Table(title=f"{name}: R2 % and mean absolute error", title_justify="left", title_style="bold")
+    table.add_column("")
+    for modality in modalities:
+        table.add_column(modality, justify="right", no_wrap=True)
+    rows = target_rows(task)
+    above = "" if len({target for target, _, _ in rows}) > 1 else rows[0][0]  # the only target needs no row of its own
+    for target, source, cells in rows:
+        if target != above:
+            table.add_section()
+            table.add_row(above := target, style="bold")
+        table.add_row(source, *(f"{percent(cell['mean'])}, {error_text(cell)}" if cell else "" for cell in cells))
+    return table
+
+
+def target_rows(task: dict[str, Any]) -> list[tuple[str, str, list[dict[str, Any] | None]]]:
+    """Target, source, and the source's scores of that target by modality (``columns_of``), of a task with values."""
+    first = next(cell for cells in task.values() for cell in cells.values())
+    rows = []
+    for t, target in enumerate(first["targets"]):
+        for source in sources_of(task):
+            cells = [task[m].get(source) or task.get("none", {}).get(source) for m in columns_of(task)]
+            rows.append((target["name"], source, [cell["targets"][t] if cell else None for cell in cells]))
+    return rows
 
 
 def print_retrieval(result: dict[str, Any], console: Console) -> None:

@@ -1,0 +1,114 @@
+"""Sections of the report about scores: every probe next to its controls, and predicted values against true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mvitac.evaluation.leaks import leak_mark
+from mvitac.evaluation.scores import (
+    MODALITY_ORDER,
+    cell_text,
+    columns_of,
+    error_text,
+    percent,
+    score_name,
+    sources_of,
+    summarise_again,
+    tested_on,
+    with_interval,
+)
+from mvitac.report import figures, html, tables
+from mvitac.report.sections import Study
+
+
+def probe(study: Study) -> str:
+    """Bars per task, then every number; '' if nothing is labelled."""
+    summary, records = study.result["summary"], study.result["records"]
+    if not summary:
+        return ""
+    kinds: list[str] = list(dict.fromkeys(r["probe"] for r in records))  # the first one is that of the summary
+    drawn = []
+    for task, found in summary.items():
+        order = sources_of(found)
+        groups = {m: {s: found[m][s] for s in order if s in found[m]} for m in columns_of(found)}
+        lines = {name: cell["mean"] for name, cell in found.get("none", {}).items()}
+        drawing = figures.bars(task, groups, lines, f"{score_name(found)} %, mean and 95 % interval")
+        alt = f"Probe scores on {task}; the numbers are in the table below"
+        drawn.append(study.figure(f"probe {task}", drawing, alt))
+    numbers = [_scores(study, summary)]
+    for kind in kinds[1:]:
+        again = summarise_again(records, kind)
+        names = " and ".join(dict.fromkeys(tables.probe_name(kind, score_name(cells)) for cells in again.values()))
+        numbers.append(html.fold(f"The same by {names}", _scores(study, again)))
+    numbers += _every_probe(records)
+    names = " or ".join(dict.fromkeys(tables.probe_name(kinds[0], score_name(found)) for found in summary.values()))
+    by = study.pack.spec.group_by
+    intro = f"A probe ({names}) on frozen features, scored on {tables.unseen_groups(by, records)}."
+    for leak in study.result.get("leaks", ()):
+        intro += f" LEAK: {leak}."
+    if any(score_name(found) == "R2" for found in summary.values()):
+        intro += (
+            " Values are scored by R2, the share of the variance of the test rows that is predicted: 100 % is exact, 0 %"
+            " is no better than their mean, and less is worse."
+        )
+    if {r["source"] for r in records} - set(study.sources):
+        intro += " Grey bars are controls: the same probe on an untrained trunk, raw pixels, and the image border."
+    return html.paragraph(intro) + html.grid(drawn) + "".join(numbers)
+
+
+def _scores(study: Study, summary: dict[str, Any]) -> str:
+    """A table of accuracies, one of R2, and one of each target."""
+    parts = []
+    for score in ("accuracy", "R2"):
+        tasks = {task: found for task, found in summary.items() if score_name(found) == score}
+        columns = [m for m in MODALITY_ORDER if any(m in columns_of(found) for found in tasks.values())]
+        rows, muted = [], set()
+        for task, found in tasks.items():
+            order = sources_of(found)
+            rows += [
+                [f"{task} ({tested_on(found, study.pack.spec.group_by)})"],
+                *([s, *(cell_text(found, s, m) for m in columns)] for s in order),
+            ]
+            muted |= set(order) - set(study.sources)
+        if rows:
+            parts.append(html.table([f"{score} %", *columns], rows, muted=muted, label=score))
+        parts += [_target_table(study, task, found) for task, found in tasks.items() if score == "R2"]
+    return "".join(parts)
+
+
+def _target_table(study: Study, task: str, found: dict[str, Any]) -> str:
+    """R2 and mean absolute error of each target of one task."""
+    rows: list[list[str]] = []
+    for target, source, cells in tables.target_rows(found):
+        if [target] not in rows:
+            rows.append([target])
+        score = ("" if c is None else with_interval(c["mean"], c["low"], c["high"]) for c in cells)
+        error = ("" if c is None else error_text(c) for c in cells)
+        rows.append([source, *(text for pair in zip(score, error, strict=True) for text in pair)])
+    heads = [head for m in columns_of(found) for head in (f"{m}: R2 %", "mean absolute error")]
+    return html.table([task, *heads], rows, muted=set(sources_of(found)) - set(study.sources), label=f"{task}: targets")
+
+
+def _every_probe(records: Sequence[dict[str, Any]]) -> list[str]:
+    """Every score of every record, folded: one table of classes, one of values."""
+    classes, values = [], []
+    for r in records:
+        first = [r["source"], "" if r["seed"] is None else str(r["seed"]), r["task"], r["modality"], r["probe"]]
+        mark = leak_mark(r.get("leak", ""))
+        if "targets" in r:
+            for t in r["targets"]:
+                errors = [error_text(t, key) for key in ("mae", "rmse")]
+                values.append([*first, t["name"], percent(t["r2"]) + mark, *errors])
+        else:
+            scores = (r.get(key) for key in ("accuracy", "balanced_accuracy", "macro_f1", "auroc"))
+            classes.append([*first, *("" if score is None else percent(score) + mark for score in scores)])
+    columns = ("", "seed", "task", "features", "probe")
+    found = []
+    if classes:
+        heads = (*columns, "accuracy", "balanced", "macro F1", "AUROC")
+        found.append(html.fold("Every probe with balanced accuracy, F1 and AUROC (%)", html.table(heads, classes)))
+    if values:
+        heads = (*columns, "target", "R2 %", "mean absolute error", "root mean squared error")
+        found.append(html.fold("Every probe of values with its errors", html.table(heads, values)))
+    return found
