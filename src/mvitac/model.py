@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import DataSpec, Target
 from mvitac.methods.base import Method
 from mvitac.nn.encoders import SCRATCH, num_features, timm_trunk
-from mvitac.nn.linear_probe import LinearProbe
+from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
@@ -80,8 +80,9 @@ class Model(nn.Module):
     def _repr_html_(self) -> str:
         rows = [(modality, num_features(trunk)) for modality, trunk in self.encoders.items()]
         probes = [(task, ", ".join(classes)) for task, classes in self.classes.items()]
+        probes += [(task, ", ".join(f"{t.name} ({t.unit})" for t in found)) for task, found in self.targets.items()]
         text = f"<p>{escape(repr(self))}</p>{table(rows, ('input', 'features'))}"
-        return text + (table(probes, ("probe", "classes")) if probes else "")
+        return text + (table(probes, ("probe", "answers")) if probes else "")
 
     def forward(
         self, *unnamed: Tensor, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False
@@ -257,7 +258,7 @@ class Model(nn.Module):
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None
     ) -> dict[str, Tensor]:
-        """Classify raw images with the probes of a published artifact.
+        """Classify or measure raw images with the probes of a published artifact.
 
         Args:
             vision: As for ``embed``. If both modalities are given, the probes on both are used.
@@ -265,7 +266,8 @@ class Model(nn.Module):
             background: As for ``embed``.
 
         Returns:
-            task -> class probabilities [N, K]. ``classes`` names the columns.
+            task -> class probabilities [N, K], or values [N, T] in the units of their targets. ``classes`` and ``targets``
+            name the columns.
 
         Raises:
             ValueError: As for ``embed``, or if the model has no probe on these modalities.
@@ -282,7 +284,12 @@ class Model(nn.Module):
     @property
     def classes(self) -> dict[str, tuple[str, ...]]:
         """task -> class names, in the order of the columns of ``predict``."""
-        return {r.question.task: r.question.classes for r in self.readouts.values()}
+        return {q.task: q.classes for r in self.readouts.values() if isinstance(q := r.question, ProbeInfo)}
+
+    @property
+    def targets(self) -> dict[str, tuple[Target, ...]]:
+        """task -> names and units of its values, in the order of the columns of ``predict``."""
+        return {q.task: q.targets for r in self.readouts.values() if isinstance(q := r.question, ValueInfo)}
 
     def open_data(self, *, quiet: bool = False) -> Pack:
         """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""

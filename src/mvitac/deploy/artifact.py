@@ -1,6 +1,6 @@
 """The artifact: one folder with a trained model and everything needed to use it correctly.
 
-    <artifact>/artifact.json       format, preprocessing, probes with class names and scores, data, digests
+    <artifact>/artifact.json       format, preprocessing, probes with class names or units and scores, data, digests
                model.safetensors   encoders and heads into the shared space
                probes.safetensors  trained linear probes (absent where the data has no labels)
                run.json            provenance: method, data, optimiser, seed, versions, commit
@@ -23,7 +23,7 @@ from torch import nn
 
 from mvitac import model as models
 from mvitac.model import Model
-from mvitac.nn.linear_probe import LinearProbe, ProbeInfo
+from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import from_json
 from mvitac.system.files import brief, digest, digest_file, read_json
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
@@ -197,9 +197,11 @@ def check_header(path: Path) -> None:
 def read_probes(folder: Path, manifest: dict[str, Any], model: Model) -> dict[str, LinearProbe]:
     """The probes of ``folder`` by name; ValueError if names, shapes or classes do not fit the model."""
     try:
-        questions: tuple[ProbeInfo, ...] = from_json(tuple[ProbeInfo, ...], manifest.get("probes"), "probes")
+        classes: tuple[ProbeInfo, ...] = from_json(tuple[ProbeInfo, ...], manifest.get("probes"), "probes")
+        values: tuple[ValueInfo, ...] = from_json(tuple[ValueInfo, ...], manifest.get("values", []), "values")
     except ValueError as error:
         raise ValueError(f"{folder / MANIFEST} is damaged ({error}): publish it again") from None
+    questions = (*classes, *values)
     if not questions:
         return {}
     path = folder / "probes.safetensors"

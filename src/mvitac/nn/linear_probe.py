@@ -115,7 +115,8 @@ class LinearProbe(nn.Module):
         if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
             raise ValueError(
                 f"probe {question.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
-                f" do not fit {num} {'classes' if isinstance(question, ProbeInfo) else 'targets'}: expected [{num}, D] and [{num}]"
+                f" do not fit {num} {'classes' if isinstance(question, ProbeInfo) else 'targets'}: expected [{num}, D] and"
+                f" [{num}]"
             )
         if weight.dtype != torch.float32 or bias.dtype != torch.float32:
             raise ValueError(f"probe {question.name}: weights are {weight.dtype}, expected torch.float32")
@@ -148,3 +149,8 @@ def constant(question: ProbeInfo, label: int, dim: int) -> LinearProbe:
     bias = torch.full((len(question.classes),), UNSEEN)
     bias[label] = 0
     return LinearProbe(question, torch.zeros(len(question.classes), dim), bias)
+
+
+def from_ridge(question: ValueInfo, weight: np.ndarray, bias: np.ndarray) -> LinearProbe:
+    """A probe of values with these weights [T, D] and biases [T]."""
+    return LinearProbe(question, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
