@@ -4,7 +4,8 @@
 
 It subscribes to sensor_msgs/Image (rgb8 or bgr8), and publishes std_msgs/String on ~/prediction and
 std_msgs/Float32MultiArray on ~/embedding. A prediction is JSON: number of the touch, contact (true; false once, when
-the contact ends), age in ms, and class and confidence of each task. Errors are written to the node's log.
+the contact ends), age in ms, and for each task its class and confidence, or the value, unit and spread (usual error) of
+each target. Errors are written to the node's log.
 
 Only ``main`` needs ROS. ``Node`` accepts any object with the fields of an Image message, so it can be tested without
 ROS.
@@ -86,14 +87,12 @@ class Node:
         """Publish new results. Also called by a timer, because a topic that stops sends no message."""
         predicted, before = self.live.tick(), self.touched
         self.touched = self.live.touch is not None
-        number = {"touch": self.live.num_touches, "contact": self.touched}
         if predicted:
-            said = {task: {"class": c, "confidence": p} for task, (c, p) in self.live.answers(self.live.touch).items()}
-            self.publish("prediction", json.dumps({**number, "age_ms": 1000 * self.live.age, **said}))
+            self.publish("prediction", json.dumps(self.live.prediction()))
             names = [n for n in self.outputs if n.startswith("embedding_")]
             self.publish("embedding", np.concatenate([self.outputs[n][0] for n in names]).tolist())
         elif before and not self.touched:
-            self.publish("prediction", json.dumps(number))
+            self.publish("prediction", json.dumps(self.live.prediction()))
 
 
 class Kept:
@@ -101,7 +100,7 @@ class Kept:
 
     def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
         self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
-        self.difference = engine.difference
+        self.values, self.difference = engine.values, engine.difference
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
         self.outputs.update(self.engine(**images))

@@ -104,3 +104,14 @@ def value_artifact(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> 
     folder = tmp_path_factory.mktemp("values")
     run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
     return publish(train(run, folder / "run", quiet=True), folder / "artifact")
+
+
+@pytest.fixture(scope="session")
+def value_onnx(value_artifact: Path, measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """That artifact, exported for ONNX Runtime."""
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.export import ExportConfig, export
+
+    out = tmp_path_factory.mktemp("value export") / "onnx"
+    export(load(value_artifact), measured, out, ExportConfig(kind="onnx"))
+    return out

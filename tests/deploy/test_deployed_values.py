@@ -1,4 +1,4 @@
-"""Probes of values after publishing: in the artifact, its card and ``Model.predict``."""
+"""Probes of values after publishing: in the artifact, its card, ``Model.predict`` and exports."""
 
 from __future__ import annotations
 
@@ -11,10 +11,16 @@ import pytest
 import torch
 
 import mvitac
+from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.data.spec import Target
+from mvitac.deploy import engine as runtime
 from mvitac.deploy import publish
 from mvitac.deploy.artifact import read_manifest
+from mvitac.deploy.engine import Engine, spread_at
+from mvitac.deploy.export import ExportConfig
+from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.parity import parity, reference
 from mvitac.evaluation.probe import score_predictions, split_rows
 from mvitac.nn.linear_probe import Error, ValueInfo
 
@@ -79,3 +85,89 @@ def test_an_artifact_of_classes_says_nothing_of_values(artifact: Path) -> None:
     assert "## Classes" in (artifact / "README.md").read_text()
     json.dumps(read_manifest(artifact), allow_nan=False)
     assert torch.is_tensor(mvitac.load(artifact).predict(touch=np.zeros((2, 32, 32, 3), np.uint8))["pattern"])
+
+
+# -- exports ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_export_gives_the_models_values_with_unit_and_spread(
+    value_onnx: Path, value_artifact: Path, measured: Pack
+) -> None:
+    engine, model = Engine(value_onnx, threads=1), mvitac.load(value_artifact)
+    images = {m: np.asarray(measured.images[m][:5]) for m in measured.images}
+    found, said = engine(**images), model.predict(**images)
+    for task, targets in model.targets.items():
+        np.testing.assert_allclose(found[f"value_{task}"], said[task].numpy(), rtol=1e-3, atol=1e-3)
+        assert [(t["name"], t["unit"]) for t in engine.values[task]] == [(t.name, t.unit) for t in targets]
+        (error, *_) = model.readouts[f"{task}.both"].question.errors
+        assert spread_at(engine.values[task][0], 99.0) == error.spread_at(99.0)
+    assert set(engine.classes) == set(model.classes)
+    (light,) = engine.meta["report"]["values"]["light"]
+    assert light["unit"] == "levels" and light["num"] == 24 and light["change"] < 1e-3 * light["allowed"]
+    assert light["export"] == pytest.approx(model.readouts["light.both"].question.errors[0].mae, rel=1e-3)
+    spread = float(np.std(measured.values(measured.spec.values[0])[measured.rows("test")]))
+    assert light["allowed"] == pytest.approx(0.1 * spread)
+
+
+def test_an_export_that_changes_a_value_is_refused_in_the_unit(value_artifact: Path, measured: Pack) -> None:
+    model = mvitac.load(value_artifact)
+    graph, rows = ExportModule(model), measured.rows("test")
+    wanted = reference(model, graph, measured, rows)
+    std = float(np.nanstd(measured.values(measured.spec.values[1])[rows, 1]))  # weight
+
+    def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        with torch.no_grad():
+            found = [x.numpy() for x in graph(*(torch.from_numpy(a) for a in arrays))]
+        found[-1] = found[-1] + np.array([0, 0.2 * std], np.float32)  # of task both: the weight alone
+        return found
+
+    with pytest.raises(
+        ValueError, match=f"changes weight by {0.2 * std:.3g} N .* at most {0.1 * std:.3g} N .*--value-loss"
+    ):
+        parity(graph, call, model, measured, rows, wanted, ExportConfig())
+    report = parity(graph, call, model, measured, rows, wanted, ExportConfig(value_loss=0.3))
+    assert report["values"]["both"][1]["change"] == pytest.approx(0.2 * std, rel=1e-3)
+    assert report["values"]["both"][1]["num"] == 16 and report["values"]["light"][0]["change"] < 1e-3
+
+
+def test_values_that_a_pack_lacks_are_still_compared(value_artifact: Path, pack: Pack) -> None:
+    model = mvitac.load(value_artifact)
+    graph, rows = ExportModule(model), pack.rows("test")
+    wanted = reference(model, graph, pack, rows)
+    report = parity(graph, lambda arrays: _run(graph, arrays), model, pack, rows, wanted, ExportConfig())
+    light = report["values"]["light"][0]
+    assert light["num"] == 0 and light["original"] is None and light["allowed"] > 0
+    assert light["allowed"] == pytest.approx(0.1 * wanted["value_light"].std(), rel=1e-4)
+
+
+def _run(graph: ExportModule, arrays: list[np.ndarray]) -> list[np.ndarray]:
+    with torch.no_grad():
+        return [x.numpy() for x in graph(*(torch.from_numpy(a) for a in arrays))]
+
+
+def test_a_value_that_differs_on_the_robot_is_refused(value_onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice as long features have the same cosine, but not the same values."""
+    real = runtime.open_engine
+    names = json.loads((value_onnx / "export.json").read_text())["outputs"]
+
+    def longer(*given: object) -> runtime.Call:
+        call = real(*given)  # type: ignore[arg-type]
+        return lambda arrays: [
+            x * 2 if name.startswith(("embedding", "value")) else x for name, x in zip(names, call(arrays), strict=True)
+        ]
+
+    monkeypatch.setattr(runtime, "open_engine", longer)
+    with pytest.raises(ValueError, match=r"level differs by .* levels from the trained model"):
+        Engine(value_onnx, threads=1)
+
+
+def test_export_command_prints_errors_in_the_unit(
+    value_artifact: Path, measured: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export", str(value_artifact), "--int8", "--target", "avx2", "--on", str(measured.path)]
+    assert main([*command, "--out", str(tmp_path / "e"), "--value-loss", "9", "--accuracy-loss", "100"]) == 0
+    assert "weight, mean absolute error, N" in " ".join(capsys.readouterr().out.split())
+    report = json.loads((tmp_path / "e" / "export.json").read_text())["report"]
+    assert 0 < report["values"]["both"][1]["change"] < report["values"]["both"][1]["allowed"]
+    assert main([*command, "--out", str(tmp_path / "f"), "--value-loss", "-1"]) == 2
+    assert "--value-loss -1.0: give" in capsys.readouterr().err and not (tmp_path / "f").exists()

@@ -2,12 +2,14 @@
 
 The background of each touch sensor (no contact) is learned from its first frames and updated slowly while nothing is
 touched; it decides *whether* there is contact. The model gets frames as they are, or minus that background if it was
-trained on difference images. Probabilities are averaged over one touch. Time comes from a clock passed as an argument.
+trained on difference images. Probabilities are averaged over one touch; values, such as a force, are those of the newest
+frame. Time comes from a clock passed as an argument.
 Shapes: frames uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -17,12 +19,38 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import difference, fit
-from mvitac.deploy.engine import Engine
+from mvitac.deploy.engine import Engine, spread_at
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.streams import Event, Frame, Stream
 
 NUM_AGES = 10_000
 """Number of latest predictions, some minutes of them, over which the percentiles of the age are computed."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One predicted number of a touch, in its unit."""
+
+    name: str
+    unit: str
+    value: float
+    spread: float
+    """Root mean squared error of test rows whose prediction was in the range of ``value``."""
+    low: float
+    high: float
+    """Lowest and highest value of the touch so far."""
+
+    def __str__(self) -> str:
+        return f"{self._digits(self.value)} {self.unit} +- {self._digits(self.spread)}"
+
+    def over_touch(self) -> str:
+        """The range of the touch, such as '0.3 to 3.2 N +- 0.4'."""
+        return f"{self._digits(self.low)} to {self._digits(self.high)} {self.unit} +- {self._digits(self.spread)}"
+
+    def _digits(self, value: float) -> str:
+        """``value`` with the decimals of the first digit of the spread."""
+        decimals = -math.floor(math.log10(self.spread)) if self.spread > 0 else 3
+        return f"{value:.{min(6, max(0, decimals))}f}"
 
 
 @dataclass
@@ -34,13 +62,18 @@ class Touch:
     end: float | None = None
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
+    values: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    """task -> newest, lowest and highest values [T]."""
     known: list[str] = field(default_factory=list)
     """The most similar known touches, if there is an index."""
 
-    def add(self, probabilities: dict[str, np.ndarray]) -> None:
+    def add(self, probabilities: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
         for task, p in probabilities.items():
             self.totals[task] = self.totals.get(task, 0) + p
+        for task, v in values.items():
+            _, low, high = self.values.get(task, [v, v, v])
+            self.values[task] = [v, np.minimum(low, v), np.maximum(high, v)]
 
     def answer(self, task: str, classes: Sequence[str]) -> tuple[str, float]:
         """The likeliest class so far, and its mean probability."""
@@ -141,7 +174,10 @@ class Live:
             self.num_touches += 1
             self.touch = Touch(self.num_touches, now)
         outputs = self.engine(**{m: x[None] for m, x in self._as_trained(images).items()})
-        self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
+        self.touch.add(
+            {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
+            {task: outputs[f"value_{task}"][0] for task in self.engine.values},
+        )
         if self.nearest:
             self.touch.known = self.nearest(outputs)
         self.age = self.clock() - captured
@@ -214,6 +250,24 @@ class Live:
             return {}
         return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
 
+    def readings(self, touch: Touch | None) -> dict[str, list[Reading]]:
+        """The values of a touch by task: of its newest frame, with the range over the touch."""
+        if touch is None or not touch.num_frames:
+            return {}
+        return {task: _readings(targets, *touch.values[task]) for task, targets in self.engine.values.items()}
+
+    def prediction(self) -> dict[str, Any]:
+        """The newest prediction of the current touch, JSON-ready; without contact, that alone."""
+        said: dict[str, Any] = {"touch": self.num_touches, "contact": self.touch is not None}
+        if self.touch is None:
+            return said
+        said["age_ms"] = 1000 * self.age
+        for task, (name, confidence) in self.answers(self.touch).items():
+            said[task] = {"class": name, "confidence": confidence}
+        for task, found in self.readings(self.touch).items():
+            said[task] = {r.name: {"value": r.value, "unit": r.unit, "spread": r.spread} for r in found}
+        return said
+
     def summary(self) -> dict[str, Any]:
         """Counts, ages in ms from capture to prediction, and events, JSON-ready."""
         ages = 1000 * self._ages[: self.num_predictions]
@@ -228,6 +282,15 @@ class Live:
             },
             "events": dict(self.counts),
         }
+
+
+def _readings(targets: Sequence[dict[str, Any]], *found: np.ndarray) -> list[Reading]:
+    """One reading per target, of its newest, lowest and highest value ``found``."""
+    readings = []
+    for target, new, low, high in zip(targets, *(values.tolist() for values in found), strict=True):
+        spread = spread_at(target, new)
+        readings.append(Reading(target["name"], target["unit"], new, spread, low, high))
+    return readings
 
 
 def _check_inputs(engine: Engine, streams: dict[str, Sequence[Stream]]) -> None:

@@ -5,6 +5,7 @@ Shapes: B images, D features (a probe on both modalities reads vision, then touc
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,7 +75,7 @@ class Error:
 
     def spread_at(self, value: float) -> float:
         """The usual error (root mean square) of a prediction of ``value``."""
-        return self.spread[int(np.searchsorted(self.edges, value, side="right"))]
+        return self.spread[bisect_right(self.edges, value)]
 
 
 @dataclass(frozen=True, kw_only=True)
