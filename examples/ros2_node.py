@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.deploy.engine import Engine
+from mvitac.deploy.engine import Engine, frame_shapes
 from mvitac.live.cameras import Source
 from mvitac.live.predictor import Live
 from mvitac.live.streams import Stream
@@ -68,7 +68,7 @@ class Node:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.publish, self.outputs = publish, {}
-        self.topics = {m: [Topic() for _ in range(shape[2] // 3)] for m, shape in engine.inputs.items()}
+        self.topics = {m: [Topic() for _ in range(shape[2] // 3)] for m, shape in frame_shapes(engine).items()}
         self.streams = {
             m: [Stream(f"{m} {i}", topic, clock=clock) for i, topic in enumerate(topics)]
             for m, topics in self.topics.items()
@@ -100,7 +100,7 @@ class Kept:
 
     def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
         self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
-        self.values, self.difference = engine.values, engine.difference
+        self.values, self.difference, self.window = engine.values, engine.difference, engine.window
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
         self.outputs.update(self.engine(**images))
@@ -117,7 +117,7 @@ def main() -> None:
     options, rest = parser.parse_known_args()
     engine = Engine(options.export)
     for modality in ("vision", "touch"):
-        takes = engine.inputs.get(modality, (0, 0, 0))[2] // 3
+        takes = frame_shapes(engine).get(modality, (0, 0, 0))[2] // 3
         if len(getattr(options, modality)) != takes:
             parser.error(f"the model needs {takes} {modality} topic(s): give --{modality} TOPIC {takes} times")
 

@@ -151,8 +151,9 @@ class Model(nn.Module):
         self.check_modality(modality)
         self._check_background(modality, background)
         channels, size = self.spec.channels(modality), self.run.augment.eval_size if normalize else None
-        free = None if background is None else to_array(background, channels, "background")
-        return Preprocess(modality, channels, self.stored, size, free)
+        frames = self.spec.frames(modality)
+        free = None if background is None else to_array(background, channels // frames, "background")
+        return Preprocess(modality, channels, self.stored, size, free, frames)
 
     def trunk(self, modality: str) -> nn.Module:
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
@@ -217,11 +218,15 @@ class Model(nn.Module):
         uint8 or float in [0, 1], RGB. Several images are a list of these, an array [N, H, W, C], or a tensor [N, C, H, W]
         or [N, H, W, C]. They may have any size: they are resized like the training images.
 
+        A model of windows (``spec.window``) takes clips: [F, H, W, C], oldest first, or a list of F images; several are a
+        list of clips or an array [N, F, H, W, C]. Frames are ``spec.window.stride`` apart.
+
         Args:
             vision: Camera images.
             touch: Tactile images. With two sensors they have 6 channels, left before right.
             background: For models trained on difference images (``spec.difference``): the sensor without contact, as one
-                image or one per touch image. Without it, ``touch`` must already be (touch - background) / 2 + 128.
+                image or one per touch image; for windows minus their touch's first frame: that frame. Without it,
+                ``touch`` must already be (touch - background) / 2 + 128.
             shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
 
         Returns:
@@ -250,7 +255,13 @@ class Model(nn.Module):
         return torch.cat(chunks)
 
     def _check_background(self, modality: str, background: ImageInput | None) -> None:
-        if background is not None and (modality != "touch" or not self.spec.difference):
+        window = self.spec.window
+        first = window.minus_first and "touch" in window.of
+        if background is not None and first and self.spec.difference:
+            raise ValueError(
+                "background: this model's touch is minus a background, then minus its first frame: give it as trained"
+            )
+        if background is not None and (modality != "touch" or not (self.spec.difference or first)):
             untrained = "this model was not trained on difference images of touch"
             why = untrained if modality == "touch" else "there is no touch"
             raise ValueError(f"background cannot be used, {why}: leave it out")

@@ -54,7 +54,7 @@ class Slow:
 
     def __init__(self, engine: Engine) -> None:
         self.engine, self.inputs, self.classes, self.meta = engine, engine.inputs, engine.classes, engine.meta
-        self.values, self.difference = engine.values, engine.difference
+        self.values, self.difference, self.window = engine.values, engine.difference, engine.window
         self.clock: Clock | None = None
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
@@ -540,7 +540,7 @@ def test_the_picture_shows_frames_contact_and_answers(engine: Engine, modalities
         """The engine, of some of its inputs."""
 
         inputs, classes, difference = {m: engine.inputs[m] for m in modalities}, engine.classes, False
-        values = engine.values
+        values, window = engine.values, engine.window
 
         def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
             zeros = {m: np.zeros((1, *shape), np.uint8) for m, shape in engine.inputs.items()}

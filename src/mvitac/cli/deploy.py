@@ -12,7 +12,7 @@ from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
 from mvitac.deploy.artifact import load, read_manifest
-from mvitac.deploy.publish import own_data, with_readouts
+from mvitac.deploy.publish import as_trained, own_data, with_readouts
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
 from mvitac.report.tables import print_summary
@@ -104,8 +104,9 @@ def export(argv: list[str]) -> None:
     )
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
+    pack = as_trained(model, pack)
     with shown(Console(stderr=True)):
-        calibrate = Pack(options.calibrate) if options.calibrate else None
+        calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
         report = exports.export(with_readouts(model, pack), pack, options.out, config, calibrate=calibrate)
     Console(markup=False).print(_table(options.out, report))
 

@@ -73,6 +73,7 @@ class _Options:
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
+    from mvitac.deploy.engine import frame_shapes
     from mvitac.live.display import Window
     from mvitac.live.recorder import Recorder, finish
 
@@ -94,7 +95,7 @@ def live(argv: list[str]) -> None:
         print("no --vision, no --touch: all sensors are simulated")
     recorder = None
     if options.record:
-        channels = {m: s[2] for m, s in engine.inputs.items()}
+        channels = {m: s[2] for m, s in frame_shapes(engine).items()}
         recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
     loop = _loop(engine, streams, options.live, console, nearest=nearest, record=recorder)
     with _lines(options.predictions) as write:
@@ -122,11 +123,12 @@ def _nearest(options: _Options, engine: "Engine") -> Any:
 
 def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
     """The streams by modality, not yet open; several of one modality are numbered from 1."""
+    from mvitac.deploy.engine import frame_shapes
     from mvitac.live.cameras import source
     from mvitac.live.streams import Stream
 
     streams = {}
-    for modality, texts in sources(engine.inputs, options.vision, options.touch).items():
+    for modality, texts in sources(frame_shapes(engine), options.vision, options.touch).items():
         names = [modality] if len(texts) == 1 else [f"{modality} {i + 1}" for i in range(len(texts))]
         pairs = zip(names, texts, strict=True)
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]

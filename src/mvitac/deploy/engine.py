@@ -55,6 +55,8 @@ class Engine:
         """task -> name, unit, edges and spread of each target (``spread_at``)."""
         self.difference: bool = self.meta["preprocessing"].get("difference", False)
         """Whether the touch input is (touch - background) / 2 + 128."""
+        self.window: dict[str, Any] | None = self.meta["preprocessing"].get("window")
+        """For windows: number of frames, stride, its unit (order) and modalities (of), as in export.json."""
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})
@@ -91,6 +93,16 @@ class Engine:
                 raise ValueError(f"{name}: expected uint8 [B, {shape}], got {value.dtype} {value.shape}")
         found = self._call([np.ascontiguousarray(images[m]) for m in self.inputs])
         return dict(zip(self.meta["outputs"], found, strict=True))
+
+
+def frames_of(window: Mapping[str, Any] | None, modality: str) -> int:
+    """Frames of one input of ``modality``, by ``Engine.window``."""
+    return int(window["frames"]) if window and modality in window["of"] else 1
+
+
+def frame_shapes(engine: Any) -> dict[str, tuple[int, int, int]]:
+    """Shapes [S, S, C] of single frames by modality, of all cameras or sensors of it."""
+    return {m: (h, w, c // frames_of(engine.window, m)) for m, (h, w, c) in engine.inputs.items()}
 
 
 def spread_at(target: Mapping[str, Any], value: float) -> float:

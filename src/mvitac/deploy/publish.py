@@ -12,6 +12,7 @@ import safetensors.torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
+from mvitac.data.windows import windowed
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.deploy.card import card
 from mvitac.evaluation.classifiers import fit_linear, spread_out
@@ -166,10 +167,15 @@ def own_data(model: Model, instead: str) -> Pack:
         raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None
 
 
+def as_trained(model: Model, pack: Pack) -> Pack:
+    """``pack`` with the windows that ``model`` was trained on, if it shows single frames."""
+    return pack if pack.spec.window.active else windowed(pack, model.spec.window)
+
+
 def with_readouts(model: Model, pack: Pack | None = None) -> Model:
     """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack`` (default: the run's data)."""
     if not model.readouts:
-        model.readouts = fit_readouts(model, pack or model.open_data())
+        model.readouts = fit_readouts(model, as_trained(model, pack) if pack else model.open_data())
     return model
 
 
@@ -206,7 +212,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
     with new_folder(out) as partial:
         model = load(run)
         _, record = load_run(run)
-        pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
+        pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on another pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         _write_weights(model, partial)
         write_json(partial / "run.json", record)

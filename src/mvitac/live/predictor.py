@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import difference, fit
-from mvitac.deploy.engine import Engine, spread_at
+from mvitac.deploy.engine import Engine, frame_shapes, frames_of, spread_at
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.streams import Event, Frame, Stream
 
@@ -114,7 +114,11 @@ class Live:
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]
         """The stream whose new frames start predictions."""
-        side = engine.inputs["touch"][0] if engine.difference and "touch" in streams else 0
+        _check_window(engine)
+        self.minus_rest = engine.difference or _minus_first(engine)
+        """Whether the learned background is subtracted from touch."""
+        side = engine.inputs["touch"][0] if self.minus_rest and "touch" in streams else 0
+        self._since: dict[str, float] = {}
         self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
@@ -129,9 +133,11 @@ class Live:
         self._changed: set[str] = set()
         for stream in self.all:
             stream.tell = self._heard
+        self._remember()
 
     def tick(self) -> bool:
         """Use the newest frames if the leading stream has a new one; True if that made a prediction."""
+        self._remember()
         for stream in self.all:
             stream.check()
         leading = self.leading.newest(take=False)
@@ -153,7 +159,7 @@ class Live:
             for m, found in frames.items()
         }
         if self.contact:
-            self._predict(images, now, captured=min(f.time for f in frames[self._leading_modality] if f))
+            self._predict(frames, images, now)
         else:
             self._release(now)
         if self.record:
@@ -168,12 +174,16 @@ class Live:
             for stream, frame in zip(several, found, strict=True)
         )
 
-    def _predict(self, images: dict[str, np.ndarray], now: float, captured: float) -> None:
-        """Add a prediction to the current touch, or start one; ``captured``: time of the leading frame."""
+    def _predict(self, frames: dict[str, list[Frame | None]], images: dict[str, np.ndarray], now: float) -> None:
+        """Add a prediction for the newest ``frames``, resized to ``images``, to the current touch, or start one."""
+        captured = min(f.time for f in frames[self._leading_modality] if f)
         if self.touch is None:
             self.num_touches += 1
             self.touch = Touch(self.num_touches, now)
-        outputs = self.engine(**{m: x[None] for m, x in self._as_trained(images).items()})
+            pairs = (pair for m in frames for pair in zip(self.streams[m], frames[m], strict=True))
+            self._since = {stream.name: frame.time for stream, frame in pairs if frame}
+        given = {m: self._as_trained(m, self._window(m, frames[m], image)) for m, image in images.items()}
+        outputs = self.engine(**{m: np.concatenate(several, axis=2)[None] for m, several in given.items()})
         self.touch.add(
             {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
             {task: outputs[f"value_{task}"][0] for task in self.engine.values},
@@ -214,12 +224,35 @@ class Live:
         states = self.contacts.values()
         return None if any(c.background is None for c in states) else any(c.touched for c in states)
 
-    def _as_trained(self, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """``images`` as the model was trained on them; recorded images stay as they came."""
-        if not (self.engine.difference and self.contacts):
-            return images
+    def _window(self, modality: str, frames: list[Frame | None], newest: np.ndarray) -> list[np.ndarray]:
+        """The frames [S, S, C] that the model looks at, newest first: ``newest``, and older ones by their time."""
+        if frames_of(self.engine.window, modality) == 1:
+            return [newest]
+        sensors = []
+        for stream, frame in zip(self.streams[modality], frames, strict=True):
+            if frame:
+                sensors.append(stream.window(frame, self._back(stream), self._since.get(stream.name, frame.time)))
+        return [newest, *(np.concatenate(each, axis=2) for each in list(zip(*sensors, strict=True))[1:])]
+
+    def _back(self, stream: Stream) -> list[float]:
+        """Seconds from each frame of a window to the newest."""
+        window = self.engine.window or {}
+        unit = 1.0 if window["order"] == "time" else self.config.frame_seconds or stream.interval() or 0.0
+        return [k * window["stride"] * unit for k in range(window["frames"])]
+
+    def _remember(self) -> None:
+        """Let the streams keep as much as a window needs."""
+        for modality in (m for m in self.streams if frames_of(self.engine.window, m) > 1):
+            for stream in self.streams[modality]:
+                seconds = self._back(stream)[-1] if stream.interval() else math.inf
+                stream.remember(seconds, self.engine.inputs[modality][0])
+
+    def _as_trained(self, modality: str, frames: list[np.ndarray]) -> list[np.ndarray]:
+        """Frames [S, S, C] as the model was trained on them; recorded images stay as they came."""
+        if modality != "touch" or not (self.minus_rest and self.contacts):
+            return frames
         free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
-        return {**images, "touch": difference(images["touch"], np.rint(free).astype(np.uint8))}
+        return [difference(frame, np.rint(free).astype(np.uint8)) for frame in frames]
 
     def _lose(self, now: float) -> None:
         """End the touch when frames are missing: contact is then unknown."""
@@ -293,9 +326,24 @@ def _readings(targets: Sequence[dict[str, Any]], *found: np.ndarray) -> list[Rea
     return readings
 
 
+def _minus_first(engine: Engine) -> bool:
+    """Whether windows of touch are minus the first frame of their touch, for which the learned background stands."""
+    return bool(engine.window and engine.window["minus_first"] and "touch" in engine.window["of"])
+
+
+def _check_window(engine: Engine) -> None:
+    """ValueError if the model looks at differences that live input does not have."""
+    window = engine.window
+    if window and window["minus_first"] and (engine.difference or "vision" in window["of"]):
+        raise ValueError(
+            "live: this model looks at frames minus the first one of vision, or of touch minus a background already: live"
+            " knows the background of touch alone; train it with --data.frames-of touch and without --subtract-background"
+        )
+
+
 def _check_inputs(engine: Engine, streams: dict[str, Sequence[Stream]]) -> None:
     """ValueError if the number of streams is not that of the engine's inputs."""
-    for modality, (_, _, channels) in engine.inputs.items():
+    for modality, (_, _, channels) in frame_shapes(engine).items():
         given, wanted = len(streams.get(modality, ())), channels // 3
         if given != wanted:
             raise ValueError(
