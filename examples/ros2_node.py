@@ -4,7 +4,8 @@
 
 It subscribes to sensor_msgs/Image (rgb8 or bgr8), and publishes std_msgs/String on ~/prediction and
 std_msgs/Float32MultiArray on ~/embedding. A prediction is JSON: number of the touch, contact (true; false once, when
-the contact ends), age in ms, and class and confidence of each task. Errors are written to the node's log.
+the contact ends), age in ms, and for each task its class and confidence, or the value, unit and spread (usual error) of
+each target. Errors are written to the node's log.
 
 Only ``main`` needs ROS. ``Node`` accepts any object with the fields of an Image message, so it can be tested without
 ROS.
@@ -20,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from mvitac.deploy.engine import Engine
+from mvitac.deploy.engine import Engine, frame_shapes
 from mvitac.live.cameras import Source
 from mvitac.live.predictor import Live
 from mvitac.live.streams import Stream
@@ -67,7 +68,7 @@ class Node:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.publish, self.outputs = publish, {}
-        self.topics = {m: [Topic() for _ in range(shape[2] // 3)] for m, shape in engine.inputs.items()}
+        self.topics = {m: [Topic() for _ in range(shape[2] // 3)] for m, shape in frame_shapes(engine).items()}
         self.streams = {
             m: [Stream(f"{m} {i}", topic, clock=clock) for i, topic in enumerate(topics)]
             for m, topics in self.topics.items()
@@ -86,14 +87,12 @@ class Node:
         """Publish new results. Also called by a timer, because a topic that stops sends no message."""
         predicted, before = self.live.tick(), self.touched
         self.touched = self.live.touch is not None
-        number = {"touch": self.live.num_touches, "contact": self.touched}
         if predicted:
-            said = {task: {"class": c, "confidence": p} for task, (c, p) in self.live.answers(self.live.touch).items()}
-            self.publish("prediction", json.dumps({**number, "age_ms": 1000 * self.live.age, **said}))
+            self.publish("prediction", json.dumps(self.live.prediction()))
             names = [n for n in self.outputs if n.startswith("embedding_")]
             self.publish("embedding", np.concatenate([self.outputs[n][0] for n in names]).tolist())
         elif before and not self.touched:
-            self.publish("prediction", json.dumps(number))
+            self.publish("prediction", json.dumps(self.live.prediction()))
 
 
 class Kept:
@@ -101,7 +100,7 @@ class Kept:
 
     def __init__(self, engine: Engine, outputs: dict[str, np.ndarray]) -> None:
         self.engine, self.outputs, self.inputs, self.classes = engine, outputs, engine.inputs, engine.classes
-        self.difference = engine.difference
+        self.values, self.difference, self.window = engine.values, engine.difference, engine.window
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
         self.outputs.update(self.engine(**images))
@@ -118,7 +117,7 @@ def main() -> None:
     options, rest = parser.parse_known_args()
     engine = Engine(options.export)
     for modality in ("vision", "touch"):
-        takes = engine.inputs.get(modality, (0, 0, 0))[2] // 3
+        takes = frame_shapes(engine).get(modality, (0, 0, 0))[2] // 3
         if len(getattr(options, modality)) != takes:
             parser.error(f"the model needs {takes} {modality} topic(s): give --{modality} TOPIC {takes} times")
 

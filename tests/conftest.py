@@ -81,3 +81,37 @@ def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -
     out = tmp_path_factory.mktemp("export") / "onnx"
     export(load(artifact), pack, out, ExportConfig(kind="onnx"))
     return out
+
+
+@pytest.fixture(scope="session")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """The striped pairs with two measured numbers: brightness in levels, weight in N."""
+    from support.toy import toy_pack
+
+    return toy_pack(tmp_path_factory.mktemp("measured") / "pack", values=True)
+
+
+@pytest.fixture(scope="session")
+def value_artifact(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two steps on ``measured``, published."""
+    from dataclasses import replace
+
+    from mvitac.datasets.pack import PackConfig
+    from mvitac.deploy.publish import publish
+    from mvitac.recipes import recipe
+    from mvitac.training.loop import train
+
+    folder = tmp_path_factory.mktemp("values")
+    run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
+    return publish(train(run, folder / "run", quiet=True), folder / "artifact")
+
+
+@pytest.fixture(scope="session")
+def value_onnx(value_artifact: Path, measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """That artifact, exported for ONNX Runtime."""
+    from mvitac.deploy.artifact import load
+    from mvitac.deploy.export import ExportConfig, export
+
+    out = tmp_path_factory.mktemp("value export") / "onnx"
+    export(load(value_artifact), measured, out, ExportConfig(kind="onnx"))
+    return out

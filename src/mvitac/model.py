@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import DataSpec, Target
 from mvitac.methods.base import Method
 from mvitac.nn.encoders import SCRATCH, num_features, timm_trunk
-from mvitac.nn.linear_probe import LinearProbe
+from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
@@ -80,8 +80,9 @@ class Model(nn.Module):
     def _repr_html_(self) -> str:
         rows = [(modality, num_features(trunk)) for modality, trunk in self.encoders.items()]
         probes = [(task, ", ".join(classes)) for task, classes in self.classes.items()]
+        probes += [(task, ", ".join(f"{t.name} ({t.unit})" for t in found)) for task, found in self.targets.items()]
         text = f"<p>{escape(repr(self))}</p>{table(rows, ('input', 'features'))}"
-        return text + (table(probes, ("probe", "classes")) if probes else "")
+        return text + (table(probes, ("probe", "answers")) if probes else "")
 
     def forward(
         self, *unnamed: Tensor, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False
@@ -150,8 +151,9 @@ class Model(nn.Module):
         self.check_modality(modality)
         self._check_background(modality, background)
         channels, size = self.spec.channels(modality), self.run.augment.eval_size if normalize else None
-        free = None if background is None else to_array(background, channels, "background")
-        return Preprocess(modality, channels, self.stored, size, free)
+        frames = self.spec.frames(modality)
+        free = None if background is None else to_array(background, channels // frames, "background")
+        return Preprocess(modality, channels, self.stored, size, free, frames)
 
     def trunk(self, modality: str) -> nn.Module:
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
@@ -216,11 +218,15 @@ class Model(nn.Module):
         uint8 or float in [0, 1], RGB. Several images are a list of these, an array [N, H, W, C], or a tensor [N, C, H, W]
         or [N, H, W, C]. They may have any size: they are resized like the training images.
 
+        A model of windows (``spec.window``) takes clips: [F, H, W, C], oldest first, or a list of F images; several are a
+        list of clips or an array [N, F, H, W, C]. Frames are ``spec.window.stride`` apart.
+
         Args:
             vision: Camera images.
             touch: Tactile images. With two sensors they have 6 channels, left before right.
             background: For models trained on difference images (``spec.difference``): the sensor without contact, as one
-                image or one per touch image. Without it, ``touch`` must already be (touch - background) / 2 + 128.
+                image or one per touch image; for windows minus their touch's first frame: that frame. Without it,
+                ``touch`` must already be (touch - background) / 2 + 128.
             shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
 
         Returns:
@@ -249,7 +255,13 @@ class Model(nn.Module):
         return torch.cat(chunks)
 
     def _check_background(self, modality: str, background: ImageInput | None) -> None:
-        if background is not None and (modality != "touch" or not self.spec.difference):
+        window = self.spec.window
+        first = window.minus_first and "touch" in window.of
+        if background is not None and first and self.spec.difference:
+            raise ValueError(
+                "background: this model's touch is minus a background, then minus its first frame: give it as trained"
+            )
+        if background is not None and (modality != "touch" or not (self.spec.difference or first)):
             untrained = "this model was not trained on difference images of touch"
             why = untrained if modality == "touch" else "there is no touch"
             raise ValueError(f"background cannot be used, {why}: leave it out")
@@ -257,7 +269,7 @@ class Model(nn.Module):
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None
     ) -> dict[str, Tensor]:
-        """Classify raw images with the probes of a published artifact.
+        """Classify or measure raw images with the probes of a published artifact.
 
         Args:
             vision: As for ``embed``. If both modalities are given, the probes on both are used.
@@ -265,7 +277,8 @@ class Model(nn.Module):
             background: As for ``embed``.
 
         Returns:
-            task -> class probabilities [N, K]. ``classes`` names the columns.
+            task -> class probabilities [N, K], or values [N, T] in the units of their targets. ``classes`` and ``targets``
+            name the columns.
 
         Raises:
             ValueError: As for ``embed``, or if the model has no probe on these modalities.
@@ -282,7 +295,12 @@ class Model(nn.Module):
     @property
     def classes(self) -> dict[str, tuple[str, ...]]:
         """task -> class names, in the order of the columns of ``predict``."""
-        return {r.question.task: r.question.classes for r in self.readouts.values()}
+        return {q.task: q.classes for r in self.readouts.values() if isinstance(q := r.question, ProbeInfo)}
+
+    @property
+    def targets(self) -> dict[str, tuple[Target, ...]]:
+        """task -> names and units of its values, in the order of the columns of ``predict``."""
+        return {q.task: q.targets for r in self.readouts.values() if isinstance(q := r.question, ValueInfo)}
 
     def open_data(self, *, quiet: bool = False) -> Pack:
         """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""

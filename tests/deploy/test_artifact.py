@@ -24,7 +24,8 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.artifact import preprocessing, read_manifest, seal
-from mvitac.deploy.publish import card, fit_readouts, push
+from mvitac.deploy.card import card
+from mvitac.deploy.publish import fit_readouts, push
 from mvitac.deploy.search import check_pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import pack_features

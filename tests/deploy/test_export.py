@@ -24,8 +24,9 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import export_module as graphs
 from mvitac.deploy.engine import Engine, cosines
-from mvitac.deploy.export import ExportConfig, export, parity, reference
+from mvitac.deploy.export import ExportConfig, export
 from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.parity import parity, reference
 from mvitac.deploy.publish import with_readouts
 from mvitac.deploy.quantise import this_machine
 from mvitac.model import Model

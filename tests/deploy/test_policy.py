@@ -125,7 +125,7 @@ def test_the_ros_node_on_a_fake_publisher(onnx: Path) -> None:
     said = json.loads(sent[0][1])
     assert said["touch"] == 1 and said["contact"] and said["pattern"]["class"] in engine.classes["pattern"]
     assert said["age_ms"] == 0  # the fake clock stands still meanwhile
-    assert len(sent[1][1]) == 128
+    assert len(sent[1][1]) == 128 and set(said) == {"touch", "contact", "age_ms", "pattern", "bright"}
     clock.now += 5
     node.tick()
     assert sorted(warned[1:]) == ["touch 0 gives no frames since 5.0 s", "vision 0 gives no frames since 5.0 s"]

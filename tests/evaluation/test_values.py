@@ -32,12 +32,6 @@ NEWTON = (Target(name="force_n", unit="N"),)
 POSE = (Target(name="z_mm", unit="mm"), Target(name="tilt_deg", unit="deg"))
 
 
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    path = tmp_path_factory.mktemp("measured") / "pack"
-    return build(Toy(values=True), path, size=32, workers=1, quiet=True)
-
-
 # -- scores -----------------------------------------------------------------------------------------------------------
 
 

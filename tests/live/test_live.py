@@ -30,7 +30,7 @@ from mvitac.deploy.search import neighbours
 from mvitac.live.cameras import Camera, Folder, Simulated, source
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.display import Window, draw
-from mvitac.live.predictor import Live
+from mvitac.live.predictor import Live, Reading
 from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.model import Model
@@ -54,7 +54,7 @@ class Slow:
 
     def __init__(self, engine: Engine) -> None:
         self.engine, self.inputs, self.classes, self.meta = engine, engine.inputs, engine.classes, engine.meta
-        self.difference = engine.difference
+        self.values, self.difference, self.window = engine.values, engine.difference, engine.window
         self.clock: Clock | None = None
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
@@ -540,6 +540,7 @@ def test_the_picture_shows_frames_contact_and_answers(engine: Engine, modalities
         """The engine, of some of its inputs."""
 
         inputs, classes, difference = {m: engine.inputs[m] for m in modalities}, engine.classes, False
+        values, window = engine.values, engine.window
 
         def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
             zeros = {m: np.zeros((1, *shape), np.uint8) for m, shape in engine.inputs.items()}
@@ -634,6 +635,77 @@ def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys:
         assert main([*command, *wrong]) == 2 and "more than 0" in capsys.readouterr().err
 
 
+# -- values -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def measuring(value_onnx: Path) -> Engine:
+    return Engine(value_onnx, threads=1)
+
+
+def test_a_value_is_that_of_the_newest_frame_with_the_spread_of_its_range(measuring: Engine) -> None:
+    given = iter([1.0, 5.0, 3.0, 3.0, 3.0])
+
+    class Rising(Slow):
+        """Says 1, 5, 3, 3, ... levels; errors are 0.25 below 2 levels and 0.5 from there."""
+
+        def __init__(self) -> None:
+            super().__init__(measuring)
+            self.values = {"light": [{"name": "level", "unit": "N", "edges": [2.0], "spread": [0.25, 0.5]}]}
+
+        def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
+            return {**self.engine(**images), "value_light": np.array([[next(given, 3.0)]], np.float32)}
+
+    world, found = World(Rising()), []
+    while world.live.num_predictions < 3:
+        before = world.live.num_predictions
+        world.run(0.05)  # one frame
+        if world.live.num_predictions > before:
+            (reading,) = world.live.readings(world.live.touch)["light"]
+            found.append((reading.value, reading.spread, reading.low, reading.high))
+    assert found == [(1.0, 0.25, 1.0, 1.0), (5.0, 0.5, 1.0, 5.0), (3.0, 0.5, 1.0, 5.0)]
+    assert str(reading) == "3.0 N +- 0.5" and reading.over_touch() == "1.0 to 5.0 N +- 0.5"
+    said = json.loads(json.dumps(world.live.prediction()))
+    assert said["light"] == {"level": {"value": 3.0, "unit": "N", "spread": 0.5}} and said["contact"] is True
+    assert said["pattern"]["class"] in measuring.classes["pattern"]
+    assert "level      3.0 N +- 0.5" in shown(world.live)
+    while world.live.touch:
+        world.run(0.1)
+    assert world.live.prediction() == {"touch": 1, "contact": False}
+
+
+@pytest.mark.parametrize(("spread", "text"), [(0.04, "3.16 N"), (0.4, "3.2 N"), (12.0, "3 N"), (0.0, "3.162 N")])
+def test_a_value_has_as_many_digits_as_its_spread_allows(spread: float, text: str) -> None:
+    assert str(Reading("force_n", "N", 3.1622, spread, 3.0, 4.0)).startswith(text + " +- ")
+
+
+def test_the_picture_and_the_line_of_a_touch_have_values(measuring: Engine) -> None:
+    world = World(measuring)
+    assert draw(world.live).shape == (256 + 24 * (4 + 3), 512, 3)  # level, and level and weight
+    while world.live.last is None:
+        world.run(0.5)
+    console = Console(width=300, file=io.StringIO())
+    assert _print_touch(world.live, console, 0) == 1
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert re.search(r"weight: -?[\d.]+ to -?[\d.]+ N \+- [\d.]+", text) and "level: " in text
+
+
+def test_predictions_are_written_line_by_line(value_onnx: Path, measured: Pack, tmp_path: Path) -> None:
+    for m in ("vision", "touch"):
+        (tmp_path / m).mkdir()
+        for i in range(12):
+            image = measured.images[m][0] if i < 5 else 255 - measured.images[m][0]
+            Image.fromarray(image ^ np.uint8(i % 2)).save(tmp_path / m / f"{i:03d}.png")
+    command = ["live", str(value_onnx), "--vision", f"{tmp_path / 'vision'}@30", "--touch", f"{tmp_path / 'touch'}@30"]
+    options = ["--calibration", "2", "--stale", "60", "--predictions", str(tmp_path / "p.jsonl")]
+    assert main([*command, *options]) == 0
+    lines = [json.loads(line) for line in (tmp_path / "p.jsonl").read_text().splitlines()]
+    assert len(lines) > 3 and all(line["both"]["weight"]["unit"] == "N" for line in lines)
+    assert [line["time"] for line in lines] == sorted({line["time"] for line in lines})
+    assert all(line["both"]["weight"]["spread"] > 0 for line in lines)
+    assert main([*command, "--predictions", str(tmp_path)]) == 2
+
+
 # -- the terminal -------------------------------------------------------------------------------------------------------
 
 
@@ -644,6 +716,8 @@ def touched(known: list[str]) -> SimpleNamespace:
     return SimpleNamespace(
         last=touch,
         answers=lambda touch: answers,
+        readings=lambda touch: {},
+        clock=lambda: 0.0,
         config=LiveConfig(),
         engine=SimpleNamespace(classes={"category": ("rubber", "knit", "cloth"), "soft": ("hard", "soft")}),
     )

@@ -84,6 +84,7 @@ class Toy(Source):
             "noise": float(rng.normal()),
         }
         if self.values:
+            columns["frame"] = item // NUM_CLASSES % 2  # the two of an instance
             columns["level"] = float(90 + 60 * bright + rng.normal())
             columns["weight"] = float("nan") if item % 3 == 0 else category + 0.1 * float(rng.normal())
         return [Sample(vision=image(self.vision_channels), touch=image(self.touch_channels), columns=columns)]

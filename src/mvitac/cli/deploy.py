@@ -12,7 +12,7 @@ from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
 from mvitac.deploy.artifact import load, read_manifest
-from mvitac.deploy.publish import own_data, with_readouts
+from mvitac.deploy.publish import as_trained, own_data, with_readouts
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
 from mvitac.report.tables import print_summary
@@ -52,7 +52,7 @@ def publish(argv: list[str]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _ExportOptions:
-    """Write a model for another engine: uint8 in, embeddings and class probabilities out. The result is compared with the
+    """Write a model for another engine: uint8 in, embeddings, probabilities and values out. The result is compared with the
     model on real inputs; nothing is written if it differs."""
 
     model: Positional[str]
@@ -79,6 +79,8 @@ class _ExportOptions:
     """Lowest cosine allowed (default: .9999 for fp32, .99 for bf16, .95 for int8)."""
     accuracy_loss: float = 0.5
     """Points of accuracy that a task may lose."""
+    value_loss: float = 0.1
+    """Change that a value may have (root mean square), in standard deviations of that value."""
     num_rows: Annotated[int, tyro.conf.arg(name="rows")] = 512
     """Maximum number of test rows to check on."""
     threads: int = 0
@@ -96,13 +98,15 @@ def export(argv: list[str]) -> None:
         modalities=None if options.modality == "both" else (options.modality,),
         min_cosine=options.min_cosine,
         accuracy_loss=options.accuracy_loss,
+        value_loss=options.value_loss,
         num_rows=options.num_rows,
         threads=options.threads,
     )
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
+    pack = as_trained(model, pack)
     with shown(Console(stderr=True)):
-        calibrate = Pack(options.calibrate) if options.calibrate else None
+        calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
         report = exports.export(with_readouts(model, pack), pack, options.out, config, calibrate=calibrate)
     Console(markup=False).print(_table(options.out, report))
 
@@ -113,6 +117,11 @@ def _table(out: Path, report: dict[str, Any]) -> Table:
         table.add_column(column)
     for task, values in report["accuracy"].items():
         table.add_row(f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}")
+    for target in (target for targets in report.get("values", {}).values() for target in targets):
+        if target["num"]:
+            cells = (f"{target[key]:.3g}" for key in ("original", "export"))
+            table.add_row(f"{target['name']}, mean absolute error, {target['unit']}", *cells)
+        table.add_row(f"{target['name']}, change, {target['unit']}", "", f"{target['change']:.2g}")
     for name, values in report["cosine"].items():
         table.add_row(f"{name}, lowest cosine", "", f"{values['min']:.5f}")
     if target := report.get("target"):

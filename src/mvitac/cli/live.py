@@ -1,8 +1,9 @@
 """``mvitac live``: predict from the frames of cameras and tactile sensors, one answer for every touch."""
 
+import json
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,11 +65,15 @@ class _Options:
     """Age in seconds from which a frame is too old to be used."""
     json: Path | None = None
     """Write the summary to this file."""
+    predictions: Path | None = None
+    """Write every prediction to this file: one JSON object per line, with time in seconds, classes with confidence, and
+    values with unit and spread."""
     live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
+    from mvitac.deploy.engine import frame_shapes
     from mvitac.live.display import Window
     from mvitac.live.recorder import Recorder, finish
 
@@ -80,6 +85,7 @@ def live(argv: list[str]) -> None:
         if seconds is not None and not seconds > 0:
             raise ValueError(f"{name} {seconds:g}: give seconds, more than 0")
     check_json(options.json)
+    check_json(options.predictions, "--predictions")
     console = Console(markup=False)
     window = Window() if options.window else None
     engine = _engine(options.model, options.threads, console)
@@ -89,10 +95,11 @@ def live(argv: list[str]) -> None:
         print("no --vision, no --touch: all sensors are simulated")
     recorder = None
     if options.record:
-        channels = {m: s[2] for m, s in engine.inputs.items()}
+        channels = {m: s[2] for m, s in frame_shapes(engine).items()}
         recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
     loop = _loop(engine, streams, options.live, console, nearest=nearest, record=recorder)
-    _run(loop, console, window, options.seconds)
+    with _lines(options.predictions) as write:
+        _run(loop, console, window, options.seconds, write)
     summary = loop.summary()
     _print_summary(summary)
     if options.json:
@@ -116,11 +123,12 @@ def _nearest(options: _Options, engine: "Engine") -> Any:
 
 def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
     """The streams by modality, not yet open; several of one modality are numbered from 1."""
+    from mvitac.deploy.engine import frame_shapes
     from mvitac.live.cameras import source
     from mvitac.live.streams import Stream
 
     streams = {}
-    for modality, texts in sources(engine.inputs, options.vision, options.touch).items():
+    for modality, texts in sources(frame_shapes(engine), options.vision, options.touch).items():
         names = [modality] if len(texts) == 1 else [f"{modality} {i + 1}" for i in range(len(texts))]
         pairs = zip(names, texts, strict=True)
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
@@ -137,10 +145,27 @@ def _loop(engine: "Engine", streams: dict[str, Any], config: LiveConfig, console
     return Live(engine, streams, config, tell=tell, **options)
 
 
-def _run(loop: "Live", console: Console, window: "Window | None", seconds: float | None) -> None:
-    """Predict until all streams ended, ``seconds`` are over, or the user stops it."""
+@contextmanager
+def _lines(path: Path | None) -> Iterator[Callable[[Any], object]]:
+    """A function that writes one JSON line to ``path``, if there is one."""
+    if path is None:
+        yield lambda said: None
+        return
+    with path.open("w") as file:
+        yield lambda said: file.write(json.dumps(said) + "\n")
+
+
+def _run(
+    loop: "Live",
+    console: Console,
+    window: "Window | None",
+    seconds: float | None,
+    write: Callable[[Any], object] = lambda said: None,
+) -> None:
+    """Predict until all streams ended, ``seconds`` are over, or the user stops it; ``write`` gets every prediction."""
     from mvitac.live.display import draw
 
+    start = loop.clock()
     end = time.monotonic() + seconds if seconds else float("inf")
     printed, drawn = 0, 0.0
     with (
@@ -151,7 +176,8 @@ def _run(loop: "Live", console: Console, window: "Window | None", seconds: float
             while time.monotonic() < end and not all(s.ended for s in loop.all):
                 news.wait(0.05)
                 news.clear()
-                loop.tick()
+                if loop.tick():
+                    write({"time": round(loop.clock() - start, 4), **loop.prediction()})
                 printed = _print_touch(loop, console, printed)
                 if time.monotonic() - drawn > _REDRAW:
                     screen.update(view(loop), refresh=True)
@@ -245,7 +271,10 @@ def _print_touch(loop: "Live", console: Any, printed: int) -> int:
     touch = loop.last
     if touch is None or touch.number <= printed or touch.end is None:
         return printed
-    answers = "; ".join(_answer(loop, *item) for item in loop.answers(touch).items())
+    answers = "; ".join(
+        [_answer(loop, *item) for item in loop.answers(touch).items()]
+        + [f"{r.name}: {r.over_touch()}" for found in loop.readings(touch).values() for r in found]
+    )
     like = f"; like: {'; '.join(touch.known)}" if touch.known else ""
     text = f"touch {touch.number} ({touch.end - touch.start:.1f} s): {answers}{like}"
     _say(console, text)
@@ -273,12 +302,14 @@ def view(loop: "Live") -> Any:
         lines.append(Text(f"{s.name:8} {'unknown' if s.fault else state}"))
     touch = loop.touch or loop.last
     titles = {task: task_title(task, classes) for task, classes in loop.engine.classes.items()}
-    wide = max([10, *map(len, titles.values())])
+    values = [reading for found in loop.readings(touch).values() for reading in found]
+    wide = max([10, *map(len, titles.values()), *(len(reading.name) for reading in values)])
     for task, (name, confidence) in loop.answers(touch).items():
         sure = "" if confidence >= loop.config.min_confidence else "  unsure"
         lines.append(
             Text(f"{titles[task]:{wide}} {name:18} {'#' * round(20 * confidence):20} {100 * confidence:3.0f} %{sure}")
         )
+    lines += [Text(f"{reading.name:{wide}} {reading}") for reading in values]
     if touch and touch.known:
         lines.append(Text("like: " + "; ".join(touch.known)))
     age = loop.summary()["age_ms"]

@@ -106,14 +106,14 @@ def asks_help(argv: Sequence[str]) -> bool:
     return bool({"-h", "--help"} & set(argv))
 
 
-def check_json(path: Path | None) -> None:
-    """ValueError if the file of a ``--json`` option cannot be written; called before the work begins."""
+def check_json(path: Path | None, option: str = "--json") -> None:
+    """ValueError if the file of ``option`` cannot be written; called before the work begins."""
     from mvitac.system.files import check_place
 
     if path and path != STDOUT:
         check_place(path)
         if path.is_dir():
-            raise ValueError(f"--json {path} is a folder: give another place, the name of a file")
+            raise ValueError(f"{option} {path} is a folder: give another place, the name of a file")
 
 
 def console(json_file: Path | None) -> Any:

@@ -1,6 +1,6 @@
 """The artifact: one folder with a trained model and everything needed to use it correctly.
 
-    <artifact>/artifact.json       format, preprocessing, probes with class names and scores, data, digests
+    <artifact>/artifact.json       format, preprocessing, probes with class names or units and scores, data, digests
                model.safetensors   encoders and heads into the shared space
                probes.safetensors  trained linear probes (absent where the data has no labels)
                run.json            provenance: method, data, optimiser, seed, versions, commit
@@ -23,8 +23,8 @@ from torch import nn
 
 from mvitac import model as models
 from mvitac.model import Model
-from mvitac.nn.linear_probe import LinearProbe, ProbeInfo
-from mvitac.registry import from_json
+from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
+from mvitac.registry import from_json, to_json
 from mvitac.system.files import brief, digest, digest_file, read_json
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
@@ -41,6 +41,11 @@ SUBTRACTED = (
     "subtracted: touch is (touch - background) / 2 + 128, the background being what the sensor shows without contact;"
     " `mvitac live` learns it and does this, `embed` and `predict` do it given background=..., whoever calls an export"
     " does it first"
+)
+LAYOUT = (
+    "channels are those of the newest frame first, then of older ones; frames are `stride` units of column `order` apart"
+    " (time: seconds, else: frames); at the start of a touch its first frame repeats; minus_first: each frame is"
+    " (frame - first frame of the touch) / 2 + 128"
 )
 HUB_ID = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(@(?P<revision>[\w./-]+))?")
 
@@ -125,6 +130,7 @@ def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]
         "difference": model.spec.difference,
         "background": SUBTRACTED if model.spec.difference else AS_GIVEN,
         "sensors": list(sensors),
+        **({"window": {**to_json(model.spec.window), "layout": LAYOUT}} if model.spec.window.active else {}),
     }
 
 
@@ -133,10 +139,10 @@ def read(folder: Path) -> PublishedModel:
     manifest = read_manifest(folder)
     model = models.load(folder / "model.safetensors")
     asked, given = preprocessing(model), manifest["preprocessing"]
-    for name in ("colour_order", "mean", "std", "stored", "size", "channels"):
-        if given.get(name) != asked[name]:
+    for name in ("colour_order", "mean", "std", "stored", "size", "channels", "window"):
+        if given.get(name) != asked.get(name):
             raise ValueError(
-                f"{folder}: artifact.json says {name} {given.get(name)}, its model was trained with {asked[name]}:"
+                f"{folder}: artifact.json says {name} {given.get(name)}, its model was trained with {asked.get(name)}:"
                 " predictions would be wrong, publish it again"
             )
     model.readouts = read_probes(folder, manifest, model)
@@ -197,9 +203,11 @@ def check_header(path: Path) -> None:
 def read_probes(folder: Path, manifest: dict[str, Any], model: Model) -> dict[str, LinearProbe]:
     """The probes of ``folder`` by name; ValueError if names, shapes or classes do not fit the model."""
     try:
-        questions: tuple[ProbeInfo, ...] = from_json(tuple[ProbeInfo, ...], manifest.get("probes"), "probes")
+        classes: tuple[ProbeInfo, ...] = from_json(tuple[ProbeInfo, ...], manifest.get("probes"), "probes")
+        values: tuple[ValueInfo, ...] = from_json(tuple[ValueInfo, ...], manifest.get("values", []), "values")
     except ValueError as error:
         raise ValueError(f"{folder / MANIFEST} is damaged ({error}): publish it again") from None
+    questions = (*classes, *values)
     if not questions:
         return {}
     path = folder / "probes.safetensors"

@@ -10,6 +10,7 @@ Pickles in a torch export are refused. torch still calls its format unsafe, so o
 
 from __future__ import annotations
 
+import bisect
 import os
 import re
 import sys
@@ -41,6 +42,7 @@ class Engine:
     Example:
         engine = Engine("exports/first")
         probabilities = engine(vision=photos, touch=presses)["probability_category"]   # [B, K]
+        newtons = engine(vision=photos, touch=presses)["value_force_n"]                # [B, 1]
     """
 
     def __init__(self, folder: str | Path, *, threads: int = 0) -> None:
@@ -49,8 +51,12 @@ class Engine:
         self.meta = read_manifest(folder)
         self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
         self.classes: dict[str, list[str]] = self.meta["classes"]
+        self.values: dict[str, list[dict[str, Any]]] = self.meta.get("values", {})
+        """task -> name, unit, edges and spread of each target (``spread_at``)."""
         self.difference: bool = self.meta["preprocessing"].get("difference", False)
         """Whether the touch input is (touch - background) / 2 + 128."""
+        self.window: dict[str, Any] | None = self.meta["preprocessing"].get("window")
+        """For windows: number of frames, stride, its unit (order) and modalities (of), as in export.json."""
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})
@@ -64,6 +70,18 @@ class Engine:
                     f"{folder}: on this machine {name} has cosine {least:.4f} to the output of the trained model,"
                     f" at least {self.meta['tolerance']['min_cosine']} is allowed: export it again{again}"
                 )
+        for task in self.values:
+            self._check_values(folder, task, found[f"value_{task}"] - check[f"value_{task}"])
+
+    def _check_values(self, folder: Path, task: str, change: np.ndarray) -> None:
+        """ValueError if values change by over twice what the export may: its few inputs vary more than all test rows."""
+        for t, target in enumerate(self.meta["report"]["values"][task]):
+            rms = float((change[:, t] ** 2).mean() ** 0.5)
+            if not rms <= 2 * target["allowed"] + 1e-6:
+                raise ValueError(
+                    f"{folder}: on this machine {target['name']} differs by {rms:.3g} {target['unit']} from the trained"
+                    f" model, at most {2 * target['allowed']:.3g} is allowed: export it again with this engine"
+                )
 
     def __call__(self, **images: np.ndarray) -> dict[str, np.ndarray]:
         """Outputs of one batch; ValueError names an input that is missing, unknown or of another shape."""
@@ -75,6 +93,21 @@ class Engine:
                 raise ValueError(f"{name}: expected uint8 [B, {shape}], got {value.dtype} {value.shape}")
         found = self._call([np.ascontiguousarray(images[m]) for m in self.inputs])
         return dict(zip(self.meta["outputs"], found, strict=True))
+
+
+def frames_of(window: Mapping[str, Any] | None, modality: str) -> int:
+    """Frames of one input of ``modality``, by ``Engine.window``."""
+    return int(window["frames"]) if window and modality in window["of"] else 1
+
+
+def frame_shapes(engine: Any) -> dict[str, tuple[int, int, int]]:
+    """Shapes [S, S, C] of single frames by modality, of all cameras or sensors of it."""
+    return {m: (h, w, c // frames_of(engine.window, m)) for m, (h, w, c) in engine.inputs.items()}
+
+
+def spread_at(target: Mapping[str, Any], value: float) -> float:
+    """The root mean squared error of test rows whose prediction was in the range of ``value``, in the target's unit."""
+    return float(target["spread"][bisect.bisect_right(target["edges"], value)])
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

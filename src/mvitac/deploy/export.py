@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import time
+import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -23,8 +23,9 @@ import torch
 
 from mvitac.data.pack import Pack, has_difference
 from mvitac.deploy.artifact import preprocessing
-from mvitac.deploy.engine import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST, Call, cosines, open_engine
+from mvitac.deploy.engine import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST, open_engine
 from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.parity import latency, parity, reference
 from mvitac.deploy.quantise import Target, quantise, this_machine, to_openvino, write_onnx
 from mvitac.evaluation.features import sample
 from mvitac.model import Model
@@ -33,7 +34,6 @@ from mvitac.system.files import digest, digest_file, write_atomic, write_json
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
-from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 Kind = Literal["torch", "onnx", "openvino"]
 MIN_COSINE = {"fp32": 0.9999, "bf16": 0.99, "int8": 0.95}
@@ -61,6 +61,8 @@ class ExportConfig:
     """Lowest cosine of any single embedding with the original; None = that of ``MIN_COSINE``."""
     accuracy_loss: float = 0.5
     """Points of accuracy (percent) that any one task may lose on the test rows."""
+    value_loss: float = 0.1
+    """Change of any predicted value on the test rows (root mean square), in standard deviations of that value."""
     num_rows: int = 512
     """Maximum number of test rows to check on."""
     threads: int = 0
@@ -75,6 +77,8 @@ class ExportConfig:
             raise ValueError(f"--target {self.target} chooses the weights of --int8: add --int8, or leave --target out")
         if not (0 <= self.accuracy_loss <= 100):
             raise ValueError(f"--accuracy-loss {self.accuracy_loss}: give points of accuracy, 0 to 100")
+        if not 0 <= self.value_loss < math.inf:
+            raise ValueError(f"--value-loss {self.value_loss}: give standard deviations of the value, 0 or more")
         if not (self.min_cosine is None or -1 <= self.min_cosine <= 1):
             raise ValueError(f"--min-cosine {self.min_cosine}: give a cosine, -1 to 1")
         if self.num_rows < 1:
@@ -96,7 +100,7 @@ def export(
         calibrate: data whose train rows set the ranges of int8 (default: ``pack``).
 
     Returns:
-        The report: cosines, accuracies, size in MB, latency in ms.
+        The report: cosines, accuracies, errors of values in their units, size in MB, latency in ms.
 
     Raises:
         Busy: another process writes ``out``.
@@ -183,6 +187,7 @@ def _write_manifest(
     model: Model, graph: ExportModule, folder: Path, config: ExportConfig, report: dict[str, Any]
 ) -> None:
     """export.json; every other file that it does not name is deleted."""
+    values = {"value_loss": config.value_loss} if graph.values else {}
     meta = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -192,9 +197,10 @@ def _write_manifest(
         "inputs": {m: list(shape) for m, shape in graph.inputs.items()},
         "outputs": list(graph.outputs),
         "classes": graph.classes,
+        **({"values": graph.values} if graph.values else {}),
         "preprocessing": preprocessing(model),
         "weights": model.weights_digest(),
-        "tolerance": {"min_cosine": config.min_cosine, "accuracy_loss": config.accuracy_loss},
+        "tolerance": {"min_cosine": config.min_cosine, "accuracy_loss": config.accuracy_loss} | values,
         "report": report,
         "provenance": provenance(),
         "files": {name: digest_file(folder / name) for name in (CHECK, *FILES[config.kind])},
@@ -235,114 +241,3 @@ def _measure(
     with work("measuring latency"):
         report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
     return report, wanted
-
-
-def reference(
-    model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray, advance: Callable[[int], object] = lambda num: None
-) -> dict[str, np.ndarray]:
-    """The outputs of ``graph`` for pack rows, computed by the code of ``Model`` itself."""
-    chunks = []
-    for chunk in np.array_split(rows, max(1, len(rows) // 64)):
-        images = {m: torch.from_numpy(pack.images[m][chunk]).permute(0, 3, 1, 2) for m in graph.modalities}
-        features = {m: model.features(m, x) for m, x in images.items()}
-        joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
-        found = {f"embedding_{m}": x for m, x in features.items()}
-        found |= {
-            f"shared_{m}": model.project(m, model.features(m, images[m], for_heads=True)) for m in graph.projectors
-        }
-        found |= {f"probability_{r.question.task}": r(joined) for r in graph.readouts}  # type: ignore[union-attr]
-        chunks.append(found)
-        advance(len(chunk))
-    return {name: torch.cat([c[name] for c in chunks]).numpy() for name in graph.outputs}
-
-
-def parity(
-    graph: ExportModule,
-    call: Call,
-    model: Model,
-    pack: Pack,
-    rows: np.ndarray,
-    wanted: dict[str, np.ndarray],
-    config: ExportConfig,
-    advance: Callable[[int], object] = lambda num: None,
-) -> dict[str, Any]:
-    """Compare the outputs of ``call`` for pack rows with ``wanted``.
-
-    Returns:
-        num_rows; cosine by embedding (min, mean); accuracy by task (original, export, num labelled rows).
-
-    Raises:
-        ValueError: they differ by more than ``config`` allows; the message names the likeliest reason.
-    """
-    chunks = []
-    for chunk in np.array_split(rows, max(1, len(rows) // 16)):  # batches of another size than the traced one
-        chunks.append(call([np.ascontiguousarray(pack.images[m][chunk]) for m in graph.modalities]))
-        advance(len(chunk))
-    found = {name: np.concatenate([c[i] for c in chunks]) for i, name in enumerate(graph.outputs)}
-    report: dict[str, Any] = {"num_rows": len(rows), "cosine": {}, "accuracy": {}}
-    for name in (n for n in graph.outputs if n.startswith(("embedding_", "shared_"))):
-        values = cosines(found[name], wanted[name])
-        report["cosine"][name] = {"min": float(values.min()), "mean": float(values.mean())}
-        if not values.min() >= (config.min_cosine or 0):
-            raise ValueError(
-                f"the export is not the trained model: {name} has cosine {values.min():.4f} on real inputs, at least"
-                f" {config.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows)}"
-            )
-    for task, known in graph.classes.items():
-        labels = labels_of(pack, task, known, rows)
-        if (labels >= 0).any():
-            name = f"probability_{task}"
-            report["accuracy"][task] = _accuracy(task, labels, wanted[name], found[name], config.accuracy_loss)
-    return report
-
-
-def _accuracy(task: str, labels: np.ndarray, wanted: np.ndarray, found: np.ndarray, limit: float) -> dict[str, Any]:
-    """Accuracy in percent before and after, over labelled rows; ValueError if more than ``limit`` points are lost."""
-    before, after = (100 * float((x.argmax(1) == labels)[labels >= 0].mean()) for x in (wanted, found))
-    if before - after > limit:
-        raise ValueError(
-            f"the export loses {before - after:.2f} points of accuracy on {task} ({before:.1f} to {after:.1f} %),"
-            f" at most {limit} is allowed: use another precision, check on more --rows if the {len(labels)} here are"
-            " few, or allow more, --accuracy-loss"
-        )
-    return {"original": before, "export": after, "num": int((labels >= 0).sum())}
-
-
-def labels_of(pack: Pack, task: str, classes: list[str], rows: np.ndarray) -> np.ndarray:
-    """Labels [len(rows)] of pack rows as indices into ``classes``, matched by name; -1 = unlabelled or unknown class."""
-    own = next((t.classes for t in pack.spec.tasks if t.name == task), None)
-    if own is None:
-        return np.full(len(rows), -1)
-    numbers = np.array([*(classes.index(name) if name in classes else -1 for name in own), -1])
-    return numbers[pack.column(f"label_{task}")[rows].astype(int)]
-
-
-def explain(model: Model, modality: str, found: dict[str, np.ndarray], pack: Pack, rows: np.ndarray) -> str:
-    """The preprocessing mistake with which the model reproduces the export's output, if it is a common one."""
-    raw = torch.from_numpy(pack.images[modality][rows[:8]]).permute(0, 3, 1, 2)
-    swapped = raw.unflatten(1, (-1, 3)).flip(2).flatten(1, 2)
-    size = (model.run.augment.eval_size,) * 2
-    unit = torch.nn.functional.interpolate(raw, size, mode="bilinear", antialias=True).float() / 255
-    mean, std = (torch.tensor(v * (raw.shape[1] // 3)).view(-1, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
-    with torch.no_grad():
-        mistakes = {
-            "its input is BGR, the model wants RGB": model.features(modality, swapped),
-            "it does not normalise by the ImageNet mean and std": model.encoders[modality](unit),
-            "it normalises to [-1, 1] instead of by the ImageNet mean and std": model.encoders[modality](2 * unit - 1),
-            "it does not divide by 255": model.encoders[modality]((255 * unit - mean) / std),
-        }
-    for reason, features in mistakes.items():
-        if cosines(features.numpy(), found[f"embedding_{modality}"][:8]).min() > 0.999:
-            return f": {reason}"
-    return ""
-
-
-def latency(call: Call, one: list[np.ndarray], *, num: int = 100, warm: int = 10) -> dict[str, float]:
-    """p50 and p99 in ms of ``num`` calls with a batch of one pair, after ``warm`` calls that are not measured."""
-    times = []
-    for _ in range(warm + num):
-        start = time.perf_counter()
-        call(one)
-        times.append(1000 * (time.perf_counter() - start))
-    p50, p99 = np.percentile(times[warm:], [50, 99])
-    return {"p50": round(float(p50), 3), "p99": round(float(p99), 3)}

@@ -1,18 +1,21 @@
-"""From pixels to probabilities in one module: uint8 in, resizing and normalisation inside.
+"""From pixels to probabilities and values in one module: uint8 in, resizing and normalisation inside.
 
 Shapes: B images, S stored side, C channels (3, or 6 for two sensors), D features, E shared space, K classes.
 Inputs: one uint8 [B, S, S, C] RGB per modality, as a pack stores them. Outputs, by ``ExportModule.outputs``:
 embedding_<modality> [B, D], shared_<modality> [B, E] (L2-normalised; absent without a shared space),
-probability_<task> [B, K].
+probability_<task> [B, K], value_<task> [B, T] in the units of its T targets.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mvitac.model import Model
+from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 
@@ -35,12 +38,14 @@ class ExportModule(nn.Module):
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.modalities})
         self.projectors = nn.ModuleDict({m: p for m, p in model.projectors.items() if m in self.modalities})
         self.readouts = nn.ModuleList([r for r in model.readouts.values() if r.question.modality == asked])
-        self.classes: dict[str, list[str]] = {r.question.task: list(r.question.classes) for r in self.readouts}  # type: ignore[union-attr]
+        questions = [r.question for r in self.readouts]
+        self.classes = {q.task: list(q.classes) for q in questions if isinstance(q, ProbeInfo)}
+        self.values = {q.task: _targets(q) for q in questions if isinstance(q, ValueInfo)}
         self.inputs = {m: (model.stored, model.stored, model.spec.channels(m)) for m in self.modalities}
         self.outputs = tuple(
             [f"embedding_{m}" for m in self.modalities]
             + [f"shared_{m}" for m in self.projectors]
-            + [f"probability_{task}" for task in self.classes]
+            + [output_of(r) for r in self.readouts]  # type: ignore[arg-type]
         )
         sides = model.run.augment
         # Heads need views of the size they were trained on.
@@ -70,6 +75,18 @@ class ExportModule(nn.Module):
         shared = [F.normalize(head(wanted[m]), dim=1) for m, head in self.projectors.items()]
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         return (*features.values(), *shared, *(readout(joined) for readout in self.readouts))
+
+
+def output_of(readout: LinearProbe) -> str:
+    """The name of the output of a probe."""
+    kind = "probability" if isinstance(readout.question, ProbeInfo) else "value"
+    return f"{kind}_{readout.question.task}"
+
+
+def _targets(question: ValueInfo) -> list[dict[str, Any]]:
+    """Name, unit, and errors by range of the predicted value (``Error``) of each target, JSON-ready."""
+    named = zip(question.targets, question.errors, strict=True)
+    return [{"name": t.name, "unit": t.unit, "edges": list(e.edges), "spread": list(e.spread)} for t, e in named]
 
 
 def _filter(size: int, stored: int) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -12,29 +11,36 @@ import numpy as np
 import safetensors.torch
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Task
+from mvitac.data.spec import AnyTask, Task, ValueTask
+from mvitac.data.windows import windowed
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
+from mvitac.deploy.card import card
 from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
-from mvitac.evaluation.probe import score_rows, split_rows
-from mvitac.evaluation.scores import cell_text, columns_of, covered, sources_of, summarise, tested_on
+from mvitac.evaluation.probe import ProbeSplit, fit_values, score_predictions, score_rows, split_rows
+from mvitac.evaluation.scores import summarise
+from mvitac.evaluation.value_scores import error_by_range
 from mvitac.model import Model, load
 from mvitac.nn.encoders import SCRATCH, build_trunk
-from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, constant, from_logistic
+from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo, constant, from_logistic, from_ridge
 from mvitac.registry import to_json
 from mvitac.run import load_run
 from mvitac.system.files import brief, digest_file, write_atomic, write_json
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 
+NUM_RANGES, RANGE_ROWS = 8, 20
+"""Most ranges of a predicted value that have an error of their own, and fewest test rows in one."""
+
 
 def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
     """The linear probe of every task and modality of ``pack`` by name, fitted and scored exactly as by ``mvitac probe``.
 
-    A task without labelled rows in train and test has none: a probe that cannot be scored is not published.
+    That of a task with values is ridge regression. A task without labelled rows in train and test has none: a probe that
+    cannot be scored is not published.
     """
     return {readout.question.name: readout for readout, _ in _fit_all(model, pack)}
 
@@ -44,15 +50,15 @@ def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]
     found = []
     modalities = [m for m in pack.spec.modalities if m in model.encoders]
     sources = [*modalities, *(["both"] if len(modalities) == 2 else [])]
-    with work("fitting probes", len(pack.spec.tasks) * len(sources), "probes") as advance:
-        for task, source in product(pack.spec.tasks, sources):
+    with work("fitting probes", len(pack.spec.all_tasks) * len(sources), "probes") as advance:
+        for task, source in product(pack.spec.all_tasks, sources):
             fitted = _fit_readout(model, pack, task, source, modalities if source == "both" else [source])
             found += [fitted] if fitted else []
             advance()
     return found
 
 
-def _scorable(pack: Pack, task: Task) -> bool:
+def _scorable(pack: Pack, task: AnyTask) -> bool:
     """Whether the task has labelled rows in train and test."""
     try:
         split_rows(pack, task)
@@ -62,17 +68,49 @@ def _scorable(pack: Pack, task: Task) -> bool:
 
 
 def _fit_readout(
-    model: Model, pack: Pack, task: Task, source: str, modalities: list[str]
+    model: Model, pack: Pack, task: AnyTask, source: str, modalities: list[str]
 ) -> tuple[LinearProbe, dict[str, Any]] | None:
     """One task's linear probe on features of ``modalities``, and its record; None without rows in train and test."""
     try:
         rows = split_rows(pack, task, source)
     except ValueError:
         return None
+    x = np.concatenate([features(model, pack, m, rows.all) for m in modalities], axis=1)
+    return (_fit_values if isinstance(task, ValueTask) else _fit_classes)(x, pack, task, source, rows)  # type: ignore[arg-type]
+
+
+def _fit_values(
+    x: np.ndarray, pack: Pack, task: ValueTask, source: str, rows: ProbeSplit
+) -> tuple[LinearProbe, dict[str, Any]]:
+    """The ridge probe of one task on features ``x`` of ``rows.all``, and its record."""
+    num = len(rows.fitted)
+    fitted, _ = fit_values(x[:num], pack, task, rows, "linear")
+    true, guess = pack.values(task)[rows.test], fitted(x[num:])
+    record = score_predictions(pack, task, rows.test, guess)
+    known = {"task": task.name, "modality": source}
+    scored = zip(record["targets"], true.T, guess.T, strict=True)
+    errors = tuple(_error(target, t[~np.isnan(t)], g[~np.isnan(t)]) for target, t, g in scored)
+    question = ValueInfo(**known, targets=task.targets, errors=errors, num_test=len(rows.test))
+    return from_ridge(question, *fitted.weights()), {**known, "probe": "linear", **record}
+
+
+def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error:
+    """The errors of one target, with their spread by range of the predicted value."""
+    ranges = error_by_range(guess, guess - true, max(1, min(NUM_RANGES, len(true) // RANGE_ROWS)))
+    return Error(
+        **{key: float(target[key]) for key in ("r2", "mae", "rmse")},
+        edges=tuple(each["low"] for each in ranges[1:]),
+        spread=tuple(each["rmse"] for each in ranges),
+    )
+
+
+def _fit_classes(
+    x: np.ndarray, pack: Pack, task: Task, source: str, rows: ProbeSplit
+) -> tuple[LinearProbe, dict[str, Any]]:
+    """The logistic probe of one task on features ``x`` of ``rows.all``, and its record."""
     labels = pack.column(f"label_{task.name}").astype(int)
     seen = labels[rows.fitted]
     common = int(np.bincount(seen).argmax())
-    x = np.concatenate([features(model, pack, m, rows.all) for m in modalities], axis=1)
     learn, choose, test = np.split(x, np.cumsum([len(rows.train), len(rows.val)]))
     known = {"task": task.name, "modality": source, "probe": "linear"}
     given: dict[str, Any] = {"task": task.name, "modality": source, "classes": task.classes}
@@ -92,7 +130,7 @@ def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, 
     """The probes' ``records`` with those of the controls, as printed by ``mvitac probe``, JSON-ready."""
     own = {"source": model.run.method.name, "seed": model.run.seed}
     stored = stored_result([run], pack)
-    tasks = {record["task"] for record in records}  # a task with values has no probe that is published
+    tasks = {record["task"] for record in records}
     if stored:
         controls = [r for r in stored["records"] if "run" not in r and r["task"] in tasks]
     else:
@@ -112,8 +150,8 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
         build_trunk(run.encoder, 3)
     except ValueError:
         run = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
-    sources: dict[tuple[str, ...], list[Task]] = {}
-    for task in pack.spec.tasks:
+    sources: dict[tuple[str, ...], list[AnyTask]] = {}
+    for task in pack.spec.all_tasks:
         sources.setdefault(tuple(r["modality"] for r in records if r["task"] == task.name), []).append(task)
     for modalities, tasks in sources.items():
         if modalities:
@@ -129,16 +167,21 @@ def own_data(model: Model, instead: str) -> Pack:
         raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None
 
 
+def as_trained(model: Model, pack: Pack) -> Pack:
+    """``pack`` with the windows that ``model`` was trained on, if it shows single frames."""
+    return pack if pack.spec.window.active else windowed(pack, model.spec.window)
+
+
 def with_readouts(model: Model, pack: Pack | None = None) -> Model:
     """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack`` (default: the run's data)."""
     if not model.readouts:
-        model.readouts = fit_readouts(model, pack or model.open_data())
+        model.readouts = fit_readouts(model, as_trained(model, pack) if pack else model.open_data())
     return model
 
 
 def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tuple[list[Source] | None, dict[str, Any]]:
     """Fit the probes of ``model``; returns what it learned from, if that is known, and the scores of ``_scores``."""
-    tasks = {task.name: task for task in pack.spec.tasks if _scorable(pack, task)}
+    tasks = {task.name: task for task in pack.spec.all_tasks if _scorable(pack, task)}
     learned, scored = check_unseen([run], [model], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
     fitted = _fit_all(model, pack)
     for readout, record in fitted:
@@ -169,7 +212,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
     with new_folder(out) as partial:
         model = load(run)
         _, record = load_run(run)
-        pack = pack or own_data(model, "fit the probes on another pack, --on PACK")
+        pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on another pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         _write_weights(model, partial)
         write_json(partial / "run.json", record)
@@ -195,102 +238,16 @@ def _describe(model: Model, pack: Pack) -> dict[str, Any]:
     """artifact.json without its files and digest."""
     sensors = sorted(set(pack.column("sensor").astype(str))) if "sensor" in pack.table.column_names else []
     keys = ("name", "licence", "source")
+    questions = [r.question for r in model.readouts.values()]
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "preprocessing": preprocessing(model, tuple(sensors)),
-        "probes": [to_json(r.question) for r in model.readouts.values()],
+        "probes": [to_json(q) for q in questions if isinstance(q, ProbeInfo)],
+        **({"values": values} if (values := [to_json(q) for q in questions if isinstance(q, ValueInfo)]) else {}),
         "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},
         "trained_on": {key: getattr(model.spec, key) for key in keys},
     }
-
-
-def card(model: Model, manifest: dict[str, Any]) -> str:
-    """The model card: Markdown with the Hub's front matter."""
-    data, learned = manifest["data"], manifest["trained_on"]
-    sets = {"Encoders and probes": learned}
-    if learned != {key: data[key] for key in learned}:
-        sets = {"Encoders": learned, "Probes": data}
-    licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
-    header = [
-        "---",
-        "library_name: mvitac",
-        "tags: [tactile, robotics, self-supervised, visual-tactile]",
-        "license: other",
-        f"license_name: {json.dumps('weights: as their owner says; trained on data under: ' + licences)}",
-        "---",
-        "",
-    ]
-    end = [
-        "## Data",
-        "",
-        *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
-        "The configuration, library versions and commit are in run.json.",
-        "",
-    ]
-    about = _about(model, learned["name"], data["name"], manifest["scores"])
-    return "\n".join([*header, *about, *_usage(manifest["preprocessing"]), *end])
-
-
-def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> list[str]:
-    """The part of the model card on the model: what it is, an example, scores, classes."""
-    run = model.run
-    return [
-        f"# {run.method.name} on {learned}",
-        "",
-        f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}),"
-        f" {'trained with labels' if model.tasks else 'pre-trained without labels'} by"
-        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes on {data}.",
-        "",
-        "```python",
-        "import mvitac",
-        'model = mvitac.load("this folder, or owner/name on the Hub")   # never unpickles, checks every digest',
-        f"probabilities = model.predict({', '.join(f'{m}={m}_image' for m in model.encoders)})   # uint8 RGB, any size",
-        "```",
-        "",
-        "## Scores",
-        "",
-        *_score_tables(model, scores),
-        "## Classes",
-        "",
-        *(f"- {task}: {', '.join(c)}" for task, c in model.classes.items()),
-        "",
-    ]
-
-
-def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
-    """A Markdown table per task: accuracy with its interval, next to the controls."""
-    if not scores["summary"]:
-        return ["No task has labelled rows in train and test.", ""]
-    by = scores["group_by"]
-    leaks = dict.fromkeys(r.question.leak for r in model.readouts.values() if r.question.leak)
-    unseen = f"{by}s that neither encoders nor probes saw"
-    if leaks:
-        unseen = f"test rows. LEAK, what the encoders saw of them: {'; '.join(leaks)}"
-    lines = [
-        f"Accuracy in percent of linear probes, on {unseen}. The rows below the first are controls. 95 % intervals:"
-        f" {covered(by, [{'source': 'run', 'seed': 0}])}.",
-        "",
-    ]
-    for name, task in scores["summary"].items():
-        columns = columns_of(task)
-        lines += [f"| {name} ({tested_on(task, by)}) | {' | '.join(columns)} |", "|---" + "|---:" * len(columns) + "|"]
-        lines += [f"| {s} | {' | '.join(cell_text(task, s, m) for m in columns)} |" for s in sources_of(task)]
-        lines.append("")
-    return [*lines, *(line for note in scores["notes"] for line in (f"Note: {note}.", ""))]
-
-
-def _usage(given: dict[str, Any]) -> list[str]:
-    """The part of the model card on preprocessing."""
-    return [
-        "## Preprocessing",
-        "",
-        f"{given['input']}. {given['resize']}: stored {given['stored']} px, size {given['size']} px."
-        f" Then (x / 255 - {given['mean']}) / {given['std']}. Background: {given['background']}.",
-        f"Sensors seen: {', '.join(given['sensors']) or 'not recorded'}."
-        " For another sensor, lamp or gel, check the accuracy before you rely on these predictions.",
-        "",
-    ]
 
 
 def push(artifact: Path, repo: str, *, private: bool = False) -> str:

@@ -7,6 +7,7 @@ it. A fitted regressor is a function from features to values [N, T].
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ ALPHAS = tuple(10.0**k for k in range(-1, 6))
 NEIGHBOURS = 20
 
 
-def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Regressor, list[float]]:
+def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Joined, list[float]]:
     """Fit ridge regression on standardised features and targets.
 
     Each target's alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
@@ -33,12 +34,12 @@ def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Regressor, li
         The regressor and the chosen alpha of each target.
     """
     fitted = _fit_each(x, y, num_val, lambda: [])
-    return _joined(fitted), [float(pipeline[-1].alpha_) for pipeline, _, _ in fitted]
+    return Joined(fitted), [float(pipeline[-1].alpha_) for pipeline, _, _ in fitted]
 
 
 def fit_curve(x: np.ndarray, y: np.ndarray, num_val: int) -> Regressor:
     """Fit a smooth curve: ridge on cubic splines of each column of ``x``, for controls of a few columns."""
-    return _joined(_fit_each(x, y, num_val, lambda: [SplineTransformer(n_knots=6, extrapolation="linear")]))
+    return Joined(_fit_each(x, y, num_val, lambda: [SplineTransformer(n_knots=6, extrapolation="linear")]))
 
 
 def fit_neighbours(x: np.ndarray, y: np.ndarray) -> Regressor:
@@ -48,7 +49,7 @@ def fit_neighbours(x: np.ndarray, y: np.ndarray) -> Regressor:
         have = ~np.isnan(target)
         model = KNeighborsRegressor(n_neighbors=min(NEIGHBOURS, int(have.sum())), metric="cosine")
         fitted.append((model.fit(x[have], target[have]), 0.0, 1.0))
-    return _joined(fitted)
+    return Joined(fitted)
 
 
 Fitted = tuple[Any, float, float]
@@ -69,5 +70,19 @@ def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, basis: Callable[[], li
     return fitted
 
 
-def _joined(fitted: list[Fitted]) -> Regressor:
-    return lambda z: np.stack([model.predict(z) * std + mean for model, mean, std in fitted], axis=1)
+@dataclass(frozen=True)
+class Joined:
+    """The regressors of all targets as one: features [N, D] to values [N, T]."""
+
+    fitted: list[Fitted]
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return np.stack([model.predict(z) * std + mean for model, mean, std in self.fitted], axis=1)
+
+    def weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weight [T, D] and bias [T] of ridge regression, with all scaling folded in: values = x W^T + b."""
+        weights, biases = [], []
+        for (scaler, ridge), mean, std in self.fitted:
+            weights.append(ridge.coef_ / scaler.scale_ * std)
+            biases.append(ridge.intercept_ * std + mean - weights[-1] @ scaler.mean_)
+        return np.stack(weights), np.array(biases)

@@ -105,15 +105,16 @@ def r_squared(sums: dict[str, Any]) -> Any:
     return 1 - sums["squared_error"] / np.maximum(spread, 1e-12)
 
 
-def error_by_range(true: np.ndarray, error: np.ndarray) -> list[dict[str, float]]:
-    """Mean absolute error, bias and count in up to 8 ranges of the true value, each with as many rows."""
-    edges = np.unique(np.quantile(true, np.linspace(0, 1, NUM_RANGES + 1)))
+def error_by_range(true: np.ndarray, error: np.ndarray, num: int = NUM_RANGES) -> list[dict[str, float]]:
+    """MAE, RMSE, bias and count in up to ``num`` ranges of the true value, each with as many rows."""
+    edges = np.unique(np.quantile(true, np.linspace(0, 1, num + 1)))
     place = np.clip(np.searchsorted(edges, true, side="right") - 1, 0, max(0, len(edges) - 2))
     return [
         {
             "low": float(edges[k]),
             "high": float(edges[min(k + 1, len(edges) - 1)]),
             "mae": float(abs(error[place == k]).mean()),
+            "rmse": float((error[place == k] ** 2).mean() ** 0.5),
             "bias": float(error[place == k].mean()),
             "n": int((place == k).sum()),
         }

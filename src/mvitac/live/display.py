@@ -28,7 +28,9 @@ def draw(loop: Live) -> np.ndarray:
     width = SIDE * max(2, len(loop.all))
     touch = loop.touch or loop.last
     answers = loop.answers(touch)
-    picture = Image.new("RGB", (width, SIDE + LINE * (2 + len(loop.engine.classes))), BACK)
+    picture = Image.new(
+        "RGB", (width, SIDE + LINE * (2 + len(loop.engine.classes) + sum(map(len, loop.engine.values.values())))), BACK
+    )
     pen, face = ImageDraw.Draw(picture), font(13)
     for i, stream in enumerate(loop.all):
         left, state = i * SIDE, loop.state(stream)
@@ -46,6 +48,9 @@ def draw(loop: Live) -> np.ndarray:
         answer = f"{task_title(task, loop.engine.classes[task])}: {name}{'' if sure else ' (unsure)'}"
         pen.text((EDGE, top + 3), answer, TEXT if sure else FAINT, face)
         pen.text((width - 50, top + 3), f"{100 * confidence:.0f} %", TEXT if sure else FAINT, face)
+    values = [reading for found in loop.readings(touch).values() for reading in found]
+    for row, reading in enumerate(values, len(answers)):
+        pen.text((EDGE, SIDE + LINE * (1 + row) + 3), f"{reading.name}: {reading}", TEXT, face)
     if touch and touch.known:
         pen.text((EDGE, picture.height - LINE + 3), "like: " + "; ".join(touch.known), TEXT, face)
     return np.asarray(picture)

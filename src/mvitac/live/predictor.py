@@ -2,12 +2,14 @@
 
 The background of each touch sensor (no contact) is learned from its first frames and updated slowly while nothing is
 touched; it decides *whether* there is contact. The model gets frames as they are, or minus that background if it was
-trained on difference images. Probabilities are averaged over one touch. Time comes from a clock passed as an argument.
+trained on difference images. Probabilities are averaged over one touch; values, such as a force, are those of the newest
+frame. Time comes from a clock passed as an argument.
 Shapes: frames uint8 RGB [H, W, 3].
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -17,12 +19,38 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import difference, fit
-from mvitac.deploy.engine import Engine
+from mvitac.deploy.engine import Engine, frame_shapes, frames_of, spread_at
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.streams import Event, Frame, Stream
 
 NUM_AGES = 10_000
 """Number of latest predictions, some minutes of them, over which the percentiles of the age are computed."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One predicted number of a touch, in its unit."""
+
+    name: str
+    unit: str
+    value: float
+    spread: float
+    """Root mean squared error of test rows whose prediction was in the range of ``value``."""
+    low: float
+    high: float
+    """Lowest and highest value of the touch so far."""
+
+    def __str__(self) -> str:
+        return f"{self._digits(self.value)} {self.unit} +- {self._digits(self.spread)}"
+
+    def over_touch(self) -> str:
+        """The range of the touch, such as '0.3 to 3.2 N +- 0.4'."""
+        return f"{self._digits(self.low)} to {self._digits(self.high)} {self.unit} +- {self._digits(self.spread)}"
+
+    def _digits(self, value: float) -> str:
+        """``value`` with the decimals of the first digit of the spread."""
+        decimals = -math.floor(math.log10(self.spread)) if self.spread > 0 else 3
+        return f"{value:.{min(6, max(0, decimals))}f}"
 
 
 @dataclass
@@ -34,13 +62,18 @@ class Touch:
     end: float | None = None
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
+    values: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    """task -> newest, lowest and highest values [T]."""
     known: list[str] = field(default_factory=list)
     """The most similar known touches, if there is an index."""
 
-    def add(self, probabilities: dict[str, np.ndarray]) -> None:
+    def add(self, probabilities: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
         for task, p in probabilities.items():
             self.totals[task] = self.totals.get(task, 0) + p
+        for task, v in values.items():
+            _, low, high = self.values.get(task, [v, v, v])
+            self.values[task] = [v, np.minimum(low, v), np.maximum(high, v)]
 
     def answer(self, task: str, classes: Sequence[str]) -> tuple[str, float]:
         """The likeliest class so far, and its mean probability."""
@@ -81,7 +114,11 @@ class Live:
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]
         """The stream whose new frames start predictions."""
-        side = engine.inputs["touch"][0] if engine.difference and "touch" in streams else 0
+        _check_window(engine)
+        self.minus_rest = engine.difference or _minus_first(engine)
+        """Whether the learned background is subtracted from touch."""
+        side = engine.inputs["touch"][0] if self.minus_rest and "touch" in streams else 0
+        self._since: dict[str, float] = {}
         self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
         self.counts: Counter[str] = Counter()
         self._ages = np.zeros(NUM_AGES)
@@ -96,9 +133,11 @@ class Live:
         self._changed: set[str] = set()
         for stream in self.all:
             stream.tell = self._heard
+        self._remember()
 
     def tick(self) -> bool:
         """Use the newest frames if the leading stream has a new one; True if that made a prediction."""
+        self._remember()
         for stream in self.all:
             stream.check()
         leading = self.leading.newest(take=False)
@@ -120,7 +159,7 @@ class Live:
             for m, found in frames.items()
         }
         if self.contact:
-            self._predict(images, now, captured=min(f.time for f in frames[self._leading_modality] if f))
+            self._predict(frames, images, now)
         else:
             self._release(now)
         if self.record:
@@ -135,13 +174,20 @@ class Live:
             for stream, frame in zip(several, found, strict=True)
         )
 
-    def _predict(self, images: dict[str, np.ndarray], now: float, captured: float) -> None:
-        """Add a prediction to the current touch, or start one; ``captured``: time of the leading frame."""
+    def _predict(self, frames: dict[str, list[Frame | None]], images: dict[str, np.ndarray], now: float) -> None:
+        """Add a prediction for the newest ``frames``, resized to ``images``, to the current touch, or start one."""
+        captured = min(f.time for f in frames[self._leading_modality] if f)
         if self.touch is None:
             self.num_touches += 1
             self.touch = Touch(self.num_touches, now)
-        outputs = self.engine(**{m: x[None] for m, x in self._as_trained(images).items()})
-        self.touch.add({t: outputs[f"probability_{t}"][0] for t in self.engine.classes})
+            pairs = (pair for m in frames for pair in zip(self.streams[m], frames[m], strict=True))
+            self._since = {stream.name: frame.time for stream, frame in pairs if frame}
+        given = {m: self._as_trained(m, self._window(m, frames[m], image)) for m, image in images.items()}
+        outputs = self.engine(**{m: np.concatenate(several, axis=2)[None] for m, several in given.items()})
+        self.touch.add(
+            {task: outputs[f"probability_{task}"][0] for task in self.engine.classes},
+            {task: outputs[f"value_{task}"][0] for task in self.engine.values},
+        )
         if self.nearest:
             self.touch.known = self.nearest(outputs)
         self.age = self.clock() - captured
@@ -178,12 +224,35 @@ class Live:
         states = self.contacts.values()
         return None if any(c.background is None for c in states) else any(c.touched for c in states)
 
-    def _as_trained(self, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """``images`` as the model was trained on them; recorded images stay as they came."""
-        if not (self.engine.difference and self.contacts):
-            return images
+    def _window(self, modality: str, frames: list[Frame | None], newest: np.ndarray) -> list[np.ndarray]:
+        """The frames [S, S, C] that the model looks at, newest first: ``newest``, and older ones by their time."""
+        if frames_of(self.engine.window, modality) == 1:
+            return [newest]
+        sensors = []
+        for stream, frame in zip(self.streams[modality], frames, strict=True):
+            if frame:
+                sensors.append(stream.window(frame, self._back(stream), self._since.get(stream.name, frame.time)))
+        return [newest, *(np.concatenate(each, axis=2) for each in list(zip(*sensors, strict=True))[1:])]
+
+    def _back(self, stream: Stream) -> list[float]:
+        """Seconds from each frame of a window to the newest."""
+        window = self.engine.window or {}
+        unit = 1.0 if window["order"] == "time" else self.config.frame_seconds or stream.interval() or 0.0
+        return [k * window["stride"] * unit for k in range(window["frames"])]
+
+    def _remember(self) -> None:
+        """Let the streams keep as much as a window needs."""
+        for modality in (m for m in self.streams if frames_of(self.engine.window, m) > 1):
+            for stream in self.streams[modality]:
+                seconds = self._back(stream)[-1] if stream.interval() else math.inf
+                stream.remember(seconds, self.engine.inputs[modality][0])
+
+    def _as_trained(self, modality: str, frames: list[np.ndarray]) -> list[np.ndarray]:
+        """Frames [S, S, C] as the model was trained on them; recorded images stay as they came."""
+        if modality != "touch" or not (self.minus_rest and self.contacts):
+            return frames
         free = np.concatenate([c.picture for c in self.contacts.values() if c.picture is not None], axis=2)
-        return {**images, "touch": difference(images["touch"], np.rint(free).astype(np.uint8))}
+        return [difference(frame, np.rint(free).astype(np.uint8)) for frame in frames]
 
     def _lose(self, now: float) -> None:
         """End the touch when frames are missing: contact is then unknown."""
@@ -214,6 +283,24 @@ class Live:
             return {}
         return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
 
+    def readings(self, touch: Touch | None) -> dict[str, list[Reading]]:
+        """The values of a touch by task: of its newest frame, with the range over the touch."""
+        if touch is None or not touch.num_frames:
+            return {}
+        return {task: _readings(targets, *touch.values[task]) for task, targets in self.engine.values.items()}
+
+    def prediction(self) -> dict[str, Any]:
+        """The newest prediction of the current touch, JSON-ready; without contact, that alone."""
+        said: dict[str, Any] = {"touch": self.num_touches, "contact": self.touch is not None}
+        if self.touch is None:
+            return said
+        said["age_ms"] = 1000 * self.age
+        for task, (name, confidence) in self.answers(self.touch).items():
+            said[task] = {"class": name, "confidence": confidence}
+        for task, found in self.readings(self.touch).items():
+            said[task] = {r.name: {"value": r.value, "unit": r.unit, "spread": r.spread} for r in found}
+        return said
+
     def summary(self) -> dict[str, Any]:
         """Counts, ages in ms from capture to prediction, and events, JSON-ready."""
         ages = 1000 * self._ages[: self.num_predictions]
@@ -230,9 +317,33 @@ class Live:
         }
 
 
+def _readings(targets: Sequence[dict[str, Any]], *found: np.ndarray) -> list[Reading]:
+    """One reading per target, of its newest, lowest and highest value ``found``."""
+    readings = []
+    for target, new, low, high in zip(targets, *(values.tolist() for values in found), strict=True):
+        spread = spread_at(target, new)
+        readings.append(Reading(target["name"], target["unit"], new, spread, low, high))
+    return readings
+
+
+def _minus_first(engine: Engine) -> bool:
+    """Whether windows of touch are minus the first frame of their touch, for which the learned background stands."""
+    return bool(engine.window and engine.window["minus_first"] and "touch" in engine.window["of"])
+
+
+def _check_window(engine: Engine) -> None:
+    """ValueError if the model looks at differences that live input does not have."""
+    window = engine.window
+    if window and window["minus_first"] and (engine.difference or "vision" in window["of"]):
+        raise ValueError(
+            "live: this model looks at frames minus the first one of vision, or of touch minus a background already: live"
+            " knows the background of touch alone; train it with --data.frames-of touch and without --subtract-background"
+        )
+
+
 def _check_inputs(engine: Engine, streams: dict[str, Sequence[Stream]]) -> None:
     """ValueError if the number of streams is not that of the engine's inputs."""
-    for modality, (_, _, channels) in engine.inputs.items():
+    for modality, (_, _, channels) in frame_shapes(engine).items():
         given, wanted = len(streams.get(modality, ())), channels // 3
         if given != wanted:
             raise ValueError(

@@ -9,11 +9,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from mvitac.data.images import fit
 from mvitac.live.cameras import Ended, Source
 from mvitac.system.files import brief
 
@@ -67,6 +68,8 @@ class Stream:
         self.ended = False
         self.num_frames = self.num_dropped = self.num_damaged = 0
         self.events: Counter[str] = Counter()
+        self._side, self._keep = 0, 0.0
+        self._past: deque[tuple[float, np.ndarray]] = deque()
         self._lock = threading.Lock()
         self._newest: Frame | None = None
         self._taken = True
@@ -105,6 +108,32 @@ class Stream:
         with self._lock:
             self._taken = self._taken or take
             return self._newest
+
+    def remember(self, seconds: float, side: int) -> None:
+        """Keep frames of the last ``seconds`` (and one before them), resized to ``side`` pixels, for ``window``."""
+        self._keep, self._side = seconds, side
+
+    def window(self, newest: Frame, back: Sequence[float], since: float) -> list[np.ndarray]:
+        """Kept frames as uint8 [side, side, 3], one for each of ``back``, seconds before ``newest``.
+
+        As in the training data (``data/windows.py``), it is the newest frame that is old enough, found by time, so that
+        dropped frames shift nothing; a quarter of the interval between frames is allowed for jitter. Where that would be
+        before ``since``, the first frame from there on repeats.
+        """
+        slack = (self.interval() or 0.0) / 4
+        with self._lock:
+            past = [(time, image) for time, image in self._past if since <= time <= newest.time]
+        past = past or [(newest.time, fit(newest.image, self._side))]
+        found = []
+        for seconds in back:
+            old = [image for time, image in past if time <= newest.time - seconds + (slack if seconds else 0)]
+            found.append(old[-1] if old else past[0][1])
+        return found
+
+    def interval(self) -> float | None:
+        """Seconds between two frames: the median of the last thirty; None before the second frame."""
+        gaps = np.diff(list(self._arrivals))
+        return float(np.median(gaps)) if len(gaps) else None
 
     def check(self) -> None:
         """Report a device that has stopped giving frames; ``pump`` cannot, as it waits for the device."""
@@ -150,6 +179,12 @@ class Stream:
         with self._lock:
             self.num_dropped += not self._taken
             self._newest, self._taken = Frame(image, now, self.num_frames), False
+            if self._side:
+                if before is not None and before.image.shape != image.shape:
+                    self._past.clear()  # another lens or crop
+                self._past.append((now, fit(image, self._side)))
+                while len(self._past) > 1 and self._past[1][0] <= now - self._keep:
+                    self._past.popleft()
 
     def _lost(self, error: Exception) -> None:
         self.origin.close()

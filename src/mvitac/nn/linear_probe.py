@@ -1,10 +1,11 @@
-"""A trained linear probe that is published with a model: features in, class probabilities out.
+"""A trained linear probe that is published with a model: features in, class probabilities or values out.
 
-Shapes: B images, D features (a probe on both modalities reads vision, then touch, concatenated), K classes.
+Shapes: B images, D features (a probe on both modalities reads vision, then touch, concatenated), K classes, T targets.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mvitac.data.spec import Target
 from mvitac.registry import LATER
 
 UNSEEN = -1e4
@@ -19,20 +21,12 @@ UNSEEN = -1e4
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProbeInfo:
-    """Task, modality and test score of a probe."""
+class _Asked:
+    """Task and modality of a probe."""
 
     task: str
     modality: str
     """touch, vision or both."""
-    classes: tuple[str, ...]
-    accuracy: float
-    """Accuracy on the test split of the dataset it was trained on."""
-    majority: float
-    """Accuracy on the same rows of always predicting the most frequent class."""
-    num_test: int
-    leak: str = field(default="", metadata=LATER)
-    """Which test rows the encoders were trained on, or "unknown" (``evaluation.leaks``)."""
 
     @property
     def name(self) -> str:
@@ -43,25 +37,87 @@ class ProbeInfo:
         return ("vision", "touch") if self.modality == "both" else (self.modality,)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ProbeInfo(_Asked):
+    """Task, modality and test score of a probe of classes."""
+
+    classes: tuple[str, ...]
+    accuracy: float
+    """Accuracy on the test split of the dataset it was trained on."""
+    majority: float
+    """Accuracy on the same rows of always predicting the most frequent class."""
+    num_test: int
+    leak: str = field(default="", metadata=LATER)
+    """Which test rows the encoders were trained on, or "unknown" (``evaluation.leaks``)."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.classes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Error:
+    """Errors of one target on the test split, in its unit."""
+
+    r2: float
+    mae: float
+    rmse: float
+    edges: tuple[float, ...]
+    """Bounds [R - 1], ascending, between the R ranges of the predicted value."""
+    spread: tuple[float, ...]
+    """Root mean squared error [R] of the test rows whose prediction is in each range."""
+
+    def __post_init__(self) -> None:
+        if len(self.spread) != len(self.edges) + 1 or list(self.edges) != sorted(self.edges):
+            raise ValueError(f"{len(self.edges)} edges and {len(self.spread)} spreads: give n ascending and n + 1")
+        if not np.isfinite([self.r2, self.mae, self.rmse, *self.edges, *self.spread]).all():
+            raise ValueError("errors of a probe must be finite numbers")
+
+    def spread_at(self, value: float) -> float:
+        """The usual error (root mean square) of a prediction of ``value``."""
+        return self.spread[bisect_right(self.edges, value)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValueInfo(_Asked):
+    """Task, modality and test errors of a probe of values."""
+
+    targets: tuple[Target, ...]
+    errors: tuple[Error, ...]
+    """One for each target."""
+    num_test: int
+    leak: str = field(default="", metadata=LATER)
+    """As for ``ProbeInfo``."""
+
+    def __post_init__(self) -> None:
+        if not self.targets or len(self.errors) != len(self.targets):
+            raise ValueError(f"probe {self.name}: {len(self.errors)} errors for {len(self.targets)} targets")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(target.name for target in self.targets)
+
+
 class LinearProbe(nn.Module):
-    """softmax(features W^T + b).
+    """softmax(features W^T + b) for classes; features W^T + b, in the units of the targets, for values.
 
     Args:
         question: What the probe predicts.
-        weight: [K, D], fp32.
-        bias: [K], fp32.
+        weight: [K, D] or [T, D], fp32.
+        bias: [K] or [T], fp32.
     """
 
     weight: Tensor
     bias: Tensor
 
-    def __init__(self, question: ProbeInfo, weight: Tensor, bias: Tensor) -> None:
+    def __init__(self, question: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor) -> None:
         super().__init__()
-        num = len(question.classes)
+        num = len(question.outputs)
         if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
             raise ValueError(
                 f"probe {question.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
-                f" do not fit {num} classes: expected [{num}, D] and [{num}]"
+                f" do not fit {num} {'classes' if isinstance(question, ProbeInfo) else 'targets'}: expected [{num}, D] and"
+                f" [{num}]"
             )
         if weight.dtype != torch.float32 or bias.dtype != torch.float32:
             raise ValueError(f"probe {question.name}: weights are {weight.dtype}, expected torch.float32")
@@ -72,8 +128,9 @@ class LinearProbe(nn.Module):
         self.register_buffer("bias", bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Probabilities [B, K] of ``features`` [B, D]."""
-        return torch.softmax(nn.functional.linear(features, self.weight, self.bias), dim=1)
+        """Probabilities [B, K] or values [B, T] of ``features`` [B, D]."""
+        found = nn.functional.linear(features, self.weight, self.bias)
+        return torch.softmax(found, dim=1) if isinstance(self.question, ProbeInfo) else found
 
 
 def from_logistic(question: ProbeInfo, model: Any, mean: np.ndarray, std: np.ndarray) -> LinearProbe:
@@ -93,3 +150,8 @@ def constant(question: ProbeInfo, label: int, dim: int) -> LinearProbe:
     bias = torch.full((len(question.classes),), UNSEEN)
     bias[label] = 0
     return LinearProbe(question, torch.zeros(len(question.classes), dim), bias)
+
+
+def from_ridge(question: ValueInfo, weight: np.ndarray, bias: np.ndarray) -> LinearProbe:
+    """A probe of values with these weights [T, D] and biases [T]."""
+    return LinearProbe(question, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())

@@ -19,6 +19,7 @@ from mvitac.deploy.publish import with_readouts
 from mvitac.deploy.search import check_pack, nearest
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
+from mvitac.nn.linear_probe import ProbeInfo
 from mvitac.registry import unknown
 from mvitac.report.palette import COLOURS, MAP_HUES, ramp
 
@@ -59,7 +60,7 @@ class ExplorerData:
         self.guess: dict[str, np.ndarray] = {}
         for task in tuple(self.classes):
             readout = self.model.readouts.get(f"{task}.{self.modalities[-1]}")
-            if readout:
+            if readout and isinstance(readout.question, ProbeInfo):
                 joined = np.concatenate([raw[m] for m in readout.question.modalities], axis=1)
                 # Match classes by name: the probe may be of other data.
                 known = readout.question.classes
@@ -203,8 +204,9 @@ class ExplorerData:
         pictures: dict[str, Any] = {modality: given}
         said = {}
         if any(r.question.modality == modality for r in self.model.readouts.values()):
-            for task, p in self.model.predict(**pictures).items():
-                said[task] = dict(zip(self.model.classes[task], p[0].tolist(), strict=True))
+            found = self.model.predict(**pictures)
+            for task, names in self.model.classes.items():
+                said[task] = dict(zip(names, found[task][0].tolist(), strict=True))
         x = _unit(self.model.embed(**pictures)[modality].cpu().numpy())
         return said, self.neighbours(x, modality, k)
 

@@ -43,20 +43,27 @@ class Preprocess:
     """Side of normalised images for the trunk. None: uint8 at ``stored`` pixels, for ``Model.forward``."""
     background: np.ndarray | None = None
     """The touch sensor without contact, uint8 [H, W, C], to subtract."""
+    frames: int = 1
+    """Frames of a window; ``channels`` are those of all of them, the newest first."""
 
     def __call__(self, image: ImageInput) -> Tensor:
-        """One image (a path, PIL image, array or tensor) to uint8 [C, stored, stored], or fp32 [C, size, size]."""
+        """One image (a path, PIL image, array or tensor) to uint8 [C, stored, stored], or fp32 [C, size, size].
+
+        With several ``frames``: one clip, as for ``Model.embed``.
+        """
         pixels = torch.from_numpy(self._stored(image, self.background)).permute(2, 0, 1).contiguous()
         return pixels if self.size is None else plain_view(pixels[None], self.size)[0].contiguous()
 
     def batches(self, images: ImageInput, background: ImageInput | None, num: int) -> Iterator[Tensor]:
         """Batches uint8 [<= num, C, stored, stored] of one image or several, read as they are needed.
 
-        ``background`` is one image, or one for each of ``images``.
+        ``background`` is one image, or one for each of ``images``. With several ``frames``, images are clips.
         """
-        given, free = single_images(images, self.modality), [None]
+        given, free = single_images(images, self.modality, clips=self.channels if self.frames > 1 else 0), [None]
         if background is not None:
-            free = [to_array(x, self.channels, "background") for x in single_images(background, "background")]
+            free = [
+                to_array(x, self.channels // self.frames, "background") for x in single_images(background, "background")
+            ]
         if len(free) not in (1, len(given)):
             raise ValueError(f"background: got {len(free)} images for {len(given)} of touch: give one, or one for each")
         for start in range(0, len(given), num):
@@ -66,21 +73,59 @@ class Preprocess:
 
     def _stored(self, image: Any, background: np.ndarray | None) -> np.ndarray:
         """One image of any kind as a new uint8 array [stored, stored, channels], as a pack would store it."""
-        array = to_array(image, self.channels, self.modality)
+        if self.frames > 1:
+            frames = [self._frame(frame, background) for frame in self._clip(image)]
+            return np.concatenate(frames[::-1], axis=2)
+        return self._frame(image, background)
+
+    def _frame(self, image: Any, background: np.ndarray | None) -> np.ndarray:
+        array = to_array(image, self.channels // self.frames, self.modality)
         return np.array(fit(array if background is None else difference(array, background), self.stored))
 
+    def _clip(self, value: Any) -> list[Any]:
+        """The frames of one clip, oldest first; a window as a pack stores it, [H, W, C] of all frames, is taken apart."""
+        each = self.channels // self.frames
+        if isinstance(value, np.ndarray) and value.ndim == 3 and value.shape[2] == self.channels:
+            return [value[:, :, f * each : (f + 1) * each] for f in reversed(range(self.frames))]
+        single = isinstance(value, (str, os.PathLike, Image.Image))
+        single |= isinstance(value, (np.ndarray, Tensor)) and value.ndim < 4
+        frames = [] if single else list(value)
+        if len(frames) != self.frames:
+            got = "a single image" if single else f"{len(frames)} frames"
+            raise ValueError(
+                f"{self.modality}: this model looks at {self.frames} frames at once, got {got}: give clips"
+                f" [{self.frames}, H, W, {each}], oldest first, or lists of {self.frames} images"
+            )
+        return frames
 
-def single_images(value: ImageInput, what: str) -> list[Any]:
-    """The images in any input of ``Model.embed``, as they are. ``what`` names it in errors."""
+
+def single_images(value: ImageInput, what: str, *, clips: int = 0) -> list[Any]:
+    """The images in any input of ``Model.embed``, as they are. ``what`` names it in errors.
+
+    ``clips``: channels of a window, if they are clips; 0 for images.
+    """
     if isinstance(value, (str, os.PathLike, Image.Image)):
         return [value]
-    if isinstance(value, (np.ndarray, Tensor)) and value.ndim not in (1, 4):
+    many = (1, 4)
+    if clips:  # [N, F, H, W, C], or [N, H, W, F C] as a pack stores windows
+        windows = isinstance(value, np.ndarray) and value.ndim == 4 and value.shape[3] == clips
+        many = (1, 4, 5) if windows else (1, 5)
+        if isinstance(value, (list, tuple)) and value and _is_frame(value[0]):
+            return [value]
+    if isinstance(value, (np.ndarray, Tensor)) and value.ndim not in many:
         return [value]
     if isinstance(value, (bytes, dict)) or not isinstance(value, Iterable):
         raise ValueError(f"{what}: expected one image or several, got {type(value).__name__}")
     if not (images := list(value)):
         raise ValueError(f"{what}: no images given")
     return images
+
+
+def _is_frame(value: Any) -> bool:
+    """Whether ``value`` is one frame, and so the list that it is in is one clip."""
+    if isinstance(value, (np.ndarray, Tensor)):
+        return value.ndim < 4
+    return isinstance(value, (str, os.PathLike, Image.Image))
 
 
 def to_array(image: Any, channels: int, what: str) -> np.ndarray:

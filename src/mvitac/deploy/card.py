@@ -1,0 +1,119 @@
+"""The model card of an artifact: what the model is, an example, scores next to controls, preprocessing, data."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from mvitac.evaluation.scores import cell_text, columns_of, covered, score_name, sources_of, tested_on
+from mvitac.model import Model
+from mvitac.nn.linear_probe import ValueInfo
+
+
+def card(model: Model, manifest: dict[str, Any]) -> str:
+    """The model card: Markdown with the Hub's front matter."""
+    data, learned = manifest["data"], manifest["trained_on"]
+    sets = {"Encoders and probes": learned}
+    if learned != {key: data[key] for key in learned}:
+        sets = {"Encoders": learned, "Probes": data}
+    licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
+    header = [
+        "---",
+        "library_name: mvitac",
+        "tags: [tactile, robotics, self-supervised, visual-tactile]",
+        "license: other",
+        f"license_name: {json.dumps('weights: as their owner says; trained on data under: ' + licences)}",
+        "---",
+        "",
+    ]
+    end = [
+        "## Data",
+        "",
+        *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
+        "The configuration, library versions and commit are in run.json.",
+        "",
+    ]
+    about = _about(model, learned["name"], data["name"], manifest["scores"])
+    return "\n".join([*header, *about, *_usage(manifest["preprocessing"]), *end])
+
+
+def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> list[str]:
+    """The part of the model card on the model: what it is, an example, scores, classes."""
+    run = model.run
+    said = "probabilities" if not model.targets else "probabilities_and_values" if model.classes else "values"
+    return [
+        f"# {run.method.name} on {learned}",
+        "",
+        f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}),"
+        f" {'trained with labels' if model.tasks else 'pre-trained without labels'} by"
+        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes on {data}.",
+        "",
+        "```python",
+        "import mvitac",
+        'model = mvitac.load("this folder, or owner/name on the Hub")   # never unpickles, checks every digest',
+        f"{said} = model.predict({', '.join(f'{m}={m}_image' for m in model.encoders)})   # uint8 RGB, any size",
+        "```",
+        "",
+        "## Scores",
+        "",
+        *_score_tables(model, scores),
+        *_listed("Classes", {task: ", ".join(c) for task, c in model.classes.items()}),
+        *_listed(
+            "Values", {task: ", ".join(f"{t.name} in {t.unit}" for t in ts) for task, ts in model.targets.items()}
+        ),
+    ]
+
+
+def _listed(title: str, rows: dict[str, str]) -> list[str]:
+    """A section of the model card with one line per task; nothing without tasks."""
+    return [f"## {title}", "", *(f"- {task}: {text}" for task, text in rows.items()), ""] if rows else []
+
+
+def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
+    """A Markdown table per task: accuracy or R2 with its interval, next to the controls; of values their errors too."""
+    if not scores["summary"]:
+        return ["No task has labelled rows in train and test.", ""]
+    by = scores["group_by"]
+    leaks = dict.fromkeys(r.question.leak for r in model.readouts.values() if r.question.leak)
+    unseen = f"{by}s that neither encoders nor probes saw"
+    if leaks:
+        unseen = f"test rows. LEAK, what the encoders saw of them: {'; '.join(leaks)}"
+    names = dict.fromkeys(score_name(task).capitalize() for task in scores["summary"].values())
+    lines = [
+        f"{' or '.join(names)} in percent of linear probes, on {unseen}. The rows below the first are controls."
+        f" 95 % intervals: {covered(by, [{'source': 'run', 'seed': 0}])}.",
+        "",
+    ]
+    for name, task in scores["summary"].items():
+        columns = columns_of(task)
+        lines += [f"| {name} ({tested_on(task, by)}) | {' | '.join(columns)} |", "|---" + "|---:" * len(columns) + "|"]
+        lines += [f"| {s} | {' | '.join(cell_text(task, s, m) for m in columns)} |" for s in sources_of(task)]
+        lines.append("")
+        lines += _errors([r.question for r in model.readouts.values() if r.question.task == name])
+    return [*lines, *(line for note in scores["notes"] for line in (f"Note: {note}.", ""))]
+
+
+def _errors(questions: list[Any]) -> list[str]:
+    """A Markdown table of the errors of one task's probes, in the unit of each target; nothing for classes."""
+    questions = [q for q in questions if isinstance(q, ValueInfo)]
+    if not questions:
+        return []
+    head = f"| mean absolute error (root mean square) | {' | '.join(q.modality for q in questions)} |"
+    lines = [head, "|---" + "|---:" * len(questions) + "|"]
+    for t, target in enumerate(questions[0].targets):
+        found = [f"{q.errors[t].mae:.3g} ({q.errors[t].rmse:.3g}) {target.unit}" for q in questions]
+        lines.append(f"| {target.name} | {' | '.join(found)} |")
+    return [*lines, ""]
+
+
+def _usage(given: dict[str, Any]) -> list[str]:
+    """The part of the model card on preprocessing."""
+    return [
+        "## Preprocessing",
+        "",
+        f"{given['input']}. {given['resize']}: stored {given['stored']} px, size {given['size']} px."
+        f" Then (x / 255 - {given['mean']}) / {given['std']}. Background: {given['background']}.",
+        f"Sensors seen: {', '.join(given['sensors']) or 'not recorded'}."
+        " For another sensor, lamp or gel, check the accuracy before you rely on these predictions.",
+        "",
+    ]

@@ -1,0 +1,166 @@
+"""Whether an export is the trained model: its outputs on test rows next to those of the code that was scored."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from mvitac.data.pack import Pack
+from mvitac.deploy.engine import Call, cosines
+from mvitac.deploy.export_module import ExportModule, output_of
+from mvitac.model import Model
+from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
+
+if TYPE_CHECKING:
+    from mvitac.deploy.export import ExportConfig
+
+
+def reference(
+    model: Model, graph: ExportModule, pack: Pack, rows: np.ndarray, advance: Callable[[int], object] = lambda num: None
+) -> dict[str, np.ndarray]:
+    """The outputs of ``graph`` for pack rows, computed by the code of ``Model`` itself."""
+    chunks = []
+    for chunk in np.array_split(rows, max(1, len(rows) // 64)):
+        images = {m: torch.from_numpy(pack.images[m][chunk]).permute(0, 3, 1, 2) for m in graph.modalities}
+        features = {m: model.features(m, x) for m, x in images.items()}
+        joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
+        found = {f"embedding_{m}": x for m, x in features.items()}
+        found |= {
+            f"shared_{m}": model.project(m, model.features(m, images[m], for_heads=True)) for m in graph.projectors
+        }
+        found |= {output_of(r): r(joined) for r in graph.readouts}  # type: ignore[arg-type]
+        chunks.append(found)
+        advance(len(chunk))
+    return {name: torch.cat([c[name] for c in chunks]).numpy() for name in graph.outputs}
+
+
+def parity(
+    graph: ExportModule,
+    call: Call,
+    model: Model,
+    pack: Pack,
+    rows: np.ndarray,
+    wanted: dict[str, np.ndarray],
+    config: ExportConfig,
+    advance: Callable[[int], object] = lambda num: None,
+) -> dict[str, Any]:
+    """Compare the outputs of ``call`` for pack rows with ``wanted``.
+
+    Returns:
+        num_rows; cosine by embedding (min, mean); accuracy by task (original, export, num labelled rows).
+
+    Raises:
+        ValueError: they differ by more than ``config`` allows; the message names the likeliest reason.
+    """
+    chunks = []
+    for chunk in np.array_split(rows, max(1, len(rows) // 16)):  # batches of another size than the traced one
+        chunks.append(call([np.ascontiguousarray(pack.images[m][chunk]) for m in graph.modalities]))
+        advance(len(chunk))
+    found = {name: np.concatenate([c[i] for c in chunks]) for i, name in enumerate(graph.outputs)}
+    report: dict[str, Any] = {"num_rows": len(rows), "cosine": {}, "accuracy": {}}
+    for name in (n for n in graph.outputs if n.startswith(("embedding_", "shared_"))):
+        values = cosines(found[name], wanted[name])
+        report["cosine"][name] = {"min": float(values.min()), "mean": float(values.mean())}
+        if not values.min() >= (config.min_cosine or 0):
+            raise ValueError(
+                f"the export is not the trained model: {name} has cosine {values.min():.4f} on real inputs, at least"
+                f" {config.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows)}"
+            )
+    for task, known in graph.classes.items():
+        labels = labels_of(pack, task, known, rows)
+        if (labels >= 0).any():
+            name = f"probability_{task}"
+            report["accuracy"][task] = _accuracy(task, labels, wanted[name], found[name], config.accuracy_loss)
+    for task, targets in graph.values.items():
+        name, measured = f"value_{task}", [_measured(pack, target["name"], target["unit"], rows) for target in targets]
+        columns = zip(targets, measured, wanted[name].T, found[name].T, strict=True)
+        report.setdefault("values", {})[task] = [_error(*column, config.value_loss) for column in columns]
+    return report
+
+
+def _measured(pack: Pack, name: str, unit: str, rows: np.ndarray) -> np.ndarray:
+    """Measured values [len(rows)] of one target; NaN where ``pack`` has none in this unit."""
+    for task in pack.spec.values:
+        for t, target in enumerate(task.targets):
+            if (target.name, target.unit) == (name, unit):
+                return pack.values(task)[rows, t]
+    return np.full(len(rows), np.nan)
+
+
+def _error(
+    target: dict[str, Any], true: np.ndarray, wanted: np.ndarray, found: np.ndarray, limit: float
+) -> dict[str, Any]:
+    """What an export does to one target, in its unit; ValueError if values change by more than ``limit`` deviations.
+
+    The deviation is that of the measured values, or of the model's own where fewer than two were measured.
+    """
+    have = ~np.isnan(true)
+    std = float((true[have] if have.sum() > 1 else wanted).std())
+    change, allowed = float(((found - wanted) ** 2).mean() ** 0.5), limit * std
+    if not change <= allowed:
+        unit = target["unit"]
+        raise ValueError(
+            f"the export changes {target['name']} by {change:.3g} {unit} (root mean square), at most {allowed:.3g} {unit}"
+            f" is allowed, {limit:g} of its standard deviation: use another precision, or allow more, --value-loss"
+        )
+    maes = [float(abs(x - true)[have].mean()) if have.any() else None for x in (wanted, found)]
+    return {
+        **{key: target[key] for key in ("name", "unit")},
+        **{"original": maes[0], "export": maes[1], "num": int(have.sum()), "change": change, "allowed": allowed},
+    }
+
+
+def _accuracy(task: str, labels: np.ndarray, wanted: np.ndarray, found: np.ndarray, limit: float) -> dict[str, Any]:
+    """Accuracy in percent before and after, over labelled rows; ValueError if more than ``limit`` points are lost."""
+    before, after = (100 * float((x.argmax(1) == labels)[labels >= 0].mean()) for x in (wanted, found))
+    if before - after > limit:
+        raise ValueError(
+            f"the export loses {before - after:.2f} points of accuracy on {task} ({before:.1f} to {after:.1f} %),"
+            f" at most {limit} is allowed: use another precision, check on more --rows if the {len(labels)} here are"
+            " few, or allow more, --accuracy-loss"
+        )
+    return {"original": before, "export": after, "num": int((labels >= 0).sum())}
+
+
+def labels_of(pack: Pack, task: str, classes: list[str], rows: np.ndarray) -> np.ndarray:
+    """Labels [len(rows)] of pack rows as indices into ``classes``, matched by name; -1 = unlabelled or unknown class."""
+    own = next((t.classes for t in pack.spec.tasks if t.name == task), None)
+    if own is None:
+        return np.full(len(rows), -1)
+    numbers = np.array([*(classes.index(name) if name in classes else -1 for name in own), -1])
+    return numbers[pack.column(f"label_{task}")[rows].astype(int)]
+
+
+def explain(model: Model, modality: str, found: dict[str, np.ndarray], pack: Pack, rows: np.ndarray) -> str:
+    """The preprocessing mistake with which the model reproduces the export's output, if it is a common one."""
+    raw = torch.from_numpy(pack.images[modality][rows[:8]]).permute(0, 3, 1, 2)
+    swapped = raw.unflatten(1, (-1, 3)).flip(2).flatten(1, 2)
+    size = (model.run.augment.eval_size,) * 2
+    unit = torch.nn.functional.interpolate(raw, size, mode="bilinear", antialias=True).float() / 255
+    mean, std = (torch.tensor(v * (raw.shape[1] // 3)).view(-1, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    with torch.no_grad():
+        mistakes = {
+            "its input is BGR, the model wants RGB": model.features(modality, swapped),
+            "it does not normalise by the ImageNet mean and std": model.encoders[modality](unit),
+            "it normalises to [-1, 1] instead of by the ImageNet mean and std": model.encoders[modality](2 * unit - 1),
+            "it does not divide by 255": model.encoders[modality]((255 * unit - mean) / std),
+        }
+    for reason, features in mistakes.items():
+        if cosines(features.numpy(), found[f"embedding_{modality}"][:8]).min() > 0.999:
+            return f": {reason}"
+    return ""
+
+
+def latency(call: Call, one: list[np.ndarray], *, num: int = 100, warm: int = 10) -> dict[str, float]:
+    """p50 and p99 in ms of ``num`` calls with a batch of one pair, after ``warm`` calls that are not measured."""
+    times = []
+    for _ in range(warm + num):
+        start = time.perf_counter()
+        call(one)
+        times.append(1000 * (time.perf_counter() - start))
+    p50, p99 = np.percentile(times[warm:], [50, 99])
+    return {"p50": round(float(p50), 3), "p99": round(float(p99), 3)}

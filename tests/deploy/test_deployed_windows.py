@@ -1,0 +1,215 @@
+"""A model of windows in use: clips for ``embed`` and ``predict``, its artifact, its export, and live by time stamps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import mvitac
+from mvitac.cli.main import main
+from mvitac.data.images import difference
+from mvitac.data.pack import Pack
+from mvitac.data.spec import Window
+from mvitac.data.windows import windowed
+from mvitac.datasets.pack import PackConfig
+from mvitac.deploy.artifact import read_manifest
+from mvitac.deploy.engine import Engine, frame_shapes
+from mvitac.deploy.publish import publish
+from mvitac.live.contact import LiveConfig
+from mvitac.live.predictor import Live
+from mvitac.live.streams import Stream
+from mvitac.model import Model
+from mvitac.recipes import recipe
+from mvitac.training.loop import train
+from support.faults import Clock, Rig
+
+
+@pytest.fixture(scope="module")
+def published(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model of the two newest frames of touch."""
+    folder = tmp_path_factory.mktemp("windows")
+    run = replace(recipe("smoke", PackConfig(path=measured.path, num_frames=2)), steps=2, eval_every=0)
+    return publish(train(run, folder / "run", quiet=True), folder / "artifact")
+
+
+@pytest.fixture(scope="module")
+def model(published: Path) -> Model:
+    return mvitac.load(published)
+
+
+def test_a_clip_is_read_as_the_packs_window(model: Model, measured: Pack) -> None:
+    """Rows 0 and 3 are the two frames of a touch: the window of row 3 shows row 3, then row 0."""
+    touch, windows = measured.images["touch"], windowed(measured, Window(frames=2)).images["touch"]
+    clip = np.stack([touch[0], touch[3]])
+    wanted = model.features("touch", torch.from_numpy(windows[3:4]).permute(0, 3, 1, 2))
+    other = model.embed(touch=clip[::-1].copy())["touch"]
+    assert not torch.allclose(other, wanted)
+    pictures = [Image.fromarray(frame) for frame in clip]
+    tensors = torch.from_numpy(clip).permute(0, 3, 1, 2)
+    for given in (clip, list(clip), pictures, tensors, clip[None], [clip], [pictures], windows[3:4], windows[3]):
+        torch.testing.assert_close(model.embed(touch=given)["touch"], wanted)
+    assert model.embed(touch=[clip, clip, clip])["touch"].shape[0] == 3
+    said = model.predict(touch=np.stack([clip, clip]), vision=measured.images["vision"][[3, 3]])
+    assert said["light"].shape == (2, 1) and said["pattern"].shape == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("given", "got"),
+    [
+        (np.zeros((32, 32, 3), np.uint8), "a single image"),
+        (Image.new("RGB", (32, 32)), "a single image"),
+        (np.zeros((3, 32, 32, 3), np.uint8), "3 frames"),
+        ([np.zeros((32, 32, 3), np.uint8)], "1 frames"),
+    ],
+)
+def test_other_than_clips_are_named(model: Model, given: Any, got: str) -> None:
+    with pytest.raises(ValueError, match=rf"touch: this model looks at 2 frames at once, got {got}: give clips \[2, H"):
+        model.embed(touch=given)
+
+
+def test_each_frame_is_minus_the_first_one_of_its_touch(model: Model, measured: Pack) -> None:
+    other = mvitac.load(model.folder)  # type: ignore[attr-defined]
+    other.spec = replace(other.spec, window=replace(other.spec.window, minus_first=True))
+    touch = measured.images["touch"]
+    clip, first = np.stack([touch[0], touch[3]]), touch[6]
+    wanted = other.embed(touch=np.stack([difference(frame, first) for frame in clip]))["touch"]
+    torch.testing.assert_close(other.embed(touch=clip, background=first)["touch"], wanted)
+    other.spec = replace(other.spec, difference=True)
+    with pytest.raises(ValueError, match="then minus its first frame"):
+        other.embed(touch=clip, background=first)
+    with pytest.raises(ValueError, match="background cannot be used"):
+        model.embed(touch=clip, background=first)
+
+
+def test_the_artifact_says_what_a_window_is(published: Path, artifact: Path) -> None:
+    window = read_manifest(published)["preprocessing"]["window"]
+    assert (window["frames"], window["stride"], window["order"], window["of"]) == (2, 1.0, "frame", ["touch"])
+    assert "newest frame first" in window["layout"]
+    assert "window" not in read_manifest(artifact)["preprocessing"]
+
+
+# -- live -------------------------------------------------------------------------------------------------------------
+
+
+class Counter(Rig):
+    """A sensor whose picture is its number of frames read; ``calls`` before 8 are the free sensor."""
+
+    calls = 0
+
+    def read(self) -> np.ndarray:
+        self.calls += 1
+        return np.full((32, 32, 3), 10 if self.calls <= 8 else 60 + self.calls, np.uint8)
+
+
+class Seeing:
+    """An engine of windows that keeps what it was shown: the level of each frame of touch."""
+
+    classes: dict[str, list[str]]
+    values: dict[str, Any]
+
+    def __init__(self, frames: int = 3, stride: float = 1.0, order: str = "frame", **window: Any) -> None:
+        self.window = {
+            "frames": frames,
+            "stride": stride,
+            "order": order,
+            "of": ["touch"],
+            "minus_first": False,
+            **window,
+        }
+        self.inputs = {"touch": (32, 32, 3 * frames)}
+        self.classes, self.values, self.difference, self.seen = {}, {}, False, []
+
+    def __call__(self, touch: np.ndarray) -> dict[str, np.ndarray]:
+        assert touch.shape == (1, *self.inputs["touch"])
+        self.seen.append((touch[0, 16, 16, ::3].astype(int)).tolist())
+        return {}
+
+
+def play(engine: Seeing, times: list[float], config: LiveConfig = LiveConfig(calibration=2)) -> list[list[int]]:
+    """Frames at ``times`` (after eight free ones); what the engine saw, as frame numbers from 9 on."""
+    clock = Clock()
+    rig = Counter(clock, 0)
+    stream = Stream("touch", rig, clock=clock)
+    live = Live(engine, {"touch": [stream]}, config, clock=clock)  # type: ignore[arg-type]
+    for time in [*(99 + k / 10 for k in range(8)), *times]:
+        clock.now = time
+        stream.pump()
+        live.tick()
+    return [[level - 60 for level in levels] for levels in engine.seen]
+
+
+EVEN = [99.8 + k / 10 for k in range(6)]  # frames 9 to 14
+
+
+def test_live_shows_this_frame_and_earlier_ones_of_the_touch() -> None:
+    assert play(Seeing(), EVEN) == [[9, 9, 9], [10, 9, 9], [11, 10, 9], [12, 11, 10], [13, 12, 11], [14, 13, 12]]
+    assert play(Seeing(frames=2, stride=2), EVEN)[-1] == [14, 12]
+
+
+def test_dropped_frames_do_not_shift_a_window() -> None:
+    """Without the frame at 100.0 the frames one and two steps back are still those of 0.1 and 0.2 s ago, or just older."""
+    gap = [99.8, 99.9, 100.1, 100.2, 100.3]  # frames 9, 10, then 11 at the time of what would have been 12
+    assert play(Seeing(), gap) == [[9, 9, 9], [10, 9, 9], [11, 10, 10], [12, 11, 10], [13, 12, 11]]
+    jitter = [t + d for t, d in zip(EVEN, (0, 0.01, -0.01, 0.01, -0.01, 0.01), strict=True)]
+    assert play(Seeing(), jitter) == play(Seeing(), EVEN)
+
+
+def test_the_stride_is_in_seconds_or_in_frames_of_the_training_data() -> None:
+    assert play(Seeing(frames=2, stride=0.3, order="time"), EVEN)[-1] == [14, 11]
+    slower = LiveConfig(calibration=2, frame_seconds=0.2)  # trained at 5 Hz, live at 10 Hz
+    assert play(Seeing(frames=2), EVEN, slower)[-1] == [14, 12]
+    with pytest.raises(ValueError, match="frame_seconds 0: give seconds"):
+        LiveConfig(frame_seconds=0)
+
+
+def test_the_background_stands_for_the_first_frame() -> None:
+    found = play(Seeing(frames=2, minus_first=True), EVEN)
+    levels = [
+        difference(np.full((1, 1, 3), 60 + k, np.uint8), np.full((1, 1, 3), 10, np.uint8))[0, 0, 0] for k in (14, 13)
+    ]
+    assert [level + 60 for level in found[-1]] == levels
+    with pytest.raises(ValueError, match="frames minus the first one of vision"):
+        play(Seeing(minus_first=True, of=["touch", "vision"]), [])
+
+
+def test_a_stream_keeps_no_more_than_a_window_needs() -> None:
+    clock = Clock()
+    stream = Stream("touch", Counter(clock, 0, 64), clock=clock)
+    stream.remember(0.5, 16)
+    for k in range(100):
+        clock.now = 99 + k / 10
+        stream.pump()
+    assert 6 <= len(stream._past) <= 7 and stream._past[0][1].shape == (16, 16, 3)
+
+
+# -- the command line -------------------------------------------------------------------------------------------------
+
+
+def test_export_and_live_of_windows(
+    published: Path, measured: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The plain pack is opened with the model's windows; live takes the frames of one sensor."""
+    out = tmp_path / "export"
+    assert main(["export", str(published), "--on", str(measured.path), "--out", str(out)]) == 0, capsys.readouterr().err
+    engine, model = Engine(out, threads=1), mvitac.load(published)
+    assert engine.inputs["touch"] == (32, 32, 6) and frame_shapes(engine)["touch"] == (32, 32, 3)
+    assert engine.window and engine.window["order"] == "frame"
+    images = {m: np.asarray(windowed(measured, Window(frames=2)).images[m][[3, 4]]) for m in ("vision", "touch")}
+    wanted = model.predict(**images)["light"]
+    np.testing.assert_allclose(engine(**images)["value_light"], wanted, rtol=1e-3, atol=1e-3)
+    with pytest.raises(ValueError, match="touch: expected uint8"):
+        engine(vision=images["vision"], touch=images["touch"][..., :3])
+    for m in ("vision", "touch"):
+        (tmp_path / m).mkdir()
+        for i in range(10):
+            image = measured.images[m][0] if i < 4 else 255 - measured.images[m][0]
+            Image.fromarray(image ^ np.uint8(i % 2)).save(tmp_path / m / f"{i:03d}.png")
+    command = ["live", str(out), "--vision", f"{tmp_path / 'vision'}@30", "--touch", f"{tmp_path / 'touch'}@30"]
+    assert main([*command, "--calibration", "2", "--stale", "60"]) == 0
+    assert "level: " in capsys.readouterr().out
