@@ -20,7 +20,8 @@ from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
-from mvitac.evaluation.probe import ProbeSplit, fit_values, score_predictions, score_rows, split_rows
+from mvitac.evaluation.probe import ProbeSplit, score_predictions, score_rows, split_rows
+from mvitac.evaluation.regressors import fit_ridge
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.value_scores import error_by_range
 from mvitac.model import Model, load
@@ -84,7 +85,7 @@ def _fit_values(
 ) -> tuple[LinearProbe, dict[str, Any]]:
     """The ridge probe of one task on features ``x`` of ``rows.all``, and its record."""
     num = len(rows.fitted)
-    fitted, _ = fit_values(x[:num], pack, task, rows, "linear")
+    fitted, _ = fit_ridge(x[:num], pack.values(task)[rows.fitted], len(rows.val))
     true, guess = pack.values(task)[rows.test], fitted(x[num:])
     record = score_predictions(pack, task, rows.test, guess)
     known = {"task": task.name, "modality": source}
