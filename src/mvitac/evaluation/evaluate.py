@@ -33,7 +33,7 @@ from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
 
 END_TO_END = ", end to end"
-"""Suffix of a source's name for the scores of its own classifiers, trained along with its encoders."""
+"""Suffix of a source's name for the scores of its own heads, trained along with its encoders."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -171,11 +171,11 @@ def fit_values(
 def probe_model(
     model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Probe every task and modality that ``model`` has an encoder for, and its own classifiers where it has some.
+    """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
 
     Returns:
         One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
-        model's own classifier is "own".
+        model's own head is "own".
     """
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
@@ -189,26 +189,32 @@ def probe_model(
         return np.concatenate(found, axis=1)
 
     records = probe_all(source, pack, tasks, modalities, probes, model.run.seed)
-    return records + _own_classifiers(model, pack, with_classes(tasks), modalities)
+    return records + _own_heads(model, pack, tasks, modalities)
 
 
-def _own_classifiers(
-    model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]
-) -> list[dict[str, Any]]:
-    """Records of the classifiers that the model trained along with its encoders."""
+def _own_heads(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> list[dict[str, Any]]:
+    """Records of the heads that the model trained along with its encoders."""
     whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
-    known = {task.name: task.classes for task in model.spec.tasks if task.name in model.tasks}
+    known = {task.name: _outputs(task) for task in model.spec.all_tasks if task.name in model.tasks}
     records = []
     for task in tasks:
-        if whole not in modalities or task.name not in known or set(task.classes) - set(known[task.name]):
-            continue  # not a task that it learned, or not all of its classes
+        if whole not in modalities or task.name not in known or set(_outputs(task)) - set(known[task.name]):
+            continue  # not a task that it learned, or not all of its classes or targets
         rows = split_rows(pack, task, whole).test
         z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
-        # Match columns by class name: this pack may order the classes differently or have fewer.
-        columns = [known[task.name].index(name) for name in task.classes]
-        result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
+        # Match columns by name: this pack may order the classes differently or have fewer.
+        columns = [known[task.name].index(name) for name in _outputs(task)]
+        if isinstance(task, Task):
+            result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
+        else:
+            result = score_predictions(pack, task, rows, model.estimate(task.name, z).numpy()[:, columns])
         records.append({"task": task.name, "modality": whole, "probe": "own", **result})
     return records
+
+
+def _outputs(task: AnyTask) -> tuple[Any, ...]:
+    """What the outputs of a head stand for: names of classes, or targets with their units."""
+    return task.classes if isinstance(task, Task) else task.targets
 
 
 def with_classes(tasks: Sequence[AnyTask]) -> list[Task]:

@@ -37,11 +37,11 @@ class CalandraConfig(LabelledConfig):
         width = sum(num_features(stream) for stream in streams.values())
         first, second = self.widths
 
-        def classifier(num: int) -> nn.Module:
-            layers = (nn.Linear(width, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU())
-            return nn.Sequential(*layers, nn.Linear(second, num))
+        def layers(num: int) -> nn.Module:
+            hidden = (nn.Linear(width, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU())
+            return nn.Sequential(*hidden, nn.Linear(second, num))
 
-        return Supervised(streams, {task: classifier(num) for task, num in self.num_classes(spec).items()})
+        return Supervised(streams, self.heads(spec, layers))
 
 
 class Streams(nn.Module):
