@@ -41,7 +41,8 @@ class ProbeConfig:
     """What to probe, and whether to score controls."""
 
     probes: tuple[Probe, ...] = ("linear",)
-    """linear: logistic regression, C chosen on held-out groups of train. paper: the paper's Adam probe. knn: 20 nearest."""
+    """linear: logistic regression, or ridge for values, C or alpha chosen on held-out groups of train. paper: the paper's
+    Adam probe. knn: 20 nearest. mlp: one hidden layer. attentive: attention over the trunk's last feature map."""
     tasks: tuple[str, ...] = ()
     """Tasks to probe. Default: all."""
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
