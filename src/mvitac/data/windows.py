@@ -43,7 +43,7 @@ def windowed(pack: Pack, window: Window) -> Pack:
             raise unknown("modality of windows", modality, pack.spec.modalities)
     index, whole = frames_of(pack, window)
     made = copy.copy(pack)
-    made.spec = replace(pack.spec, window=replace(window, order=_places(pack, window)[0]))
+    made.spec = replace(pack.spec, window=replace(window, order=places(pack, window)[0]))
     for name in ("_answers", "hidden"):
         made.__dict__.pop(name, None)  # kept from before rows were left out
     made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
