@@ -87,6 +87,9 @@ class Attentive(nn.Module):
 class Standardised(nn.Module):
     """``network`` on inputs whose channels are standardised over the fitted rows."""
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, network: nn.Module, x: np.ndarray) -> None:
         super().__init__()
         self.network = network
@@ -105,7 +108,7 @@ class Standardised(nn.Module):
 
 def _linear(width: int, num: int) -> nn.Linear:
     """A linear layer without weights yet: drawing them here would use the random generator that threads share."""
-    return nn.utils.skip_init(nn.Linear, width, num)
+    return nn.utils.skip_init(nn.Linear, width, num)  # type: ignore[return-value]
 
 
 def _network(kind: str, x: np.ndarray, y: np.ndarray, num_out: int, seed: int) -> nn.Module:
