@@ -52,7 +52,7 @@ class Model(nn.Module):
     Attributes:
         encoders: modality -> trunk.
         projectors: modality -> head into the shared space.
-        tasks: Names of the tasks of the method's own ``classifiers``; empty for a self-supervised method.
+        tasks: Names of the tasks of the method's own heads (``classifiers``); empty for a self-supervised method.
         readouts: Name -> linear probe, if the model is a published artifact.
         foreign: Whether it is from an artifact or an index, which may be a stranger's: no place that ``run`` names is
             opened.
@@ -196,13 +196,26 @@ class Model(nn.Module):
         """Class probabilities [B, K] from the classifier that a supervised method trained with its encoders.
 
         Args:
-            task: One of ``tasks``.
+            task: One of ``tasks``, with classes.
             features: modality -> ``features(..., for_heads=True)``.
         """
+        return self._answer(task, features).softmax(dim=1)
+
+    @torch.no_grad()
+    def estimate(self, task: str, features: dict[str, Tensor]) -> Tensor:
+        """Values [B, T] in their units, from the head that a supervised method trained with its encoders.
+
+        Args:
+            task: One of ``tasks``, with values.
+            features: modality -> ``features(..., for_heads=True)``.
+        """
+        return self._answer(task, features)
+
+    def _answer(self, task: str, features: dict[str, Tensor]) -> Tensor:
         if task not in self.tasks:
-            raise unknown("task of this model's own classifiers", task, self.tasks or ("none",))
+            raise unknown("task of this model's own heads", task, self.tasks or ("none",))
         joined = torch.cat([features[m] for m in self.encoders], dim=1)
-        return self.classifiers[self.tasks.index(task)](joined).softmax(dim=1)
+        return self.classifiers[self.tasks.index(task)](joined)
 
     def embed(
         self,

@@ -365,7 +365,7 @@ def test_supervised_on_one_modality(pack: Pack, modality: str) -> None:
 def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, config: type) -> None:
     """Also of a task with a split of its own, as rough of Touch and Go's lists, and of rows without the other sense."""
     other = copy.copy(pack)
-    other._labels = {}  # type: ignore[misc]
+    other._answers = {}  # type: ignore[misc]
     first, second = pack.spec.tasks
     other.spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
     turned = {"test": "train", "train": "test"}

@@ -136,31 +136,38 @@ class Pack:
 
         With ``splits``, labels of rows in other splits (column ``Task.split``) are -1, too.
         """
-        if (task, *splits) not in self._labels:
+        if (task, *splits) not in self._answers:
             about = next(t for t in self.spec.tasks if t.name == task)
             known = self.column(f"label_{task}").astype(np.int64)
             for name, value in about.only.items():
                 known[self.column(name).astype(str) != value] = -1
             if splits:
                 known[~np.isin(self.column(about.split), splits)] = -1
-            self._labels[task, *splits] = known
-        return self._labels[task, *splits]
+            self._answers[task, *splits] = known
+        return self._answers[task, *splits]
 
-    def values(self, task: ValueTask) -> np.ndarray:
-        """Return float64 values [N, T] of the targets of ``task``; NaN if not measured or excluded by ``task.only``."""
-        found = np.stack([self.column(target.name).astype(float) for target in task.targets], axis=1)
-        for name, value in task.only.items():
-            found[self.column(name).astype(str) != value] = np.nan
-        return found
+    def values(self, task: ValueTask, *splits: str) -> np.ndarray:
+        """Return float64 values [N, T] of the targets of ``task``; NaN if not measured or excluded by ``task.only``.
 
-    def answered(self, task: AnyTask) -> np.ndarray:
-        """Return bool [N], which rows have a label, or a value of at least one target."""
+        With ``splits``, values of rows in other splits (column ``ValueTask.split``) are NaN, too.
+        """
+        if (key := (repr(task), *splits)) not in self._answers:
+            found = np.stack([self.column(target.name).astype(float) for target in task.targets], axis=1)
+            for name, value in task.only.items():
+                found[self.column(name).astype(str) != value] = np.nan
+            if splits:
+                found[~np.isin(self.column(task.split), splits)] = np.nan
+            self._answers[key] = found
+        return self._answers[key]
+
+    def answered(self, task: AnyTask, *splits: str) -> np.ndarray:
+        """Return bool [N], which rows (of ``splits``) have a label, or a value of at least one target."""
         if isinstance(task, ValueTask):
-            return np.asarray(np.isfinite(self.values(task)).any(axis=1))
-        return self.labels(task.name) >= 0
+            return np.asarray(np.isfinite(self.values(task, *splits)).any(axis=1))
+        return self.labels(task.name, *splits) >= 0
 
     @functools.cached_property
-    def _labels(self) -> dict[tuple[str, ...], np.ndarray]:
+    def _answers(self) -> dict[tuple[str, ...], np.ndarray]:
         return {}
 
     def has(self, modality: str) -> np.ndarray:

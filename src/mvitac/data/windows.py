@@ -44,6 +44,8 @@ def windowed(pack: Pack, window: Window) -> Pack:
     index, whole = frames_of(pack, window)
     made = copy.copy(pack)
     made.spec = replace(pack.spec, window=replace(window, order=places(pack, window)[0]))
+    for name in ("_answers", "hidden"):
+        made.__dict__.pop(name, None)  # kept from before rows were left out
     made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
     first = _first_rows(pack, window) if window.minus_first else None
     made.images = {m: Windows(pack.images[m], index, first) if m in window.of else pack.images[m] for m in pack.images}

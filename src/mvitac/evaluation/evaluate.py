@@ -33,7 +33,7 @@ from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
 
 END_TO_END = ", end to end"
-"""Suffix of a source's name for the scores of its own classifiers, trained along with its encoders."""
+"""Suffix of a source's name for the scores of its own heads, trained along with its encoders."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,8 @@ class ProbeConfig:
     """What to probe, and whether to score controls."""
 
     probes: tuple[Probe, ...] = ("linear",)
-    """linear: logistic regression, C chosen on held-out groups of train. paper: the paper's Adam probe. knn: 20 nearest."""
+    """linear: logistic regression, or ridge for values, C or alpha chosen on held-out groups of train. paper: the paper's
+    Adam probe. knn: 20 nearest. mlp: one hidden layer. attentive: attention over the trunk's last feature map."""
     tasks: tuple[str, ...] = ()
     """Tasks to probe. Default: all."""
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()

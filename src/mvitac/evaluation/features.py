@@ -12,9 +12,14 @@ from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.model import Model
+from mvitac.nn.encoders import last_map
 from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
+from mvitac.transforms.preprocess import encoder_input
+
+HALF = (-65504.0, 65504.0)
+"""Range of fp16."""
 
 
 def pack_features(
@@ -25,14 +30,15 @@ def pack_features(
     *,
     for_heads: bool = False,
     bf16: bool = False,
+    maps: bool = False,
     advance: Callable[[int], object] = lambda num: None,
 ) -> Tensor:
-    """Compute ``Model.features`` of pack rows in chunks on the model's device.
+    """Compute ``Model.features`` of pack rows in chunks on the model's device; with ``maps``, ``last_map`` instead.
 
     ``advance`` is called after each chunk with the number of its rows.
 
     Returns:
-        Features [len(rows), D] on the CPU.
+        Features [len(rows), D], or maps [len(rows), P, D] of fp16, on the CPU.
     """
     device = next(model.parameters()).device
     if device.type == "cpu":
@@ -40,7 +46,12 @@ def pack_features(
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
+        if maps:
+            with torch.no_grad():
+                found = last_map(model.encoders[modality], encoder_input(images, model.run.augment.eval_size))
+            chunks.append(found.clamp(*HALF).half().cpu())
+        else:
+            chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
         advance(len(chunk))
     return torch.cat(chunks)
 
@@ -53,8 +64,12 @@ def sample(rows: np.ndarray, num: int) -> np.ndarray:
     return np.sort(np.random.default_rng(0).choice(rows, min(num, len(rows)), replace=False))
 
 
-def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:
+def features(
+    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, maps: bool = False
+) -> np.ndarray:
     """Features [len(rows), D] float32, cached on disk by weights, data, rows and image size (``Model.features``).
+
+    With ``maps`` they are the trunk's last feature map, [len(rows), P, D] float16 of at most 49 places.
 
     The cached file is a .npy followed by its sha256. One that does not match, or has none, is computed again.
     """
@@ -62,14 +77,15 @@ def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_h
     sides = model.run.augment
     # The weights' digest covers eval_size already.
     side = [sides.size] if for_heads and sides.size != sides.eval_size else []
-    key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type, *side])
+    kind = [*side, *(["map"] if maps else [])]
+    key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type, *kind])
     path = cache_dir() / "features" / f"{key[:32]}.npy"
     if path.exists():
         data = path.read_bytes()
         if hashlib.sha256(memoryview(data)[:-32]).digest() == data[-32:]:
             return np.load(io.BytesIO(data), allow_pickle=False)
-    with work(f"reading {modality} features", len(rows), "images") as advance:
-        values = pack_features(model, pack, modality, rows, for_heads=for_heads, advance=advance).numpy()
+    with work(f"reading {modality} {'maps' if maps else 'features'}", len(rows), "images") as advance:
+        values = pack_features(model, pack, modality, rows, for_heads=for_heads, maps=maps, advance=advance).numpy()
     buffer = io.BytesIO()
     np.save(buffer, values)
     buffer.write(hashlib.sha256(buffer.getbuffer()).digest())

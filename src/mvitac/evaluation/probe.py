@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.special import softmax
 from torch import Tensor
 
 from mvitac.data.pack import Pack
@@ -20,16 +21,18 @@ from mvitac.evaluation.classifiers import Classifier, fit_knn, fit_linear, fit_p
 from mvitac.evaluation.features import features
 from mvitac.evaluation.regressors import Regressor, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
+from mvitac.evaluation.trained_probes import TRAINED, fit_network
 from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
 from mvitac.registry import unknown
 from mvitac.system.progress import tick
 
-PROBES = ("linear", "paper", "knn")
-"""linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
-Probe = Literal["linear", "paper", "knn"]
-VALUE_PROBES = ("linear", "knn")
-"""Probes of tasks with values: ridge regression, alpha chosen on validation groups, and the mean of the 20 nearest."""
+PROBES = ("linear", "paper", "knn", *TRAINED)
+"""linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest.
+mlp, attentive: small networks on features, or on the trunk's last map (``trained_probes``)."""
+Probe = Literal["linear", "paper", "knn", "mlp", "attentive"]
+VALUE_PROBES = ("linear", "knn", *TRAINED)
+"""Probes of tasks with values: ridge regression, alpha chosen on validation groups, the mean of the 20 nearest, networks."""
 MIN_GALLERY = 11
 """Least number of test groups for retrieval. With fewer, the first five are half of all groups or more."""
 
@@ -121,7 +124,7 @@ def probe_features(
     """Fit and score one probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one."""
     num = len(rows.fitted)
     if isinstance(task, ValueTask):
-        predict, extra = fit_values(x[:num], pack, task, rows, kind)
+        predict, extra = fit_values(x[:num], pack, task, rows, kind, seed)
         return {**score_predictions(pack, task, rows.test, predict(x[num:])), **extra}
     predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
     return {**score_rows(pack, task, rows.test, predict(x[num:])), **extra}
@@ -146,11 +149,14 @@ def fit_probe(
         return paper or fit_papers(x, [y_whole], [num], seed)[0], {}
     if kind == "knn":
         return fit_knn(x, y_whole, num), {}
+    if kind in TRAINED:
+        logits, steps = fit_network(kind, x, y_whole, len(rows.val), num, seed)
+        return lambda z: softmax(logits(z), axis=1), {"steps": steps}
     raise unknown("probe", kind, PROBES)
 
 
 def fit_values(
-    x: np.ndarray, pack: Pack, task: ValueTask, rows: ProbeSplit, kind: str
+    x: np.ndarray, pack: Pack, task: ValueTask, rows: ProbeSplit, kind: str, seed: int = 0
 ) -> tuple[Regressor, dict[str, Any]]:
     """Fit one probe of a task with values on features ``x`` of ``rows.fitted``.
 
@@ -165,50 +171,71 @@ def fit_values(
         return fit_curve(x, y, len(rows.val)), {}
     if kind == "knn":
         return fit_neighbours(x, y), {}
+    if kind in TRAINED:
+        predict, steps = fit_network(kind, x, y, len(rows.val), len(task.targets), seed)
+        return predict, {"steps": steps}
     raise unknown("probe of values", kind, VALUE_PROBES)
 
 
 def probe_model(
     model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Probe every task and modality that ``model`` has an encoder for, and its own classifiers where it has some.
+    """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
 
     Returns:
         One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
-        model's own classifier is "own".
+        model's own head is "own".
     """
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
         return []
     needed = np.unique(np.concatenate([split_rows(pack, task, m).all for task in tasks for m in modalities]))
     own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
-    by_modality = {m: features(model, pack, m, rows) for m, rows in own.items()}
 
-    def source(modality: str, rows: np.ndarray) -> np.ndarray:
-        found = [by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)]
-        return np.concatenate(found, axis=1)
+    def source_of(maps: bool) -> FeatureSource:
+        by_modality = {m: features(model, pack, m, rows, maps=maps) for m, rows in own.items()}
 
-    records = probe_all(source, pack, tasks, modalities, probes, model.run.seed)
-    return records + _own_classifiers(model, pack, with_classes(tasks), modalities)
+        def source(modality: str, rows: np.ndarray) -> np.ndarray:
+            return _joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
+
+        return source
+
+    maps = source_of(True) if "attentive" in probes else None
+    records = probe_all(source_of(False), pack, tasks, modalities, probes, model.run.seed, maps)
+    return records + _own_heads(model, pack, tasks, modalities)
 
 
-def _own_classifiers(
-    model: Model, pack: Pack, tasks: Sequence[Task], modalities: Sequence[str]
-) -> list[dict[str, Any]]:
-    """Records of the classifiers that the model trained along with its encoders."""
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Features [N, D] of several modalities, or maps [N, P, D], side by side. Narrow maps are filled up with zeros."""
+    if parts[0].ndim == 3:
+        width = max(part.shape[2] for part in parts)
+        parts = [np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[2]))) for part in parts]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+
+def _own_heads(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> list[dict[str, Any]]:
+    """Records of the heads that the model trained along with its encoders."""
     whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
-    known = {task.name: task.classes for task in model.spec.tasks if task.name in model.tasks}
+    known = {task.name: _outputs(task) for task in model.spec.all_tasks if task.name in model.tasks}
     records = []
     for task in tasks:
-        if whole not in modalities or task.name not in known or set(task.classes) - set(known[task.name]):
-            continue  # not a task that it learned, or not all of its classes
+        if whole not in modalities or task.name not in known or set(_outputs(task)) - set(known[task.name]):
+            continue  # not a task that it learned, or not all of its classes or targets
         rows = split_rows(pack, task, whole).test
         z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
-        # Match columns by class name: this pack may order the classes differently or have fewer.
-        columns = [known[task.name].index(name) for name in task.classes]
-        result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
+        # Match columns by name: this pack may order the classes differently or have fewer.
+        columns = [known[task.name].index(name) for name in _outputs(task)]
+        if isinstance(task, Task):
+            result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
+        else:
+            result = score_predictions(pack, task, rows, model.estimate(task.name, z).numpy()[:, columns])
         records.append({"task": task.name, "modality": whole, "probe": "own", **result})
     return records
+
+
+def _outputs(task: AnyTask) -> tuple[Any, ...]:
+    """What the outputs of a head stand for: names of classes, or targets with their units."""
+    return task.classes if isinstance(task, Task) else task.targets
 
 
 def with_classes(tasks: Sequence[AnyTask]) -> list[Task]:
@@ -238,8 +265,11 @@ def probe_all(
     modalities: Sequence[str],
     probes: Sequence[str],
     seed: int,
+    maps: FeatureSource | None = None,
 ) -> list[dict[str, Any]]:
     """Records of every (task, modality, probe) on the features of ``source``. The paper's probe has no values.
+
+    The attentive probe is fitted on those of ``maps``, [len(rows), P, D].
 
     Each fitted probe advances the ``progress.work`` that counts "probes".
     """
@@ -250,7 +280,8 @@ def probe_all(
             rows = split_rows(pack, task, modality)
             x = source(modality, rows.all)
             for kind in probes_of(task, probes):
-                result = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
+                z = maps(modality, rows.all) if maps and kind == "attentive" else x
+                result = probe_features(z, pack, task, rows, kind, seed, papers.get((task.name, modality)))
                 tick("probes")
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records

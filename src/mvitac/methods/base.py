@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -34,6 +34,8 @@ class Views:
     """task -> [B] int64, -1 = unlabelled. Only supervised methods use it."""
     rows: Tensor
     """[B] int64, the row of each pair in its pack. Memory banks are indexed by it."""
+    values: dict[str, Tensor] = field(default_factory=dict)
+    """Task with values -> [B, T] float32 in the units of its targets, NaN = not measured. For supervised methods."""
 
 
 class Method(nn.Module, ABC):
@@ -57,7 +59,10 @@ class Method(nn.Module, ABC):
         """The networks that are kept: modality -> trunk from images [B, C, H, W] to features [B, D]."""
 
     def classifiers(self) -> dict[str, nn.Module]:
-        """task -> classifier on the features of all ``encoders``, concatenated in their order. {} if there are none."""
+        """task -> head on the features of all ``encoders``, concatenated in their order. {} if there are none.
+
+        A head returns logits [B, K] of a task with classes, and values [B, T] in their units of a task with values.
+        """
         return {}
 
     def projectors(self) -> dict[str, nn.Module]:
@@ -71,6 +76,14 @@ class Method(nn.Module, ABC):
 
         Args:
             rows: [N] int64, the pack rows that training draws from, in ascending order.
+        """
+        return
+
+    def learn_scale(self, values: dict[str, Tensor]) -> None:
+        """Take mean and standard deviation of the values that training learns from. Called once, after ``prepare``.
+
+        Args:
+            values: As ``Views.values``, of all training rows.
         """
         return
 

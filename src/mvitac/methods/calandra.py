@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.supervised import LabelledConfig, Supervised
-from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
+from mvitac.nn.encoders import EncoderConfig, build_trunk, last_map, num_features
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +37,11 @@ class CalandraConfig(LabelledConfig):
         width = sum(num_features(stream) for stream in streams.values())
         first, second = self.widths
 
-        def classifier(num: int) -> nn.Module:
-            layers = (nn.Linear(width, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU())
-            return nn.Sequential(*layers, nn.Linear(second, num))
+        def layers(num: int) -> nn.Module:
+            hidden = (nn.Linear(width, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU())
+            return nn.Sequential(*hidden, nn.Linear(second, num))
 
-        return Supervised(streams, {task: classifier(num) for task, num in self.num_classes(spec).items()})
+        return Supervised(streams, self.heads(spec, layers))
 
 
 class Streams(nn.Module):
@@ -54,3 +54,7 @@ class Streams(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         return torch.cat([trunk(x) for trunk, x in zip(self.trunks, images.split(3, dim=1), strict=True)], dim=1)
+
+    def last_map(self, images: Tensor) -> Tensor:
+        """The streams' maps one after the other: [B, S P, D]."""
+        return torch.cat([last_map(trunk, x) for trunk, x in zip(self.trunks, images.split(3, dim=1), strict=True)], 1)

@@ -1,11 +1,14 @@
 """The supervised reference: one trunk per modality, concatenated features, one linear layer per task, trained end to end.
 
+A task asks for a class (cross-entropy) or for values (smooth L1 on standardised values).
+
 This is how the paper describes its ResNet-18 rows (appendix C). It also shows how much of a task the same network can learn
-from labels: its own classifiers are scored, and its frozen trunks are probed like those of any other method.
+from labels: its own heads are scored, and its frozen trunks are probed like those of any other method.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Self
 
@@ -15,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
 from mvitac.registry import formerly, unknown
@@ -26,7 +29,7 @@ class LabelledConfig(MethodConfig):
     """Fields shared by the supervised methods: tasks and modalities to learn from."""
 
     tasks: tuple[str, ...] = ()
-    """Tasks to learn. Default: all tasks of the dataset."""
+    """Tasks to learn. Default: all tasks with classes; if the dataset has none, all tasks with values."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
     """Modalities to learn from. Default: all modalities of the dataset."""
     labels: Literal["train", "train-and-val"] = field(default="train-and-val", metadata=formerly("train"))
@@ -43,21 +46,21 @@ class LabelledConfig(MethodConfig):
             rows = super().training_rows(pack)
         else:
             rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in self.modalities_of(pack.spec)]))
-        labelled = {task: pack.labels(task, *self.label_splits)[rows] >= 0 for task in self.labels_needed(pack.spec)}
+        labelled = {t.name: pack.answered(t, *self.label_splits)[rows] for t in self.tasks_of(pack.spec)}
         for task, there in labelled.items():
             if not there.any():
                 raise ValueError(f"task {task!r} has no labelled rows to train on: choose a self-supervised --method")
         return rows[np.logical_or.reduce(list(labelled.values()))]
 
-    def labels_needed(self, spec: DataSpec) -> tuple[str, ...]:
+    def tasks_of(self, spec: DataSpec) -> tuple[AnyTask, ...]:
         """Tasks to learn. Raises ValueError if the dataset lacks one, or has none."""
-        known = [task.name for task in spec.tasks]
+        known = {task.name: task for task in spec.all_tasks}
         for task in self.tasks:
             if task not in known:
                 raise ValueError(f"task {task!r} is not in dataset {spec.name!r}: it has {', '.join(known) or 'none'}")
         if not known:
-            raise ValueError(f"dataset {spec.name!r} has no labels: choose a self-supervised method")
-        return self.tasks or tuple(known)
+            raise ValueError(f"dataset {spec.name!r} has no labels and no values: choose a self-supervised method")
+        return tuple(known[name] for name in self.tasks) or spec.tasks or spec.values
 
     def modalities_of(self, spec: DataSpec) -> tuple[str, ...]:
         """The modalities to learn from, in the dataset's order. Raises ValueError if the dataset lacks one."""
@@ -69,26 +72,60 @@ class LabelledConfig(MethodConfig):
     def without_idle(self, spec: DataSpec) -> Self:
         return replace(self, modalities=self.modalities_of(spec))
 
-    def num_classes(self, spec: DataSpec) -> dict[str, int]:
-        """task -> number of classes, for each task to learn."""
-        known = {task.name: len(task.classes) for task in spec.tasks}
-        return {name: known[name] for name in self.labels_needed(spec)}
+    def heads(self, spec: DataSpec, layers: Callable[[int], nn.Module]) -> dict[str, nn.Module]:
+        """A head for each task to learn. ``layers`` creates one with this number of outputs."""
+        heads: dict[str, nn.Module] = {}
+        for task in self.tasks_of(spec):
+            if isinstance(task, Task):
+                heads[task.name] = layers(len(task.classes))
+            else:
+                heads[task.name] = ValueHead(layers(len(task.targets)), len(task.targets))
+        return heads
+
+
+class ValueHead(nn.Module):
+    """Values [B, T] in their units from features [B, D]: the outputs of ``layers``, scaled to ``mean`` and ``std`` [T]."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, layers: nn.Module, num: int) -> None:
+        super().__init__()
+        self.layers = layers
+        self.register_buffer("mean", torch.zeros(num))
+        self.register_buffer("std", torch.ones(num))
+
+    def learn_scale(self, values: Tensor) -> None:
+        """Take ``mean`` and ``std`` of ``values`` [N, T]; NaN = not measured."""
+        known = values.double().numpy()
+        self.mean.copy_(torch.from_numpy(np.nanmean(known, axis=0)))
+        self.std.copy_(torch.from_numpy(np.nanstd(known, axis=0)).clamp(min=1e-12))
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.layers(features).float() * self.std + self.mean
+
+    def loss(self, features: Tensor, values: Tensor) -> Tensor:
+        """Smooth L1 on standardised values, mean over the measured ones; 0 if none is."""
+        wanted = (values - self.mean) / self.std
+        known = ~wanted.isnan()
+        each = F.smooth_l1_loss(self.layers(features).float(), wanted.nan_to_num(), reduction="none")
+        return (each * known).sum() / known.sum().clamp(min=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SupervisedConfig(LabelledConfig):
-    """Cross-entropy on the labels of the dataset, on all tasks at once unless tasks are named."""
+    """Cross-entropy on labels, smooth L1 on values, on all tasks at once unless tasks are named."""
 
     name: ClassVar[str] = "supervised"
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
         trunks = {m: build_trunk(encoder, spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
         width = sum(num_features(trunk) for trunk in trunks.values())
-        return Supervised(trunks, {task: nn.Linear(width, num) for task, num in self.num_classes(spec).items()})
+        return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)))
 
 
 class Supervised(Method):
-    """One classifier per task on the concatenated features."""
+    """One head per task on the concatenated features."""
 
     def __init__(self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module]) -> None:
         super().__init__()
@@ -101,10 +138,18 @@ class Supervised(Method):
         features = torch.cat([trunk(batch.images[m][0]) for m, trunk in self.trunks.items()], dim=1)
         losses: dict[str, Tensor] = {}
         for task, head in zip(self.tasks, self.heads, strict=True):
+            if isinstance(head, ValueHead):
+                losses[task] = head.loss(features, batch.values[task])
+                continue
             labels = batch.labels[task]
             total = F.cross_entropy(head(features).float(), labels, ignore_index=-1, reduction="sum")
             losses[task] = total / (labels >= 0).sum().clamp(min=1)  # 0, not NaN, for a batch without labels
         return with_sum(losses)
+
+    def learn_scale(self, values: dict[str, Tensor]) -> None:
+        for task, head in zip(self.tasks, self.heads, strict=True):
+            if isinstance(head, ValueHead):
+                head.learn_scale(values[task])
 
     def encoders(self) -> dict[str, nn.Module]:
         return dict(self.trunks.items())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, Literal
 
 import timm
 import torch
+import torch.nn.functional as F
 from huggingface_hub import constants, get_session, try_to_load_from_cache
 from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
@@ -22,6 +24,8 @@ from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
+MAP_SIDE = 7
+"""A feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px."""
 _WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """Names of timm's files on the hub."""
 
@@ -92,11 +96,45 @@ class PerFrame(nn.Module):
             self.age = nn.Parameter(torch.zeros(frames))
 
     def forward(self, images: Tensor) -> Tensor:
-        features = self.trunk(images.unflatten(1, (self.frames, -1)).flatten(0, 1)).unflatten(0, (-1, self.frames))
+        features = self.trunk(self._each(images)).unflatten(0, (-1, self.frames))
+        return features.mean(1) if self.score is None else (self._weights(features).unsqueeze(2) * features).sum(1)
+
+    def last_map(self, images: Tensor) -> Tensor:
+        """The same mean of the frames' maps: [B, P, D]."""
+        each = self._each(images)
+        maps = last_map(self.trunk, each).unflatten(0, (-1, self.frames))
         if self.score is None:
-            return features.mean(1)
-        weights = (self.score(features).squeeze(2) + self.age).softmax(dim=1)
-        return (weights.unsqueeze(2) * features).sum(1)
+            return maps.mean(1)
+        weights = self._weights(self.trunk(each).unflatten(0, (-1, self.frames)))
+        return (weights[:, :, None, None] * maps).sum(1)
+
+    def _each(self, images: Tensor) -> Tensor:
+        return images.unflatten(1, (self.frames, -1)).flatten(0, 1)
+
+    def _weights(self, features: Tensor) -> Tensor:
+        assert self.score is not None
+        return (self.score(features).squeeze(2) + self.age).softmax(dim=1)
+
+
+def last_map(trunk: nn.Module, images: Tensor) -> Tensor:
+    """The places of a trunk's last feature map, before pooling: [B, C, H, W] to [B, P, D].
+
+    Maps larger than 7 x 7 places are averaged to 7 x 7. Tokens that are no place (class, registers) are kept, in front.
+    """
+    if not hasattr(trunk, "forward_features"):
+        return trunk.last_map(images)  # type: ignore[operator]
+    found = trunk.forward_features(images)  # type: ignore[operator]
+    if found.ndim == 3:  # [B, tokens, D]
+        front = int(getattr(trunk, "num_prefix_tokens", 0))
+        side = math.isqrt(found.shape[1] - front)
+        if side <= MAP_SIDE or side * side != found.shape[1] - front:
+            return found
+        grid = found[:, front:].mT.unflatten(2, (side, side))
+        return torch.cat([found[:, :front], F.adaptive_avg_pool2d(grid, MAP_SIDE).flatten(2).mT], dim=1)
+    if found.shape[1] != num_features(trunk) == found.shape[3]:
+        found = found.permute(0, 3, 1, 2)  # timm's Swin has channels last
+    height, width = (min(side, MAP_SIDE) for side in found.shape[2:])
+    return F.adaptive_avg_pool2d(found, (height, width)).flatten(2).mT
 
 
 def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:

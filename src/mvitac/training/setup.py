@@ -24,7 +24,7 @@ from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
 from mvitac.training.step import Step
-from mvitac.training.views import gel_mirror
+from mvitac.training.views import gel_mirror, values_of
 from mvitac.transforms.gel_flip import GelMirror
 
 
@@ -183,6 +183,7 @@ def _build_method(run: Run, pack: Pack, rows: np.ndarray, device: torch.device, 
     torch.manual_seed(run.seed)
     method = run.method.build(pack.spec, run.encoder)
     method.prepare(torch.from_numpy(rows))
+    method.learn_scale(values_of(run, pack, rows))
     shard_banks(method, world)
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _check_image_size(method, run, pack)

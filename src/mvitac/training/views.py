@@ -109,4 +109,11 @@ def make_views(
         t.name: torch.from_numpy(pack.labels(t.name, *run.method.label_splits)[rows]).to(device)
         for t in pack.spec.tasks
     }
-    return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device))
+    values = {task: value.to(device) for task, value in values_of(run, pack, rows).items()}
+    return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device), values=values)
+
+
+def values_of(run: Run, pack: Pack, rows: np.ndarray) -> dict[str, Tensor]:
+    """``Views.values`` of pack rows [B]: NaN also where the method may not read them."""
+    splits = run.method.label_splits
+    return {task.name: torch.from_numpy(pack.values(task, *splits)[rows]).float() for task in pack.spec.values}

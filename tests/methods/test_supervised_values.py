@@ -1,0 +1,110 @@
+"""The supervised methods on tasks with values: standardised targets, missing values, scores in the unit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from sklearn.metrics import mean_absolute_error
+
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.probe import probe_model, split_rows
+from mvitac.methods.base import Views
+from mvitac.methods.calandra import CalandraConfig
+from mvitac.methods.supervised import SupervisedConfig, ValueHead
+from mvitac.model import load
+from mvitac.run import Optim
+from mvitac.training.loop import train
+from mvitac.training.views import values_of
+from support.small_methods import TINY
+from support.toy import Toy
+from support.training_runs import smoke
+
+NAN = float("nan")
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Toy(values=True), tmp_path_factory.mktemp("measured") / "pack", size=32, workers=1, quiet=True)
+
+
+def test_loss_is_smooth_l1_of_standardised_values_that_were_measured() -> None:
+    head = ValueHead(torch.nn.Linear(3, 2), 2)
+    values = torch.tensor([[1000.0, 0.1], [3000.0, NAN], [NAN, 0.3], [5000.0, 0.2]])
+    head.learn_scale(values)
+    assert head.mean.tolist() == pytest.approx([3000, 0.2])
+    assert head.std.tolist() == pytest.approx([np.std([1000, 3000, 5000]), np.std([0.1, 0.3, 0.2])])
+    x = torch.randn(4, 3, requires_grad=True)
+    error = (head(x) - values) / head.std
+    measured = error[~values.isnan()]
+    expected = F.smooth_l1_loss(measured, torch.zeros_like(measured))
+    torch.testing.assert_close(head.loss(x, values), expected, rtol=1e-4, atol=1e-4)
+    (gradient,) = torch.autograd.grad(head.loss(x, values), x)
+    assert gradient.isfinite().all() and gradient.any(1).all()
+    assert head.loss(x, torch.full((4, 2), NAN)) == 0
+
+
+@pytest.mark.parametrize("config", [SupervisedConfig, CalandraConfig])
+def test_classes_are_the_default_and_values_are_learned_by_name_or_alone(measured: Pack, config: type) -> None:
+    spec = measured.spec
+    assert list(config().build(spec, TINY).classifiers()) == ["pattern", "bright"]  # as before there were values
+    assert list(config().build(replace(spec, tasks=()), TINY).classifiers()) == ["light", "both"]
+    heads = config(tasks=("both", "pattern")).build(spec, TINY).classifiers()
+    assert {task: isinstance(head, ValueHead) for task, head in heads.items()} == {"both": True, "pattern": False}
+    with pytest.raises(ValueError, match="'x' is not in dataset 'toy': it has pattern, bright, light, both"):
+        config(tasks=("x",)).build(spec, TINY)
+    with pytest.raises(ValueError, match="no labels and no values"):
+        config().build(replace(spec, tasks=(), values=()), TINY)
+
+
+def test_values_are_learned_from_the_rows_that_probes_are_fitted_on(measured: Pack) -> None:
+    both = measured.spec.values[1]
+    weight = replace(both, name="weight", targets=both.targets[1:])
+    measured.spec = replace(measured.spec, values=(*measured.spec.values[:2], weight))
+    method = SupervisedConfig(tasks=("weight",))
+    rows = method.training_rows(measured)
+    assert set(rows) == set(split_rows(measured, weight).fitted) and 0 < len(rows) < measured.num
+    everything = np.arange(measured.num)
+    for labels, splits in (("train", ["train"]), ("train-and-val", ["train", "val"])):
+        run = smoke(measured, method=SupervisedConfig(labels=labels))  # type: ignore[arg-type]
+        given = values_of(run, measured, everything)["light"][:, 0]
+        assert np.array_equal(~given.isnan().numpy(), np.isin(measured.column("split"), splits))
+
+
+def test_the_own_head_is_trained_and_scored_in_the_unit(measured: Pack, tmp_path: Path) -> None:
+    run = smoke(measured, steps=40, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=3e-3))
+    run = replace(run, method=SupervisedConfig(tasks=("both", "pattern")))
+    model = load(train(run, tmp_path / "run", quiet=True))
+    both = measured.spec.values[1]
+    rows = split_rows(measured, both).test
+    z = {m: pack_features(model, measured, m, rows) for m in ("vision", "touch")}
+    guess, true = model.estimate("both", z).numpy(), measured.values(both)[rows]
+    records = probe_model(model, measured, measured.spec.all_tasks, ["both"], [])
+    own = {r["task"]: r for r in records if r["probe"] == "own"}
+    assert set(own) == {"pattern", "both"}  # what it learned
+    assert own["pattern"]["accuracy"] > 0.7
+    for t, found in enumerate(own["both"]["targets"]):
+        have = ~np.isnan(true[:, t])
+        assert found["mae"] == pytest.approx(mean_absolute_error(true[have, t], guess[have, t]), rel=1e-4)
+        assert found["r2"] > 0.5
+    # A pack with the targets in another order, and one whose unit differs.
+    turned = replace(both, targets=both.targets[::-1])
+    record = next(r for r in probe_model(model, measured, [turned], ["both"], []) if r["probe"] == "own")
+    assert [found["r2"] for found in record["targets"]] == pytest.approx(
+        [f["r2"] for f in own["both"]["targets"]][::-1]
+    )
+    other = replace(both, targets=tuple(replace(target, unit="kN") for target in both.targets))
+    assert not probe_model(model, measured, [other], ["both"], [])
+
+
+def test_one_batch_without_a_value_and_one_without_a_label(measured: Pack) -> None:
+    method = SupervisedConfig(tasks=("light", "pattern")).build(measured.spec, TINY)
+    images = {m: [torch.randn(4, 3, 32, 32)] for m in ("vision", "touch")}
+    batch = Views(images, {"pattern": torch.full((4,), -1)}, torch.arange(4), {"light": torch.full((4, 1), NAN)})
+    assert {name: loss.item() for name, loss in method(batch).items()} == {"loss": 0, "light": 0, "pattern": 0}
