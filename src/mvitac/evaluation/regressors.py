@@ -57,6 +57,7 @@ Fitted = tuple[Any, float, float]
 
 
 def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, basis: Callable[[], list[Any]]) -> list[Fitted]:
+    x = x.astype(np.float64)  # in float32 the normal equations of correlated features are ill-conditioned
     held = np.where(np.arange(len(x)) < len(x) - num_val, -1, 0)  # -1: always fitted on, 0: held out
     fitted = []
     for target in y.T:
