@@ -201,7 +201,10 @@ def main(argv: list[str] | None = None) -> int:
             path.mkdir()
         if child(lambda: prepare(base), said := Path(folder) / "said"):
             raise RuntimeError(said.read_text())
-        for words in (f"export {base}/run --format onnx --rows 4 --out {base}/export", f"index {base}/pack --model {base}/run --out {base}/index"):
+        for words in (
+            f"export {base}/run --format onnx --rows 4 --out {base}/export",
+            f"index {base}/pack --model {base}/run --out {base}/index",
+        ):
             if child(lambda words=words: mvitac(words.split()), said):  # type: ignore[misc]
                 raise RuntimeError(said.read_text())
         made = [one for name in chosen.commands for one in calls(name, base, out)]
