@@ -57,7 +57,23 @@ COMMANDS = {**WRITING, **READING}
 """One call of each command that works; ``base`` holds its inputs."""
 SERVES = ("live", "explore")
 MODULES = (*SLOW, "mvitac.report.explorer", "mvitac.deploy.export", "mvitac.deploy.search", "torch.onnx")
-WORDS = "nan inf -inf -1 0 0.5 1e400 99999999999999999999 None [] null ~nobody ../x - --".split()
+WORDS = [
+    "nan",
+    "inf",
+    "-inf",
+    "-1",
+    "0",
+    "0.5",
+    "1e400",
+    "99999999999999999999",
+    "None",
+    "[]",
+    "null",
+    "~nobody",
+    "../x",
+    "-",
+    "--",
+]
 ODD = [
     *WORDS,
     "",

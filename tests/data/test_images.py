@@ -78,7 +78,7 @@ def test_a_jpeg_without_its_end_is_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for kept in (len(whole) // 2, len(whole) - 2):
         path.write_bytes(whole[:kept] + bytes(len(whole) - kept))
-        with pytest.raises(ValueError, match="touch.jpg cannot be read as an image .its end is missing"):
+        with pytest.raises(ValueError, match=r"touch.jpg cannot be read as an image .its end is missing"):
             decode(path)
     path.write_bytes(whole + b"trailer")
     assert decode(path).size == (64, 64)
