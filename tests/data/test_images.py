@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 
 from mvitac.cli.search import _picture
 from mvitac.data.build import build
-from mvitac.data.images import fit
+from mvitac.data.images import decode, fit
 from mvitac.datasets.folder import FolderConfig
 from mvitac.live.cameras import Folder
 from mvitac.transforms.preprocess import to_array
@@ -68,3 +68,17 @@ def test_find_does_not_stack_sensors_of_two_sizes(tmp_path: Path) -> None:
     Image.new("RGB", (8, 9)).save(tmp_path / "right.png")
     with pytest.raises(ValueError, match=r"left.png is 8 x 8, .*right.png is 8 x 9: stacked sensors need one size"):
         _picture([tmp_path / "left.png", tmp_path / "right.png"])
+
+
+def test_a_jpeg_without_its_end_is_refused(tmp_path: Path) -> None:
+    """Pillow shows zeros after half of the file as gray. An end marker inside a comment is none; a trailer is allowed."""
+    path = tmp_path / "touch.jpg"
+    rgb = np.random.default_rng(5).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(rgb).save(path, comment=b"\xff\xd9")
+    whole = path.read_bytes()
+    for kept in (len(whole) // 2, len(whole) - 2):
+        path.write_bytes(whole[:kept] + bytes(len(whole) - kept))
+        with pytest.raises(ValueError, match=r"touch.jpg cannot be read as an image .its end is missing"):
+            decode(path)
+    path.write_bytes(whole + b"trailer")
+    assert decode(path).size == (64, 64)

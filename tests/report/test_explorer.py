@@ -365,8 +365,10 @@ REFUSED: list[tuple[dict[str, str], int]] = [
     ({**LISTENING, "origin": "http://evil.example"}, 403),
     ({**LISTENING, "origin": "http://127.0.0.1:8000"}, 403),  # another page of this machine
     ({**LISTENING, "origin": "null"}, 403),
+    ({**LISTENING, "origin": "http://["}, 403),
     ({**LISTENING, "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, 403),
     ({**LISTENING, "content-length": str((20 << 20) + 1)}, 413),
+    ({**LISTENING, "transfer-encoding": "chunked"}, 411),  # of any length
 ]
 
 
@@ -395,6 +397,7 @@ def test_the_running_server_refuses_rebinding_and_large_uploads(artifact: Path, 
         assert cross.status_code == 403 and "access-control-allow-origin" not in cross.headers
         files = {"files": ("big.png", bytes(MAX_BODY + 1))}
         assert httpx.post(f"{address}gradio_api/upload", files=files).status_code == 413
+        assert httpx.post(f"{address}gradio_api/upload", content=iter([b"chunk"])).status_code == 411
 
 
 def test_labels_are_text_in_markdown() -> None:

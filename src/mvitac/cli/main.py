@@ -72,6 +72,8 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 
+LEAST_MEMORY = 1 << 30
+"""Bytes of address space that any command needs."""
 _NO_MEMORY = (
     "out of memory|can't allocate memory|cannot allocate memory|failed to map segment|can't start new thread"
     "|std::bad_alloc"
@@ -138,6 +140,7 @@ def _run(arguments: list[str]) -> int:
 
         raise unknown("command", name, COMMANDS)
     module, function = COMMANDS[name].split(":")
+    _check_memory()
     return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(rest) or 0
 
 
@@ -161,6 +164,19 @@ def _wait_briefly() -> None:
     """
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
         os.environ["GOMP_SPINCOUNT"] = "10000"
+
+
+def _check_memory() -> None:
+    """ValueError if the shell allows too little address space; OpenBLAS would then try to allocate for ever."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < LEAST_MEMORY:
+        raise ValueError(
+            f"{limit >> 20} MB of memory are allowed (ulimit -v), at least {LEAST_MEMORY >> 20} are needed: raise the limit"
+        )
 
 
 def _check_once(argv: Sequence[str]) -> None:

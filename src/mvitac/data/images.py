@@ -44,6 +44,8 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
             # A camera's MPO has a second image after the photo; GIF and TIFF stacks are refused.
             if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
                 raise ValueError(f"it holds {getattr(image, 'n_frames', 0)} frames, not one: store one image per row")
+            if image.format in ("JPEG", "MPO"):
+                _check_end(image)
             image.load()
             return to_rgb(image)
     except FileNotFoundError:
@@ -53,6 +55,20 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
         raise ValueError(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from None
     except Image.DecompressionBombError as error:
         raise ValueError(f"{name} is too large ({error})") from None
+
+
+def _check_end(image: Image.Image) -> None:
+    """ValueError if a JPEG ends without its end marker: it is cut off, or its end was overwritten by zeros.
+
+    libjpeg decodes zeros as gray, with a warning that Pillow does not show. Bytes after the marker are allowed.
+    """
+    file: BinaryIO = image.fp  # type: ignore[attr-defined]
+    file.seek(0)
+    data, at = file.read(), 2
+    while 0 < at < len(data) - 4 and data[at + 1] != 0xDA:  # segments before the pixels, such as a thumbnail
+        at = at + 1 if data[at + 1] == 0xFF else at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    if data.find(b"\xff\xd9", at) < 0:
+        raise ValueError("its end is missing: it was not copied completely")
 
 
 def to_rgb(image: Image.Image) -> Image.Image:

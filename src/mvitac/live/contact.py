@@ -70,6 +70,7 @@ class Contact:
             if len(self.first) < self.config.calibration:
                 return None
             frames = np.stack([small for small, _ in self.first])
+            frames = frames[1 - len(frames) % 2 :]  # an odd number: contact in exactly half would pass for noise
             pictures = [whole for _, whole in self.first if whole is not None]
             self.first = []
             middle = np.median(frames, axis=0)
