@@ -43,7 +43,7 @@ def windowed(pack: Pack, window: Window) -> Pack:
             raise unknown("modality of windows", modality, pack.spec.modalities)
     index, whole = frames_of(pack, window)
     made = copy.copy(pack)
-    made.spec = replace(pack.spec, window=replace(window, order=_places(pack, window)[0]))
+    made.spec = replace(pack.spec, window=replace(window, order=places(pack, window)[0]))
     made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
     first = _first_rows(pack, window) if window.minus_first else None
     made.images = {m: Windows(pack.images[m], index, first) if m in window.of else pack.images[m] for m in pack.images}
