@@ -102,7 +102,7 @@ def _controls(land: ExplorerData) -> list[Any]:
         return [
             gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of", min_width=120),
             gr.Dropdown(
-                [("label or value", "label"), "error", "split"],
+                ["label", "error", "split"],
                 value="label" if tasks else "split",
                 label="colour by",
                 min_width=120,
