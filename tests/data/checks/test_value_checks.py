@@ -175,6 +175,7 @@ def test_a_stretch_of_zeros_is_no_contact(healthy: Pack) -> None:
     pack.table = pack.table.set_column(at, "force_n", [force])
     assert "constant" not in value_checks.values(pack)[0].evidence
     force[:15] = 1
+    pack = Pack(healthy.path)
     pack.table = pack.table.set_column(at, "force_n", [force])
     assert "constant" in value_checks.values(pack)[0].evidence
 
