@@ -103,19 +103,9 @@ def probe_runs(
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:
         _check_weights(runs, session)
-    scored_rows = Scored(pack)
     sources = check_unseen(paths, models, pack, tasks, allow_leak=allow_leak)
-    records: Records = []
-    retrieval: Records = []
-    num = len(models) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
-    with work("fitting probes", num, "probes"):
-        scored = in_threads(
-            lambda each: _probe_run(*each, scored_rows, tasks, modalities, session),
-            list(zip(paths, models, names, sources, strict=True)),
-        )
-    for own, found in scored:
-        records += own
-        retrieval += found
+    each = list(zip(paths, models, names, sources, strict=True))
+    records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     if session.controls:
         specs = [m.spec for m in models]
         controls, found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
@@ -138,6 +128,21 @@ def probe_runs(
     for path in paths:
         write_json(path / "probe.json", result)
     return result
+
+
+def _probe_models(
+    each: Sequence[tuple[Path, Model, str, list[Source] | None]],
+    pack: Pack,
+    tasks: Sequence[AnyTask],
+    modalities: Sequence[str],
+    session: ProbeConfig,
+) -> tuple[Records, Records]:
+    """Probe and retrieval records of runs, given as folder, model, name and what it learned from."""
+    rows = Scored(pack)
+    num = len(each) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
+    with work("fitting probes", num, "probes"):
+        scored = in_threads(lambda one: _probe_run(*one, rows, tasks, modalities, session), list(each))
+    return [r for own, _ in scored for r in own], [r for _, found in scored for r in found]
 
 
 def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:

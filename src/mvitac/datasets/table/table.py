@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import tyro
 
 from mvitac.data.source import Lost, Sample, Source, one_stamp
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import DataSpec, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.table.columns import (
     Grouping,
@@ -228,19 +228,29 @@ class Rows(Source):
             one_stamp((*stamps[ref.path], *ref.within()) for i in item for ref in self._rows[i].refs())
             for item in self._items
         ]
-        by_video = grouping.group_by == "video"
-        self._spec = DataSpec(
+        tasks_with_classes = tuple(task for task, _ in read)
+        self._spec = self._describe(tasks_with_classes, tuple(value_tasks), grouping.group_by, controls)
+
+    def _describe(
+        self,
+        tasks: tuple[Task, ...],
+        values: tuple[ValueTask, ...],
+        group_by: str,
+        controls: dict[str, tuple[str, ...]],
+    ) -> DataSpec:
+        by_video = group_by == "video"
+        return DataSpec(
             name=self._title,
             vision_channels=3 if self._vision else 0,
             touch_channels=3 * len(self._touch),
-            tasks=tuple(task for task, _ in read),
-            values=tuple(value_tasks),
-            group_by=grouping.group_by,
+            tasks=tasks,
+            values=values,
+            group_by=group_by,
             controls=controls,
-            licence=config.licence,
-            source=config.source_url or "not given",
+            licence=self._config.licence,
+            source=self._config.source_url or "not given",
             notes=("no column says the groups, so frames of one video are one group",) if by_video else (),
-            difference=config.difference,
+            difference=self._config.difference,
         )
 
     def _select(self, manifest: Manifest) -> Selection:
