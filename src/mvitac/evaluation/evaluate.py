@@ -88,12 +88,7 @@ def probe_runs(
     _check_paths(paths)
     models = [load(path) for path in paths]
     names = names_of(paths, models)
-    packs = [pack or model.open_data() for model in models]
-    if len({p.digest for p in packs}) > 1:
-        raise ValueError(
-            "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
-        )
-    pack = packs[0]
+    pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
     for task in tasks:
@@ -128,6 +123,16 @@ def probe_runs(
     for path in paths:
         write_json(path / "probe.json", result)
     return result
+
+
+def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
+    """``pack``, or the data that all of ``models`` were trained on."""
+    packs = [pack or model.open_data() for model in models]
+    if len({p.digest for p in packs}) > 1:
+        raise ValueError(
+            "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
+        )
+    return packs[0]
 
 
 def _probe_models(
