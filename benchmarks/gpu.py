@@ -238,7 +238,8 @@ def compare_methods(session: Session, data: list[str]) -> None:
     folder, archive = session.work / "table", session.out / "runs.tar.gz"
     if archive.exists() and not folder.exists():
         with tarfile.open(archive) as tar:
-            tar.extractall(folder, filter="data")
+            tar.extraction_filter = getattr(tarfile, "data_filter", None)  # type: ignore  # not in Python 3.11.0 to 3.11.3
+            tar.extractall(folder)
     write_json(session.work / "plan.json", plan(session.size))
     given = ["mvitac", "compare", "--plan", str(session.work / "plan.json"), *data, "--out", str(folder)]
     given += ["--jobs", "1", "--device", session.device]

@@ -29,7 +29,8 @@ def old_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All archives, unpacked into the working folder: the runs name their packs relative to it."""
     for archive in sorted(OLD.glob("*.tar.xz")):
         with tarfile.open(archive) as opened:
-            opened.extractall(tmp_path, filter="data")
+            opened.extraction_filter = getattr(tarfile, "data_filter", None)  # type: ignore  # not in 3.11.0 to 3.11.3
+            opened.extractall(tmp_path)
     monkeypatch.chdir(tmp_path)
 
 
