@@ -21,7 +21,8 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.evaluation.controls import borders, thumbnails
 from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import probe_features, split_rows
-from mvitac.evaluation.scores import interval, percent, pool, with_interval
+from mvitac.evaluation.score_text import percent, with_interval
+from mvitac.evaluation.scores import interval, pool
 from mvitac.model import fresh
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe

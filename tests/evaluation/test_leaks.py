@@ -18,7 +18,8 @@ from mvitac.data.source import Sample
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.leaks import FILE, Scored, leaks_of, read_sources, source_of, write_sources
-from mvitac.evaluation.scores import pool, summarise, with_interval
+from mvitac.evaluation.score_text import with_interval
+from mvitac.evaluation.scores import pool, summarise
 from mvitac.report.report import write_report
 from mvitac.report.tables import unseen_groups
 from mvitac.run import load_run

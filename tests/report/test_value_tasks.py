@@ -27,7 +27,8 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.robustness import DROPOUT, LEAK, NOISE, SHARES, stress
-from mvitac.evaluation.scores import cell_text, summarise, summarise_again
+from mvitac.evaluation.score_text import cell_text
+from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.experiments import table_formats
 from mvitac.experiments.plan import Plan, Row
 from mvitac.experiments.table import lines_of, target_lines

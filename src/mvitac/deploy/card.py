@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from mvitac.evaluation.scores import cell_text, columns_of, covered, score_name, sources_of, tested_on
+from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ValueInfo
 

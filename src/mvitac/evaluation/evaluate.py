@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -91,9 +92,8 @@ def probe_runs(
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
-    for task in tasks:
-        for modality in modalities:
-            split_rows(pack, task, modality)
+    for task, modality in product(tasks, modalities):
+        split_rows(pack, task, modality)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:
@@ -103,9 +103,8 @@ def probe_runs(
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     if session.controls:
         specs = [m.spec for m in models]
-        controls, found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
-        records += controls
-        retrieval += found
+        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
+        records, retrieval = records + found[0], retrieval + found[1]
     result = {
         "data": pack.spec.name,
         "pack": pack.digest,

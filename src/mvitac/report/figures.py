@@ -26,7 +26,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from mvitac.evaluation.scores import percent
+from mvitac.evaluation.score_text import percent
 from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, colour
 
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")

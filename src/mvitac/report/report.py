@@ -17,7 +17,8 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import cross_modal, split_rows
-from mvitac.evaluation.scores import covered, percent, score_name, summarise, with_interval
+from mvitac.evaluation.score_text import covered, percent, score_name, with_interval
+from mvitac.evaluation.scores import summarise
 from mvitac.model import load
 from mvitac.registry import to_json
 from mvitac.report import galleries, score_sections, tables

@@ -6,19 +6,18 @@ from collections.abc import Sequence
 from typing import Any
 
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.scores import (
+from mvitac.evaluation.score_text import (
     MODALITY_ORDER,
-    by_cell,
     cell_text,
     columns_of,
     error_text,
     percent,
     score_name,
     sources_of,
-    summarise_again,
     tested_on,
     with_interval,
 )
+from mvitac.evaluation.scores import by_cell, summarise_again
 from mvitac.report import figures, html, tables, value_figures
 from mvitac.report.palette import MODALITY_HUES
 from mvitac.report.sections import WORDS, Study, headline

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.probe import MIN_GALLERY
-from mvitac.evaluation.scores import columns_of, interval, sources_of
+from mvitac.evaluation.score_text import columns_of, sources_of
+from mvitac.evaluation.scores import interval
 from mvitac.model import Model
 from mvitac.report import figures, html, tables
 from mvitac.report.figures import Line

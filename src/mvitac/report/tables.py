@@ -9,18 +9,17 @@ from rich.table import Table
 
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import VALUE_PROBES
-from mvitac.evaluation.scores import (
+from mvitac.evaluation.score_text import (
     cell_text,
     columns_of,
     covered,
     error_text,
-    interval,
-    leaks_in,
     percent,
     score_name,
     sources_of,
     tested_on,
 )
+from mvitac.evaluation.scores import interval, leaks_in
 from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
