@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from mvitac.system.terminal import plain_output
 
@@ -139,9 +140,21 @@ def _run(arguments: list[str]) -> int:
         from mvitac.registry import unknown
 
         raise unknown("command", name, COMMANDS)
+    text = help_file(name)
+    if rest in (["--help"], ["-h"]) and text.exists():
+        print(text.read_text(encoding="utf-8"), end="")
+        return 0
     module, function = COMMANDS[name].split(":")
     _check_memory()
     return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(rest) or 0
+
+
+def help_file(command: str) -> Path:
+    """The stored help of ``command``, 80 columns wide: it is printed at once, without importing torch.
+
+    The files are what each command says of itself (``tests/cli/test_help.py`` compares and writes them).
+    """
+    return Path(__file__).parent / "help" / f"{command.replace(' ', '-')}.txt"
 
 
 def _reader_left() -> bool:
