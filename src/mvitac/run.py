@@ -14,6 +14,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.initial import Init
 from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -91,6 +92,7 @@ class Run:
     method: MethodConfig = MViTacConfig()
     data: DatasetConfig
     encoder: EncoderConfig = EncoderConfig()
+    init: Init = field(default=Init(), metadata=LATER_IN_DIGEST)
     augment: Augment = Augment()
     optim: Optim = Optim()
     batch_size: int = 256
@@ -128,8 +130,8 @@ class Run:
     log_every: int = 10
     """Steps between log lines. Each also checks that the loss is finite."""
     eval_every: int = 0
-    """Steps between evaluations (kNN scores, signs of collapse) on held-out groups (split val, never test). 0 = only at the
-    end."""
+    """Steps between evaluations (linear probes, kNN, signs of collapse) on held-out groups (split val, never test). The
+    weights that are best there are kept as model.best.safetensors. 0 = only at the start and the end."""
     checkpoint_every: int = 0
     """Steps between checkpoints. 0 = about every tenth of the run."""
 
@@ -216,8 +218,9 @@ class Run:
         return replace(self, recipe="", method=self.method.without_idle(spec), augment=replace(self.augment, **unseen))
 
     def digest(self) -> str:
-        """Content address of all settings that decide the outcome."""
-        value = to_json(self, for_digest=True)
+        """Content address of all settings that decide the outcome. Start weights count by content, not by path."""
+        init = self.init if self.init.digest else self.init.resolved()
+        value = to_json(replace(self, init=replace(init, path=None)), for_digest=True)
         for name in NOT_IN_DIGEST:
             del value[name]
         for name in self.data.without_effect:

@@ -15,7 +15,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
-from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import (
     PROBES,
     Probe,
@@ -28,7 +28,7 @@ from mvitac.evaluation.probe import (
 )
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
-from mvitac.model import Model, load
+from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run
@@ -104,7 +104,12 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
 
 
 def probe_runs(
-    paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None, *, allow_leak: bool = False
+    paths: Sequence[Path],
+    session: ProbeConfig,
+    pack: Pack | None = None,
+    *,
+    allow_leak: bool = False,
+    weights: Which = "last",
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
@@ -117,6 +122,7 @@ def probe_runs(
         session: What to probe.
         pack: Other data to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
+        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
@@ -128,8 +134,8 @@ def probe_runs(
             trained on rows or groups that other data than its own would score.
     """
     _check_paths(paths)
-    models = [load(path) for path in paths]
-    names = names_of(paths, models)
+    models = [load(path, weights) for path in paths]
+    names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
@@ -146,23 +152,23 @@ def probe_runs(
         specs = [m.spec for m in models]
         found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
         records, retrieval = records + found[0], retrieval + found[1]
-    result = Scores(
-        data=pack.spec.name,
-        pack=pack.digest,
-        asked=to_json(session),
-        models=_digests(paths),
-        group_by=pack.spec.group_by,
-        notes=list(pack.spec.notes),
-        leaks=leaks_of([*records, *retrieval]),
-        classes={task.name: list(task.classes) for task in with_classes(tasks)},
-        targets={task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
-        records=records,
-        retrieval=retrieval,
-        summary=summarise(records, session.probes[0]),
-    )
+    result = {
+        "data": pack.spec.name,
+        "pack": pack.digest,
+        "asked": to_json(session),
+        "models": _digests(paths, weights),
+        "group_by": pack.spec.group_by,
+        "notes": list(pack.spec.notes),
+        "leaks": leaks_of([*records, *retrieval]),
+        "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
+        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
+        "records": records,
+        "retrieval": retrieval,
+        "summary": summarise(records, session.probes[0]),
+    }
     for path in paths:
-        write_json(path / "probe.json", result)
-    return result
+        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
+    return Scores(result)
 
 
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
@@ -206,9 +212,9 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
     return result if same and whole and scored == {path.resolve() for path in paths} else None
 
 
-def _digests(paths: Sequence[Path]) -> list[str]:
+def _digests(paths: Sequence[Path], weights: Which = "last") -> list[str]:
     """Digests of the weights of finished runs, sorted."""
-    return sorted(digest_file(path / "model.safetensors") for path in paths)
+    return sorted(digest_file(weights_file(path, weights)) for path in paths)
 
 
 def _check_paths(paths: Sequence[Path]) -> None:
@@ -239,15 +245,16 @@ def check_unseen(
     """What each run at ``paths`` learned from; None where that is not known.
 
     Raises:
-        ValueError: If a run saw what other data than its own would score. In its own data the split was chosen, so the
-            scores only say LEAK.
+        ValueError: If a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
+            its own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
     for path, model in zip(paths, models, strict=True):
         digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
         sources.append(learned := read_sources(path, model.run, digest, pack))
-        for task in tasks if learned is not None and digest != pack.digest and not allow_leak else ():
-            if leak := scored.leak(learned, split_rows(pack, task).test):
+        refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
+        for task in tasks if refused else ():
+            if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 raise ValueError(
                     f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}; give a pack whose test"
                     " groups it was not trained on, or --allow-leak to score it with LEAK beside every score"

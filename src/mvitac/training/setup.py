@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.leaks import FILE, source_of, write_sources
+from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
 from mvitac.methods.base import Method
 from mvitac.model import Model, load
 from mvitac.nn.memory_bank import replicated, shard_banks
@@ -23,6 +24,8 @@ from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
+from mvitac.training.start import Start, load_start, read_start, warning
+from mvitac.training.start import describe as describe_start
 from mvitac.training.step import Step
 from mvitac.training.views import gel_mirror, values_of
 from mvitac.transforms.gel_flip import GelMirror
@@ -47,6 +50,8 @@ class Setup:
     start: int
     """Number of steps that are already done."""
     num_steps: int
+    kept: dict[str, Any]
+    """State of validation (``Validation``)."""
 
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
@@ -55,6 +60,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     Returns:
         The set-up, or None if the run in ``out`` is already finished.
     """
+    asked = replace(asked, init=asked.init.resolved())
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
     pack = open_pack(run.data, world, quiet) if pack is None else pack
@@ -71,19 +77,28 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
             return None
         _check_precision(begun, asked, run, out)
 
-    method = _build_method(run, pack, rows, device, world)
+    start_weights = read_start(run.init, pack)
+    method, taken = _build_method(run, pack, rows, device, world, start_weights)
     step = Step(run, method, device, world)
     num_steps = run.num_steps(len(rows))
-    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world)
+    kept: dict[str, Any] = {}
+    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
     if not resumed and world.writes:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
         here = {"device": describe(device), "precision": run.precision}
+        if start_weights:
+            record |= {"start": taken}
+            for line in [] if quiet else [describe_start(taken)]:
+                print(f"mvitac: {line}", file=sys.stderr)
+            if found := warning(start_weights, pack):
+                print(f"mvitac: warning: {found}", file=sys.stderr)
         write_json(out / "run.json", {**record, **here, **provenance()})
     if world.writes and not (out / FILE).exists():
-        write_sources(out, [source_of(pack, rows)])
-    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps)
+        own = source_of(pack, rows)
+        write_sources(out, with_ancestors(own, start_weights.sources if start_weights else []))
+    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept)
 
 
 def check_out(out: Path, resume: bool) -> None:
@@ -176,19 +191,22 @@ def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
     return pack
 
 
-def _build_method(run: Run, pack: Pack, rows: np.ndarray, device: torch.device, world: World) -> Method:
-    """The method of ``run`` with fresh weights, on ``device``."""
+def _build_method(
+    run: Run, pack: Pack, rows: np.ndarray, device: torch.device, world: World, start: Start | None
+) -> tuple[Method, dict[str, Any]]:
+    """The method of ``run`` with fresh or start weights, on ``device``, and what was taken of ``start``."""
     if device.type == "cpu":
         keep_freed_memory()
     torch.manual_seed(run.seed)
     method = run.method.build(pack.spec, run.encoder)
+    taken = load_start(start, method) if start else {}
     method.prepare(torch.from_numpy(rows))
     method.learn_scale(values_of(run, pack, rows))
     shard_banks(method, world)
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _check_image_size(method, run, pack)
     synchronise_norms(method, world)
-    return method
+    return method, taken
 
 
 @torch.no_grad()
