@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features
@@ -14,8 +15,16 @@ from mvitac.run import Run
 NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
 
 
-@torch.no_grad()
 def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
+    """Scores as of ``evaluate_pack``; of a mix, those of each part, named "<part> <name>"."""
+    if not isinstance(pack, MixedPack):
+        return evaluate_pack(model, pack, run)
+    parts = {name: evaluate_pack(model, pack.alone(name), run) for name in pack.parts}
+    return {f"{part} {name}": value for part, values in parts.items() for name, value in values.items()}
+
+
+@torch.no_grad()
+def evaluate_pack(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """Scores on held-out groups (split val, never test). Only rows with both modalities are used.
 
     Without rows of val that are not trained on, the scores are computed on training rows, and there is no kNN accuracy.
@@ -29,14 +38,14 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     val_rows = np.setdiff1d(pack.rows("val", having=modalities), run.method.training_rows(pack))
     held_out = len(val_rows) > 1
     rows = _sample(pack, val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
-    z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders}
+    z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders if m in modalities}
     values: dict[str, float] = {}
     for modality, features in z.items():
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
     if held_out:
         values |= _knn(model, pack, run, train_rows, rows, z)
-    if len(model.projectors) == 2:
+    if len(model.projectors) == len(z) == 2:
         values |= _shared_space(model, pack, run, rows, z)
     return values
 
@@ -51,7 +60,7 @@ def _knn(
 ) -> dict[str, float]:
     """kNN accuracy of each task on ``rows``, whose features are ``z``; neighbours are ``train_rows``."""
     values = {}
-    bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in model.encoders}
+    bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in z}
     for task in pack.spec.tasks:
         known = torch.from_numpy(pack.labels(task.name, "train"))[train_rows]
         asked = torch.from_numpy(pack.labels(task.name, "val"))[rows]
