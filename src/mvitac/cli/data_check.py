@@ -12,7 +12,7 @@ from rich.text import Text
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json, selectors, short
-from mvitac.data.checks.examine import examine_pack, examine_source
+from mvitac.data.checks.examine import examine_open, examine_pack, examine_source
 from mvitac.data.checks.finding import exit_code
 from mvitac.data.image_grid import Block, draw
 from mvitac.data.spec import Window
@@ -79,6 +79,8 @@ def check(argv: list[str]) -> int:
     if options.items < 0:
         raise ValueError(f"--items {options.items}: give the number of items to read, 0 for all")
     data: Any = options.data
+    if data.is_pack:
+        return _report(name, *examine_open(replace(data, num_frames=1).open(quiet=True), data.frame_window()), options)
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     findings, blocks = examine_source(

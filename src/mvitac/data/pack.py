@@ -15,8 +15,9 @@ from __future__ import annotations
 import functools
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -56,6 +57,8 @@ class Pack:
     format: ClassVar[str] = FORMAT
     window: int = 0
     """Number of shards whose rows training mixes at a time; 0 = all rows (shards: ``data/streaming.py``)."""
+    parts: Mapping[str, Pack] = MappingProxyType({})
+    """Name -> pack, for several packs that are opened as one (``data/mixed_pack.py``)."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
         """Open and check the pack at ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""
@@ -174,6 +177,11 @@ class Pack:
         """Return bool [N]: which rows have an image of ``modality``. The images of the others are zeros: do not use them."""
         name = f"has_{modality}"
         return self.column(name) if name in self.table.column_names else np.ones(self.num, bool)
+
+    @functools.cached_property
+    def whole(self) -> np.ndarray:
+        """bool [N], rows with an image of every modality of their dataset."""
+        return np.logical_and.reduce([self.has(modality) for modality in self.spec.modalities])
 
     def rows(
         self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = (), by: str = "split"

@@ -9,7 +9,6 @@ model. A source without rows stands for weights of which nothing says what they 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ import safetensors
 import safetensors.numpy
 
 from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import row_hashes
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.run import Run
@@ -44,7 +44,7 @@ class Source:
 
 def source_of(pack: Pack, rows: np.ndarray) -> Source:
     """The source that pack ``rows`` are."""
-    return Source(pack.spec.name, *(np.unique(found[rows]) for found in _hashes(pack)))
+    return Source(pack.spec.name, *(np.unique(found[rows]) for found in row_hashes(pack)))
 
 
 def unknown_source(name: str) -> Source:
@@ -121,7 +121,7 @@ class Scored:
     """The rows of a pack that are scored, to be compared with what models learned from."""
 
     def __init__(self, pack: Pack) -> None:
-        self.pack, (self._ids, self._groups) = pack, _hashes(pack)
+        self.pack, (self._ids, self._groups) = pack, row_hashes(pack)
 
     def leak(self, sources: Sequence[Source] | None, rows: np.ndarray) -> str:
         """Say which of the test ``rows``, and how many of their groups, are in ``sources``; "" if none is.
@@ -162,22 +162,3 @@ def leaks_of(records: Sequence[dict[str, Any]]) -> list[str]:
         elif record.get("leak"):
             lines[f"{record['source']}, {record.get('task') or 'retrieval'}: {record['leak']}"] = None
     return list(lines)
-
-
-def _hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
-    """uint64 [N] hashes of the ids and of the groups of all rows.
-
-    Numbers, and groups that are single rows, mean nothing outside their dataset: its name is part of them.
-    """
-    name = pack.spec.name.split(" (")[0]
-    ids, groups = pack.own_ids, pack.column("group").astype(str)
-    weak = pack.spec.group_by == "row"
-    return _hash(ids, name, False), _hash(groups, name, weak)
-
-
-def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:
-    unique, inverse = np.unique(texts, return_inverse=True)
-    named = (f"{name}/{text}" if weak or text.isdigit() else text for text in unique.tolist())
-    return np.array([int.from_bytes(hashlib.blake2b(t.encode(), digest_size=8).digest()) for t in named], np.uint64)[
-        inverse
-    ]

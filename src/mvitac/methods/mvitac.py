@@ -22,11 +22,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, row_pairs
 from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers, num_features, trunks
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum, momentum_at
@@ -42,6 +44,7 @@ class MViTacConfig(MethodConfig):
     """Momentum contrast within and across vision and touch. With one modality, only its intra-modal loss is used."""
 
     name: ClassVar[str] = "mvitac"
+    takes_missing: ClassVar[bool] = True
 
     temperature: float = 0.07
     """Temperature tau of InfoNCE. The paper compares .07, .2, .5 and 1; .07 is best."""
@@ -96,6 +99,12 @@ class MViTacConfig(MethodConfig):
     def both_ways(self) -> bool:
         """Whether each view is used as query and as key."""
         return self.symmetric or self.keys == "end-to-end"
+
+    def training_rows(self, pack: Pack) -> np.ndarray:
+        rows = super().training_rows(pack)
+        has = {modality: pack.has(modality)[rows] for modality in pack.spec.modalities}
+        parts = [PARTS[part] for part in self.losses if set(PARTS[part]) <= has.keys()]
+        return rows[np.any([has[x] & has[y] for x, y in parts], axis=0)] if parts else rows
 
     def without_idle(self, spec: DataSpec) -> Self:
         mine = replace(self, losses=tuple(part for part in possible_losses(spec) if part in self.losses))
@@ -163,16 +172,16 @@ class MViTac(Contrastive):
     def keys(self, batch: Views) -> Embeddings:
         """Eq. 5, 7, 10, 13. End-to-end keys are the queries themselves, so there is nothing to add."""
         views = (1, 0) if self.config.both_ways else (1,)
-        return embed("k", self.key, batch, views)
+        return embed("k", self.key, batch, views) | {("both", m): positions for m, positions in batch.both.items()}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         k = "q" if self.config.keys == "end-to-end" else "k"
         losses = {}
         for part, (x, y) in PARTS.items():
-            if x in self.query and y in self.query:
-                head = "intra" if x == y else "inter"
-                pairs = self.view_pairs(head)
-                terms = [info_nce(z["q", x, i, head], z[k, y, j, head], self.config.temperature) for i, j in pairs]
+            head = "intra" if x == y else "inter"
+            found = [row_pairs(z, x, y, ("q", x, i, head), (k, y, j, head)) for i, j in self.view_pairs(head)]
+            terms = [info_nce(*pair, self.config.temperature) for pair in found if pair]
+            if terms:
                 losses[part] = torch.stack(terms).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         minimised = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
@@ -209,7 +218,7 @@ def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...]
             z[name, modality, view, "intra"], z[name, modality, view, "inter"] = towers[modality](images)
         return z
 
-    branches = [partial(of, modality) for modality in towers]
+    branches = [partial(of, modality) for modality, _ in present(towers, batch)]
     if batch.rows.device.type != "cpu" or draws_random_numbers(towers):
         return {key: tensor for branch in branches for key, tensor in branch().items()}
     return in_branches(branches)

@@ -45,7 +45,10 @@ class LabelledConfig(MethodConfig):
         if self.labels == "train":
             rows = super().training_rows(pack)
         else:
-            rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in self.modalities_of(pack.spec)]))
+            modalities = self.modalities_of(pack.spec)
+            known = [pack.answered(task, *self.label_splits) for task in self.tasks_of(pack.spec)]
+            self.check_senses(pack, np.flatnonzero(pack.whole & np.any(known, axis=0)), modalities)
+            rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in modalities]))
         labelled = {t.name: pack.answered(t, *self.label_splits)[rows] for t in self.tasks_of(pack.spec)}
         for task, there in labelled.items():
             if not there.any():

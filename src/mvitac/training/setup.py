@@ -24,6 +24,7 @@ from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
+from mvitac.training.sampler import check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
 from mvitac.training.step import Step
@@ -70,6 +71,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)
     check_divisible(run, world)
+    check_mix(run, pack, rows, world)
     resumed = (out / "run.json").exists()
     if resumed:
         begun = check_same(asked, pack, out)

@@ -14,6 +14,7 @@ import torch
 from scipy.special import stdtrit
 from torch import Tensor
 
+from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
@@ -69,39 +70,52 @@ class Validation:
         return text
 
 
-@torch.no_grad()
 def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """Scores on held-out groups (split val, never test). Only rows with both modalities are used.
 
     Without rows of val that are not trained on, the scores are computed on training rows, and there are no probes.
 
     Returns:
-        name -> value, e.g. "touch/linear category", "touch/knn category", "vision/rankme", "vision->touch R@5".
+        name -> value, e.g. "touch/linear category", "touch/knn category", "vision/rankme", "vision->touch R@5". Of a mix,
+        the scores of each part, named "<part> <name>".
     """
     return validate(model, pack, run)[0]
 
 
-@torch.no_grad()
 def validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cells]:
     """Scores as of ``evaluate``, and the linear probes' errors by group, to compare two evaluations of one pack."""
+    if not isinstance(pack, MixedPack):
+        return _validate(model, pack, run)
+    values: dict[str, float] = {}
+    cells: Cells = {}
+    for part in pack.parts:
+        found = _validate(model, pack.alone(part), run)
+        values |= {f"{part} {name}": value for name, value in found[0].items()}
+        cells |= {f"{part} {name}": cell for name, cell in found[1].items()}
+    return values, cells
+
+
+@torch.no_grad()
+def _validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cells]:
+    """Scores and errors on ``pack`` alone."""
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
     modalities = pack.spec.modalities
     train_rows = _sample(pack, pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
     val_rows = np.setdiff1d(pack.rows("val", having=modalities), run.method.training_rows(pack))
     held_out = len(val_rows) > 1
     rows = _sample(pack, val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
-    z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders}
+    z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders if m in modalities}
     values: dict[str, float] = {}
     cells: Cells = {}
     for modality, features in z.items():
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
     if held_out:
-        bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in model.encoders}
+        bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in z}
         values |= _knn(pack, train_rows, rows, bank, z)
         cells = _linear(pack, train_rows, rows, bank, z)
         values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
-    if len(model.projectors) == 2:
+    if len(model.projectors) == len(z) == 2:
         values |= _shared_space(model, pack, run, rows, z)
     return values, cells
 
