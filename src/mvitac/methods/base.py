@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.registry import Registered
 
 Embeddings = dict[Hashable, Tensor]
@@ -36,6 +36,8 @@ class Views:
     """[B] int64, the row of each pair in its pack. Memory banks are indexed by it."""
     values: dict[str, Tensor] = field(default_factory=dict)
     """Task with values -> [B, T] float32 in the units of its targets, NaN = not measured. For supervised methods."""
+    seed: Tensor = field(default_factory=lambda: torch.tensor(0))
+    """Integer, a function of (seed, step), for what a method draws for each row, e.g. masks (``nn.vit.row_uniform``)."""
 
 
 class Method(nn.Module, ABC):
@@ -133,6 +135,8 @@ class MethodConfig(Registered, ABC):
 
     needs_pairs: ClassVar[bool] = False
     """Whether the method needs both modalities. If not, it also trains on vision or touch alone."""
+    needs_vit: ClassVar[bool] = False
+    """Whether the trunk must be a plain ViT."""
 
     def check_fields(
         self,
@@ -165,6 +169,11 @@ class MethodConfig(Registered, ABC):
         for name in width:
             if not 1 <= getattr(self, name) <= 65536:
                 raise ValueError(f"{name} {getattr(self, name)}: give 1 to 65536")
+
+    def on_tiny_trunk(self, spec: DataSpec, encoder: EncoderConfig) -> Method:
+        """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
+        trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
+        return self.build(spec, replace(encoder, trunk=trunk, weights=SCRATCH))
 
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
