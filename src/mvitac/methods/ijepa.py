@@ -12,7 +12,8 @@ still sees its own modality only. Windows: as channels of one image, or frame by
 
 Block sizes are drawn once per batch (per chunk, with ``--chunk``), places once per image, as in the authors' code. Different
 here, because masks are made on the device without waiting for it:
-- An image keeps its whole context; theirs is cut to the shortest of the batch. Absent tokens are hidden from attention.
+- Contexts have a fixed length, the (1 - .15)^4 of the image that 4 blocks leave on average: longer ones are cut at random,
+  the missing patches of shorter ones are hidden from attention. Theirs are cut to the shortest of the batch.
 - Of 8 draws, the first with ``min_context`` patches of context, else that with the most. Theirs draw until it fits, and let
   context and targets overlap if that takes long.
 - A block may touch the last row and column, and cover the whole image. Theirs are drawn one short of both.
@@ -144,14 +145,14 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
     device, num = rows.device, height * width
 
     # Sizes, the same for all images: [M + 1, 2], targets before context.
-    draws = row_uniform(seed, torch.zeros_like(rows[:1]), 3, 2 * stream)[0]
+    draws = row_uniform(seed, torch.full_like(rows[:1], -1), 3, 2 * stream)[0]
     ranges = (config.target_scale, config.target_aspect, config.context_scale)
     scale, aspect, context_scale = (low + (high - low) * u for (low, high), u in zip(ranges, draws, strict=True))
     side = block_sides(scale, aspect, grid)
     sides = torch.stack([side] * num_targets + [block_sides(context_scale, torch.ones_like(aspect), grid)])
 
     # Places: corners [B, TRIES, M + 1, 2], and which patches are inside [B, TRIES, M + 1, N].
-    u = row_uniform(seed, rows, TRIES * (num_targets + 1) * 2, 2 * stream + 1).view(-1, TRIES, num_targets + 1, 2)
+    u = row_uniform(seed, rows, TRIES * (num_targets + 1) * 2, 2 * stream).view(-1, TRIES, num_targets + 1, 2)
     last = torch.tensor(grid).to(device) - sides
     corner = (u * (last + 1)).floor().minimum(last)
     patch = torch.arange(num, device=device)
@@ -167,29 +168,16 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
     corner = corner[:, :, :-1].take_along_dim(best, 1)[:, 0].long()
 
     # Patch numbers, in arrays whose size depends on the config only.
-    (most_high, most_wide), fewest = _bounds(config, grid)
-    room = max(1, num - fewest)
-    order = (~context).int().argsort(dim=1, stable=True)[:, :room]
+    room = max(1, round(num * (1 - config.target_scale[0]) ** num_targets))
+    order = (context + row_uniform(seed, rows, num, 2 * stream + 1)).argsort(dim=1, descending=True)[:, :room]
     in_context = torch.arange(room, device=device) < context.sum(1, keepdim=True).clamp(min=1)
+    area, (low, high) = math.floor(config.target_scale[1] * num), config.target_aspect
+    most_high, most_wide = (min(grid[i], max(1, round(math.sqrt(area * (high, 1 / low)[i])))) for i in (0, 1))
     slot = torch.arange(most_high * most_wide, device=device)
     offset = torch.stack([slot // most_wide, slot % most_wide], dim=1)
     row, column = (corner[:, :, None] + offset).unbind(-1)
     targets = row.clamp(max=height - 1) * width + column.clamp(max=width - 1)
     return Blocks(order, in_context, targets, (offset < side).all(1).expand_as(targets))
-
-
-def _bounds(config: IJEPAConfig, grid: tuple[int, int]) -> tuple[tuple[int, int], int]:
-    """The largest height and width of a target block, and the least number of its patches."""
-    (height, width), (low, high) = grid, config.target_aspect
-    least, most = (math.floor(share * height * width) for share in config.target_scale)
-
-    def sides(patches: int, tall: float, wide: float) -> tuple[int, int]:
-        return (
-            min(height, max(1, round(math.sqrt(patches * tall)))),
-            min(width, max(1, round(math.sqrt(patches / wide)))),
-        )
-
-    return sides(most, high, low), math.prod(sides(least, low, high))
 
 
 class IJEPA(Contrastive):
