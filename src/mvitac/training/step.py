@@ -176,8 +176,9 @@ def _by_layer(config: Optim, method: Method, parameters: list[Tensor]) -> list[d
         trunk = encoder.trunk if isinstance(encoder, PerFrame) else encoder
         if not hasattr(trunk, "group_matcher"):
             raise ValueError(f"the trunk of {name} names no layers: leave out --optim.layer-decay")
+        # timm gives a trunk without its classifier's layer the full rate at the end; here the heads are that layer.
         for group in param_groups_layer_decay(trunk, layer_decay=config.layer_decay):
-            scales |= {id(p): group["lr_scale"] for p in group["params"]}
+            scales |= {id(p): config.layer_decay * group["lr_scale"] for p in group["params"]}
     groups: dict[tuple[float, bool], list[Tensor]] = {}
     for p in parameters:
         groups.setdefault((scales.get(id(p), 1.0), p.ndim > 1 or config.decay_norms), []).append(p)
