@@ -15,6 +15,7 @@ from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.nn.initial import Init
+from mvitac.nn.vit import check_vit
 from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -41,6 +42,9 @@ class Optim:
     """L2 penalty (adam, sgd) or decoupled weight decay (adamw). The paper gives none."""
     decay_norms: bool = field(default=True, metadata=LATER_IN_DIGEST)
     """Also decay biases and the parameters of BatchNorm. Current practice is not to."""
+    layer_decay: float = field(default=1.0, metadata=LATER_IN_DIGEST)
+    """Learning rate of each layer of a trunk relative to that of the next one, e.g. .65 to train a pretrained ViT further
+    (BEiT, MAE). 1 = the same for all. Heads have the full rate."""
     schedule: Literal["constant", "cosine", "step", "late-step"] = "constant"
     """constant; cosine, to zero; step, x0.9 every 10 epochs from epoch 10 on; or late-step, the same from epoch 20 on (the
     authors' StepLR, which is stepped from epoch 10 on). The paper gives none."""
@@ -56,6 +60,8 @@ class Optim:
             raise ValueError(f"optim eps {self.eps}: give a positive number")
         if not (self.weight_decay >= 0 and math.isfinite(self.weight_decay)):
             raise ValueError(f"optim weight_decay {self.weight_decay}: give a number >= 0")
+        if not 0 < self.layer_decay <= 1:
+            raise ValueError(f"optim layer_decay {self.layer_decay}: give a factor above 0, at most 1")
         if not 0 <= self.warmup < 1:
             raise ValueError(f"optim warmup {self.warmup}: give a fraction of the steps in [0, 1)")
 
@@ -200,6 +206,8 @@ class Run:
             raise ValueError(
                 "independent_sensors would move the frames of a window apart: leave it out, or give frames 1"
             )
+        if self.method.needs_vit:
+            check_vit(self.encoder, self.method.name, self.augment.size)
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 

@@ -94,7 +94,7 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
     own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
     run.check(own.spec, len(run.method.training_rows(own)), own.size)
     gel_mirror(run, own, torch.device("cpu"))
-    run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+    run.method.on_tiny_trunk(own.spec, run.encoder)
     return own, run.without_idle(own.spec).digest()
 
 
@@ -249,7 +249,7 @@ def forecast(work: Work, *, measure: bool = False) -> list[str]:
 
 def _images_per_pair(run: Run, pack: Pack) -> int:
     """Views of all modalities that a step reads for one pair."""
-    method = run.method.build(pack.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+    method = run.method.on_tiny_trunk(pack.spec, run.encoder)
     return method.views * len(method.encoders())
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.registry import Registered
 
 Embeddings = dict[Hashable, Tensor]
@@ -39,6 +39,8 @@ class Views:
     """Task with values -> [B, T] float32 in the units of its targets, NaN = not measured. For supervised methods."""
     both: dict[str, Tensor] = field(default_factory=dict)
     """Modality -> [P] int64, positions in its images of the rows that have both modalities, if some rows lack one."""
+    seed: Tensor = field(default_factory=lambda: torch.tensor(0))
+    """Integer, a function of (seed, step), for what a method draws for each row, e.g. masks (``nn.vit.row_uniform``)."""
 
 
 class Method(nn.Module, ABC):
@@ -155,6 +157,8 @@ class MethodConfig(Registered, ABC):
     """Whether the method needs both modalities. If not, it also trains on vision or touch alone."""
     takes_missing: ClassVar[bool] = False
     """Whether rows of a batch may lack a modality: they then have no part in the losses that need it."""
+    needs_vit: ClassVar[bool] = False
+    """Whether the trunk must be a plain ViT."""
 
     def check_fields(
         self,
@@ -187,6 +191,11 @@ class MethodConfig(Registered, ABC):
         for name in width:
             if not 1 <= getattr(self, name) <= 65536:
                 raise ValueError(f"{name} {getattr(self, name)}: give 1 to 65536")
+
+    def on_tiny_trunk(self, spec: DataSpec, encoder: EncoderConfig) -> Method:
+        """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
+        trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
+        return self.build(spec, replace(encoder, trunk=trunk, weights=SCRATCH))
 
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""

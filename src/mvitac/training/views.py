@@ -116,13 +116,8 @@ def make_views(
         for t in pack.spec.tasks
     }
     values = {task: value.to(device) for task, value in values_of(run, pack, rows).items()}
-    return Views(
-        images=images,
-        labels=labels,
-        rows=torch.from_numpy(rows).to(device),
-        values=values,
-        both=both,
-    )
+    at, seed = torch.from_numpy(rows).to(device), torch.tensor(generator.initial_seed()).to(device)
+    return Views(images=images, labels=labels, rows=at, values=values, both=both, seed=seed)
 
 
 def _some(sources: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:
