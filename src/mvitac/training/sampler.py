@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
+from mvitac.data.windows import places
 from mvitac.run import Run
 from mvitac.system.distributed import World
 
@@ -161,14 +162,19 @@ def shard_order(
 
 
 def partners(
-    pack: Pack, rows: np.ndarray, generator: torch.Generator, of: Literal["touch_groups", "presses"] = "touch_groups"
+    pack: Pack,
+    rows: np.ndarray,
+    generator: torch.Generator,
+    of: Literal["touch_groups", "presses"] = "touch_groups",
+    within: float = 0.0,
 ) -> np.ndarray:
     """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
-    A row without such others is its own partner.
+    With ``within``, its distance in time is at most that. A row without such others is its own partner.
     """
     groups: np.ndarray = getattr(pack, of)
     split, shards = pack.column("split"), pack.shards
+    place = places(pack, pack.spec.window)[1] if within else np.zeros(0)
     whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
@@ -176,6 +182,8 @@ def partners(
         others = pack.rows_of(int(groups[row]), of)
         others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         others = others[shards[others] == shards[row]]
+        if within:
+            others = others[abs(place[others] - place[row]) <= within + 1e-9]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found
