@@ -1,4 +1,4 @@
-"""Windows of 1, 2, 4 and 8 frames without training: pixels, motion and untrained trunks (docs/results/time.md).
+"""Windows of 1, 2, 4 and 8 frames, and slip as an event, without training (docs/results/time.md).
 
     python examples/real_manifests.py DATA MANIFESTS
     python examples/time_windows.py MANIFESTS slip_gsmini OUT.json
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,14 @@ import numpy as np
 import pyarrow as pa
 
 from mvitac.data.pack import Pack
+from mvitac.data.spec import Event
 from mvitac.datasets.folder import FolderConfig
 from mvitac.evaluation.controls import thumbnails
+from mvitac.evaluation.events import with_event
 from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import probe_features, split_rows
-from mvitac.evaluation.score_text import percent, with_interval
-from mvitac.evaluation.scores import interval, paired_difference, pool
+from mvitac.evaluation.score_text import lead_text, percent, with_interval
+from mvitac.evaluation.scores import event_of, interval, paired_difference, pool
 from mvitac.model import fresh
 from mvitac.recipes import recipe
 from mvitac.system.files import read_json, write_json
@@ -33,8 +35,13 @@ from mvitac.system.files import read_json, write_json
 SETS: dict[str, dict[str, Any]] = {
     "slip_gsmini": {
         "options": {"touch": ("left", "right"), "labels": ("slip",), "touch_group": "experiment"},
-        "columns": {"recording length": ("n_frames",), "place in the recording": ("seq",)},
+        "columns": {
+            "recording length": ("n_frames",),
+            "place in the recording": ("seq",),
+            "frames since the start": ("frame",),
+        },
         "folds": 3,
+        "event": Event(happens="1", clock="frame", fps=25.0),
     },
     "slip_grasp": {
         "options": {
@@ -45,11 +52,13 @@ SETS: dict[str, dict[str, Any]] = {
         },
         "columns": {"width": ("width_mm",), "width in sweep": ("width_in_sweep",)},
         "folds": 6,
+        "event": Event(happens="0"),
     },
     "physiclear": {
-        "options": {"touch": ("touch",), "labels": ("material", "hardness"), "touch_group": "video"},
+        "options": {"touch": ("touch",), "labels": ("material",), "touch_group": "video"},
         "columns": {"contact energy": ("contact_energy",)},
         "folds": 0,
+        "event": None,
     },
 }
 WINDOWS, SEEDS = (1, 2, 4, 8), (0, 1, 2)
@@ -66,13 +75,16 @@ def folds_of(pack: Pack, num: int) -> Iterator[Pack]:
         yield pack
 
 
-def scored(pack: Pack, num_folds: int, about: dict[str, Any], x: np.ndarray) -> list[dict[str, Any]]:
-    """Records of a linear probe on features ``x`` [rows, D] for each task, pooled over the folds."""
+def scored(
+    pack: Pack, num_folds: int, about: dict[str, Any], x: np.ndarray, event: Event | None = None
+) -> list[dict[str, Any]]:
+    """Records of a linear probe on features ``x`` [rows, D] for each task, pooled over the folds; also of its event."""
     folds = []
     for fold in folds_of(pack, num_folds):
         records = []
         for task in fold.spec.tasks:
             rows = split_rows(fold, task)
+            task = with_event(task, event) if event else task
             found = probe_features(x[rows.all], fold, task, rows, "linear", about["seed"] or 0)
             records.append({**about, "task": task.name, "modality": "touch", "probe": "linear", **found})
         folds.append(records)
@@ -99,13 +111,15 @@ def untrained(config: FolderConfig, pack: Pack, temporal: str, seed: int) -> np.
     return pack_features(fresh(run, pack.spec, pack.size), pack, "touch", np.arange(pack.num)).numpy()
 
 
-def cases(config: FolderConfig, columns: dict[str, tuple[str, ...]]) -> Iterator[tuple[str, int | None, Any]]:
+def cases(
+    config: FolderConfig, columns: dict[str, tuple[str, ...]], windows: Sequence[int] = WINDOWS
+) -> Iterator[tuple[str, int | None, Any]]:
     """Name, seed and features of everything that is scored; features are computed when called."""
     plain = config.open(quiet=True)
     for name, of in columns.items():
         yield name, None, lambda of=of: (plain, np.stack([plain.column(c).astype(float) for c in of], axis=1))
     for minus_first in (False, True):
-        for frames in WINDOWS:
+        for frames in windows:
             options = replace(config, num_frames=frames, minus_first=minus_first, order="seq")
             pack = options.open(quiet=True)
             shown = f"{frames}{', minus first' * minus_first}"
@@ -113,20 +127,27 @@ def cases(config: FolderConfig, columns: dict[str, tuple[str, ...]]) -> Iterator
             yield f"pixels {shown}", None, lambda p=pack, e=every: (p, thumbnails(p, "touch", e))
             if frames > 1 and not minus_first:
                 yield f"motion {shown}", None, lambda p=pack: (p, motion(p))
-            for temporal in ("stack", "mean") if frames > 1 else ("stack",):
+            for temporal in ("stack", "mean") if frames > 1 and not minus_first else ("stack",):
                 for seed in SEEDS:
                     name = f"untrained {temporal if frames > 1 else 'single'} {shown}"
                     yield name, seed, lambda o=options, p=pack, t=temporal, s=seed: (p, untrained(o, p, t, s))
 
 
-def show(kept: dict[str, list[dict[str, Any]]], task: str) -> None:
+def show(kept: dict[str, list[dict[str, Any]]], event: bool) -> None:
     """Print every source with its interval, and its difference to the untrained trunk on single frames."""
     by_source: dict[str, list[dict[str, Any]]] = {}
-    for record in (record for records in kept.values() for record in records if record["task"] == task):
+    for record in (record for records in kept.values() for record in records if ("event" in record) == event):
         by_source.setdefault(record["source"], []).append(record)
-    base = by_source["untrained single 1"]
-    print(f"\n{task}: accuracy %, AUROC, difference to the untrained trunk on single frames and its p")
+    if not (base := by_source.get("untrained single 1")):
+        return
     for source, records in by_source.items():
+        if event:
+            found = event_of([record["event"] for record in records])
+            ends = [
+                with_interval(*(found[k][end] for end in ("mean", "low", "high"))) for k in ("detected", "false_alarms")
+            ]
+            print(f"{source:34} {ends[0]:20} {ends[1]:20} {lead_text(found):30} {found['auroc']:.2f}")
+            continue
         mean, low, high, p = paired_difference(records, base)
         auroc = [r["auroc"] for r in records if r["auroc"] is not None]
         rank = f"{np.mean(auroc):.2f}" if auroc else ""
@@ -140,14 +161,25 @@ def main(manifests: Path, name: str, out: Path) -> None:
     shared: dict[str, Any] = {"path": manifests / f"{name}.csv", "vision": "", "group": "object", "size": 72}
     config = FolderConfig(**shared, **about["options"], title=name)
     kept: dict[str, list[dict[str, Any]]] = read_json(out, "scores") if out.exists() else {}
-    for source, seed, features in cases(config, about["columns"]):
-        if (key := f"{source} seed {seed}") not in kept:
-            pack, x = features()
-            kept[key] = scored(pack, about["folds"], {"source": source, "seed": seed}, x)
-            write_json(out, kept)
-            print(key, *(f"{r['task']} {percent(r['accuracy'])}" for r in kept[key]), flush=True)
-    for task in dict.fromkeys(record["task"] for records in kept.values() for record in records):
-        show(kept, task)
+
+    def score(source: str, seed: int | None, features: Any, event: Event | None = None) -> None:
+        if (key := f"{'event ' if event else ''}{source} seed {seed}") in kept:
+            return
+        pack, x = features()
+        kept[key] = scored(pack, about["folds"], {"source": source, "seed": seed}, x, event)
+        write_json(out, kept)
+        print(key, *(percent(r["accuracy"]) for r in kept[key]), flush=True)
+
+    for case in cases(config, about["columns"]):
+        score(*case)
+    if about["event"]:  # of all frames, also those after the ones to predict from
+        for case in cases(replace(config, label_only=()), about["columns"], (1, 4)):
+            if "mean" not in case[0] and "motion" not in case[0]:
+                score(*case, event=about["event"])
+    print("\naccuracy %, AUROC, difference to the untrained trunk on single frames and its p")
+    show(kept, event=False)
+    print("\nevent: detected %, false alarms %, first alarm before the end, AUROC of recordings")
+    show(kept, event=True)
 
 
 if __name__ == "__main__":

@@ -141,6 +141,10 @@ def test_alarms_and_onsets_by_hand(grips: Pack) -> None:
         2 / 3
     )
     assert summary["lead"]["median"] == end - first and summary["auroc"] == pytest.approx((2 + 0.5 * 4 + 0 * 3) / 9)
+    clocked = slip(grips, clock="at", fps=1000)
+    later = copy.copy(grips)
+    later.table = grips.table.append_column("at", pa.array(frame * 3.0))
+    assert score_event(later, clocked, rows.fitted, held, test, as_probabilities(score))["recordings"][3]["onset"] == 84
     frames = score_event(grips, slip(grips), rows.fitted, held, test, as_probabilities(score))
     assert frames["unit"] == "frames" and frames["recordings"][3]["onset"] == 28
 
@@ -253,6 +257,8 @@ def test_the_report_draws_scores_over_time(grips: Pack, scored: tuple[Path, dict
         ({"event": ("slap=slips",)}, "unknown task with classes 'slap'"),
         ({"event": ("slip=slides",)}, "unknown class of task 'slip' 'slides'"),
         ({"fps": 25.0}, "fps is for events"),
+        ({"clock": "frame"}, "clock is for events"),
+        ({"event": ("slip=slips",), "clock": "when"}, "unknown column 'when'"),
         ({"event": ("slip=slips",), "fps": 0.0}, r"fps 0\.0: give"),
         ({"event": ("slip=slips",), "false_alarms": 1.0}, r"false_alarms 1\.0: give a share"),
     ],

@@ -80,7 +80,7 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
             leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
             records += [
                 {**own, **r, "leak": leaks[r["task"]]}
-                for r in stress(model, data, *chosen(data, replace(options.config, event=(), fps=None)))
+                for r in stress(model, data, *chosen(data, replace(options.config, event=(), fps=None, clock=None)))
             ]
     return records
 

@@ -20,8 +20,10 @@ class Event:
 
     happens: str
     """Name of the class."""
+    clock: str | None = None
+    """Column with the time of each frame. None: the one that orders the frames of windows."""
     fps: float | None = None
-    """Frames a second, if the column that orders frames counts them."""
+    """Frames a second, if the clock counts frames."""
     false_alarms: float = 0.1
     """Share of the recordings without the event in which an alarm is accepted."""
 

@@ -60,7 +60,10 @@ class ProbeConfig:
     """TASK=CLASS, e.g. slip=yes: also score this class as an event in time. How early does a recording's frame raise an
     alarm, before the first frame of this class, or before the recording's end if all of its frames have it?"""
     fps: float | None = field(default=None, metadata=LATER)
-    """Frames per second of --event, if the column that orders frames (frame, seq, or --data.order) counts them."""
+    """Frames per second, if the --clock of --event counts frames. Otherwise times are in its units."""
+    clock: str | None = field(default=None, metadata=LATER)
+    """Column with the time of each frame for --event: frame numbers, or seconds. Default: the one that orders frames
+    (--data.order, else frame, seq or time)."""
     false_alarms: float = field(default=0.1, metadata=LATER)
     """Share of recordings without the --event in which an alarm is accepted. It sets the threshold, on train and val."""
 
@@ -74,9 +77,13 @@ class ProbeConfig:
         for name, _, happens in (asked.partition("=") for asked in self.event):
             if not (name and happens):
                 raise ValueError(f"event {name or '='!r}: give a task and its class, such as slip=yes")
-        if self.fps is not None and not self.event:
-            raise ValueError("fps is for events: name one with --event TASK=CLASS")
-        Event(happens="", fps=self.fps, false_alarms=self.false_alarms)
+        if (self.fps is not None or self.clock) and not self.event:
+            raise ValueError(f"{'clock' if self.clock else 'fps'} is for events: name one with --event TASK=CLASS")
+        self.event_of("")
+
+    def event_of(self, happens: str) -> Event:
+        """The class ``happens`` as an event with these options."""
+        return Event(happens=happens, clock=self.clock, fps=self.fps, false_alarms=self.false_alarms)
 
 
 class Scores(dict[str, Any]):
@@ -101,7 +108,8 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
         runs: Folders of runs: seeds of one method, or several methods, trained on one dataset.
         on: Another pack, or its folder, to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``on`` that a run was trained on.
-        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet, event, fps, false_alarms.
+        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet, event, fps, clock,
+            false_alarms.
 
     Returns:
         The scores, a dict (see ``probe_runs``).
@@ -346,7 +354,7 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     for name, _, happens in (asked.partition("=") for asked in session.event):
         if not isinstance(task := known.get(name), Task):
             raise unknown("task with classes", name, [task.name for task in pack.spec.tasks])
-        known[name] = with_event(task, happens, session.fps, session.false_alarms)
+        known[name] = with_event(task, session.event_of(happens))
     if not known:
         raise ValueError(f"dataset {pack.spec.name!r} has no labels and no values: nothing to probe")
     for name in session.tasks:

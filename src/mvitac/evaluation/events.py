@@ -27,11 +27,11 @@ NUM_TRACES = 4
 """Recordings of each kind whose scores a record keeps for the report."""
 
 
-def with_event(task: Task, asked: str, fps: float | None, false_alarms: float) -> Task:
-    """``task`` with its class ``asked`` as an event."""
-    if asked not in task.classes:
-        raise unknown(f"class of task {task.name!r}", asked, task.classes)
-    return replace(task, event=Event(happens=asked, fps=fps, false_alarms=false_alarms))
+def with_event(task: Task, event: Event) -> Task:
+    """``task`` with ``event``, which must be one of its classes."""
+    if event.happens not in task.classes:
+        raise unknown(f"class of task {task.name!r}", event.happens, task.classes)
+    return replace(task, event=event)
 
 
 def check_event(pack: Pack, task: Task, fitted: np.ndarray, test: np.ndarray) -> None:
@@ -145,8 +145,8 @@ def lead_of(events: Sequence[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _times(pack: Pack, event: Event) -> tuple[np.ndarray, str]:
-    """Time of each row [N] and its unit: ms, or what the ordering column counts if no rate is given."""
-    name, place = places(pack, pack.spec.window)
+    """Time of each row [N] and its unit: ms, or what the clock counts if no rate is given."""
+    name, place = places(pack, replace(pack.spec.window, order=event.clock or pack.spec.window.order))
     if event.fps or name == "time":
         return place * 1000 / (event.fps or 1), "ms"
     return place, {"frame": "frames", "seq": "frames"}.get(name, name)
