@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -111,26 +111,24 @@ def untrained(config: FolderConfig, pack: Pack, temporal: str, seed: int) -> np.
     return pack_features(fresh(run, pack.spec, pack.size), pack, "touch", np.arange(pack.num)).numpy()
 
 
-def cases(
-    config: FolderConfig, columns: dict[str, tuple[str, ...]], windows: Sequence[int] = WINDOWS
-) -> Iterator[tuple[str, int | None, Any]]:
+def cases(config: FolderConfig, columns: dict[str, tuple[str, ...]]) -> Iterator[tuple[str, int | None, Any]]:
     """Name, seed and features of everything that is scored; features are computed when called."""
     plain = config.open(quiet=True)
     for name, of in columns.items():
         yield name, None, lambda of=of: (plain, np.stack([plain.column(c).astype(float) for c in of], axis=1))
-    for minus_first in (False, True):
-        for frames in windows:
-            options = replace(config, num_frames=frames, minus_first=minus_first, order="seq")
-            pack = options.open(quiet=True)
-            shown = f"{frames}{', minus first' * minus_first}"
-            every = np.arange(pack.num)
-            yield f"pixels {shown}", None, lambda p=pack, e=every: (p, thumbnails(p, "touch", e))
-            if frames > 1 and not minus_first:
-                yield f"motion {shown}", None, lambda p=pack: (p, motion(p))
-            for temporal in ("stack", "mean") if frames > 1 and not minus_first else ("stack",):
-                for seed in SEEDS:
-                    name = f"untrained {temporal if frames > 1 else 'single'} {shown}"
-                    yield name, seed, lambda o=options, p=pack, t=temporal, s=seed: (p, untrained(o, p, t, s))
+    shown = [(minus_first, frames) for minus_first in (True, False) for frames in WINDOWS]
+    for minus_first, frames in shown:
+        options = replace(config, num_frames=frames, minus_first=minus_first, order="seq")
+        name, pack = f"{frames}{', minus first' * minus_first}", options.open(quiet=True)
+        yield f"pixels {name}", None, lambda p=pack: (p, thumbnails(p, "touch", np.arange(p.num)))
+        for seed in SEEDS:
+            yield f"untrained {name}", seed, lambda o=options, p=pack, s=seed: (p, untrained(o, p, "stack", s))
+    for frames in WINDOWS[1:]:
+        options = replace(config, num_frames=frames, order="seq")
+        pack = options.open(quiet=True)
+        yield f"motion {frames}", None, lambda p=pack: (p, motion(p))
+        for seed in SEEDS:
+            yield f"untrained, mean {frames}", seed, lambda o=options, p=pack, s=seed: (p, untrained(o, p, "mean", s))
 
 
 def show(kept: dict[str, list[dict[str, Any]]], event: bool) -> None:
@@ -138,7 +136,7 @@ def show(kept: dict[str, list[dict[str, Any]]], event: bool) -> None:
     by_source: dict[str, list[dict[str, Any]]] = {}
     for record in (record for records in kept.values() for record in records if ("event" in record) == event):
         by_source.setdefault(record["source"], []).append(record)
-    if not (base := by_source.get("untrained single 1")):
+    if not (base := by_source.get("untrained 1")):
         return
     for source, records in by_source.items():
         if event:
@@ -170,16 +168,23 @@ def main(manifests: Path, name: str, out: Path) -> None:
         write_json(out, kept)
         print(key, *(percent(r["accuracy"]) for r in kept[key]), flush=True)
 
+    def print_all() -> None:
+        print("\naccuracy %, AUROC, difference to the untrained trunk on single frames and its p")
+        show(kept, event=False)
+        print("\nevent: detected %, false alarms %, first alarm before the end, AUROC of recordings", flush=True)
+        show(kept, event=True)
+
+    if about["event"]:  # of all frames, also those after the ones to predict from
+        asked = [
+            *about["columns"],
+            *(f"{kind} {n}" for kind in ("pixels", "untrained") for n in ("1", "4, minus first")),
+        ]
+        for case in cases(replace(config, label_only=()), about["columns"]):
+            if case[0] in asked and not case[1]:  # one seed
+                score(*case, event=about["event"])
     for case in cases(config, about["columns"]):
         score(*case)
-    if about["event"]:  # of all frames, also those after the ones to predict from
-        for case in cases(replace(config, label_only=()), about["columns"], (1, 4)):
-            if "mean" not in case[0] and "motion" not in case[0]:
-                score(*case, event=about["event"])
-    print("\naccuracy %, AUROC, difference to the untrained trunk on single frames and its p")
-    show(kept, event=False)
-    print("\nevent: detected %, false alarms %, first alarm before the end, AUROC of recordings")
-    show(kept, event=True)
+    print_all()
 
 
 if __name__ == "__main__":
