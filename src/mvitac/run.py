@@ -118,6 +118,9 @@ class Run:
     presses do lamp, background, sensor and position differ, so that they do not reveal the match. A row without others is
     its own partner. For one-view methods (ssvtp, cmc) all three mean the vision and touch of one row. same-touch-pairs
     gives one-view methods the vision of one row and the touch of another."""
+    positives_within: float = field(default=0.0, metadata=LATER_IN_DIGEST)
+    """Other rows are positives only up to this distance in time: K frames before or after, in units of the column that
+    orders the frames of a touch (--data.order). 0 = any distance. Not for same-image."""
     precision: Literal["auto", "fp32", "tf32", "bf16"] = "fp32"
     """Arithmetic of the networks. Losses, weights and the optimiser stay in fp32. auto: bf16 where the hardware computes it
     (GPUs from Ampere, CPUs with AVX512-BF16 or AMX), else fp32; run.json says which. fp32 never uses TF32. tf32 lets a GPU
@@ -148,6 +151,12 @@ class Run:
             raise ValueError(f"epochs {self.epochs}: give a positive number")
         if self.chunk and not (2 <= self.chunk <= self.batch_size and self.batch_size % self.chunk == 0):
             raise ValueError(f"chunk {self.chunk}: give a divisor of batch_size {self.batch_size}, at least 2, or 0")
+        if not 0 <= self.positives_within < math.inf:
+            raise ValueError(f"positives_within {self.positives_within}: give a number of frames >= 0")
+        if self.positives_within and self.positives == "same-image":
+            raise ValueError(
+                "positives_within has no effect on same-image positives: choose --positives same-touch, or same-press"
+            )
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
         if not 0 <= self.seed < 1 << 63:

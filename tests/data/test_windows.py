@@ -22,7 +22,9 @@ from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.training.loop import train
+from mvitac.training.sampler import partners
 from mvitac.transforms.random_views import Augment
+from support.training_runs import assert_equal_weights, power_cut
 
 TOUCHES, LENGTH = 8, 6
 
@@ -102,6 +104,8 @@ def test_other_windows_are_other_data_and_single_frames_are_the_pack_itself(pres
     digests = {windowed(presses, Window(frames=f, stride=s)).digest for f, s in ((1, 1), (2, 1), (3, 1), (3, 2))}
     assert len(digests) == 4 and presses.digest in digests
     assert windowed(presses, Window()) is presses
+    ordered = windowed(presses, Window(order="label_late"))  # kept for positives and events
+    assert ordered.spec.window.order == "label_late" and ordered.digest == presses.digest
 
 
 @pytest.mark.parametrize(
@@ -157,6 +161,40 @@ def test_per_frame_features_are_averaged_and_attention_starts_as_the_mean() -> N
     assert trunk.score is not None
     torch.nn.init.normal_(trunk.score.weight)
     assert not torch.allclose(trunk(images), (apart[0] + apart[1]) / 2, atol=1e-3)
+
+
+def test_positives_can_be_near_in_time(presses: Pack, tmp_path: Path) -> None:
+    rows = np.repeat(np.arange(presses.num), 30)
+    found = partners(presses, rows, torch.Generator().manual_seed(0), within=2)
+    away = (presses.column("frame")[found] - presses.column("frame")[rows]).astype(int)
+    assert np.array_equal(presses.touch_groups[found], presses.touch_groups[rows])
+    first = presses.column("frame")[rows] == 0
+    assert set(away[first].tolist()) == {1, 2} and set(away.tolist()) == {-2, -1, 1, 2}
+    assert (np.abs(partners(presses, rows, torch.Generator().manual_seed(0)) - rows) > 0).all()
+    alone = partners(presses, rows, torch.Generator().manual_seed(0), within=0.5)
+    assert np.array_equal(alone, rows)  # no frame is as near
+
+    run = recipe("smoke", PackConfig(path=presses.path, num_frames=2))
+    run = replace(run, steps=6, batch_size=8, eval_every=0, augment=Augment(size=16), checkpoint_every=2)
+    near = replace(run, positives="same-touch", positives_within=1.0)
+    assert "positives_within" not in to_json(run, for_digest=True) and near.digest() != run.digest()
+    train(near, tmp_path / "straight", quiet=True)
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+        train(near, tmp_path / "cut", quiet=True)
+    train(near, tmp_path / "cut", resume=True, quiet=True)
+    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+
+
+def test_positives_near_in_time_that_cannot_be(presses: Pack, pack: Pack, tmp_path: Path) -> None:
+    run = recipe("smoke", PackConfig(path=presses.path))
+    with pytest.raises(ValueError, match="no effect on same-image positives"):
+        replace(run, positives="same-image", positives_within=2.0)
+    with pytest.raises(ValueError, match=r"positives_within -1\.0: give"):
+        replace(run, positives="same-touch", positives_within=-1.0)
+    unordered = replace(run, data=PackConfig(path=pack.path), positives="same-touch", positives_within=2.0)
+    with pytest.raises(ValueError, match="none of the columns frame, seq, time"):
+        train(unordered, tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run" / "run.json").exists()
 
 
 def test_runs_on_single_frames_keep_their_digest(presses: Pack) -> None:

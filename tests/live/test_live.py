@@ -34,6 +34,7 @@ from mvitac.live.predictor import Live, Reading
 from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.model import Model
+from mvitac.report.value_figures import over_time
 from support.faults import Clock, Rig, World, faulty
 
 
@@ -618,6 +619,11 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
     assert made == [("columns", "rows", "checks"), ("checks", "rows", "columns")]
 
 
+def test_classes_are_not_plotted_over_time(onnx: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["live", str(onnx), "--plot", "force.png"]) == 2
+    assert "predicts classes only: leave it out" in capsys.readouterr().err
+
+
 def test_live_command_on_folders(onnx: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Threads, files and the terminal view together; ends when the files do."""
     for m in ("vision", "touch"):
@@ -700,12 +706,28 @@ def test_predictions_are_written_line_by_line(value_onnx: Path, measured: Pack, 
             Image.fromarray(image ^ np.uint8(i % 2)).save(tmp_path / m / f"{i:03d}.png")
     command = ["live", str(value_onnx), "--vision", f"{tmp_path / 'vision'}@30", "--touch", f"{tmp_path / 'touch'}@30"]
     options = ["--calibration", "2", "--stale", "60", "--predictions", str(tmp_path / "p.jsonl")]
-    assert main([*command, *options]) == 0
+    assert main([*command, *options, "--plot", str(tmp_path / "p.png")]) == 0
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     lines = [json.loads(line) for line in (tmp_path / "p.jsonl").read_text().splitlines()]
     assert len(lines) > 3 and all(line["both"]["weight"]["unit"] == "N" for line in lines)
     assert [line["time"] for line in lines] == sorted({line["time"] for line in lines})
     assert all(line["both"]["weight"]["spread"] > 0 for line in lines)
     assert main([*command, "--predictions", str(tmp_path)]) == 2
+    assert main([*command, "--plot", str(tmp_path)]) == 2
+
+
+def test_values_over_time_are_drawn_with_their_error_and_touches_apart() -> None:
+    def line(time: float, touch: int, force: float) -> dict[str, Any]:
+        values = {"force_n": {"force_n": {"value": force, "unit": "N", "spread": 0.5}}}
+        return {"time": time, "touch": touch, "contact": True, "soft": {"class": "hard", "confidence": 0.9}, **values}
+
+    (axes,) = over_time([line(1.0, 1, 2.0), line(1.5, 1, 3.0), line(4.0, 2, 1.0), {"time": 5.0, "touch": 2}]).axes
+    drawn = [curve.get_xydata().tolist() for curve in axes.lines]  # type: ignore[union-attr]
+    assert drawn == [[[1.0, 2.0], [1.5, 3.0]], [[4.0, 1.0]]]
+    band = axes.collections[0].get_paths()[0].vertices
+    assert {1.5, 2.5, 3.5} == set(band[:, 1].tolist()) and axes.get_ylabel() == "force_n, N"  # type: ignore[union-attr, call-overload, index]
+    with pytest.raises(ValueError, match="no values to draw"):
+        over_time([{"time": 5.0, "touch": 2, "soft": {"class": "hard", "confidence": 0.9}}])
 
 
 # -- the terminal -------------------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """``mvitac probe`` and ``mvitac report``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -81,7 +81,8 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
             own = {"source": names.get(str(path), ""), "seed": model.seed, "run": str(path)}
             leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
             records += [
-                {**own, **r, "leak": leaks[r["task"]]} for r in stress(model, data, *chosen(data, options.config))
+                {**own, **r, "leak": leaks[r["task"]]}
+                for r in stress(model, data, *chosen(data, replace(options.config, event=(), fps=None, clock=None)))
             ]
     return records
 

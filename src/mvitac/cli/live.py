@@ -68,6 +68,8 @@ class _Options:
     predictions: Path | None = None
     """Write every prediction to this file: one JSON object per line, with time in seconds, classes with confidence, and
     values with unit and spread."""
+    plot: Path | None = None
+    """Draw the predicted values (force, ...) against time into this PNG at the end. Needs a model with values."""
     live: Annotated[LiveConfig, tyro.conf.arg(name="")] = LiveConfig()
 
 
@@ -86,9 +88,12 @@ def live(argv: list[str]) -> None:
             raise ValueError(f"{name} {seconds:g}: give seconds, more than 0")
     check_json(options.json)
     check_json(options.predictions, "--predictions")
+    check_json(options.plot, "--plot")
     console = Console(markup=False)
     window = Window() if options.window else None
     engine = _engine(options.model, options.threads, console)
+    if options.plot and not engine.values:
+        raise ValueError(f"--plot draws values over time, and {options.model} predicts classes only: leave it out")
     nearest = _nearest(options, engine)
     streams = _streams(options, engine)
     if not (options.vision or options.touch):
@@ -98,15 +103,32 @@ def live(argv: list[str]) -> None:
         channels = {m: s[2] for m, s in frame_shapes(engine).items()}
         recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
     loop = _loop(engine, streams, options.live, console, nearest=nearest, record=recorder)
+    said: list[Any] = []
     with _lines(options.predictions) as write:
-        _run(loop, console, window, options.seconds, write)
+        _run(loop, console, window, options.seconds, lambda new: (write(new), options.plot and said.append(new)))
     summary = loop.summary()
     _print_summary(summary)
     if options.json:
         write_json(options.json, summary)
+    if options.plot:
+        _plot(said, options.plot)
     if recorder:  # last, for it may fail (a full disk)
         num = recorder.close()
         print(f"recorded: {options.record}, {num} pairs" if num else "nothing was recorded")
+
+
+def _plot(predictions: list[Any], path: Path) -> None:
+    """Draw the values of ``predictions`` over time, if there are any."""
+    from mvitac.report.figures import to_png
+    from mvitac.report.value_figures import over_time
+    from mvitac.system.files import write_atomic
+
+    if not any(said["contact"] for said in predictions):
+        print("nothing was drawn: no touch was seen")
+        return
+    picture = to_png(over_time(predictions))
+    write_atomic(path, lambda file: file.write(picture))
+    print(f"values over time: {path}")
 
 
 def _nearest(options: _Options, engine: "Engine") -> Any:

@@ -34,8 +34,12 @@ def windowed(pack: Pack, window: Window) -> Pack:
         ValueError: If the pack has no column that orders its frames, two frames of a touch have the same place, the
             frames of a touch are farther apart than the stride, or no touch is as long as a window.
     """
-    if not window.active:
+    if not window.active and window.order is None:
         return pack
+    if not window.active:  # frames have an order also for positives and events
+        made = copy.copy(pack)
+        made.spec = replace(pack.spec, window=replace(pack.spec.window, order=window.order))
+        return made
     if pack.format != Pack.format:
         raise ValueError("frames: windows need the frames of a touch together: open a pack on disk, not shards")
     for modality in window.of:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from html import escape
 from itertools import product
 from pathlib import Path
@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, ValueTask
+from mvitac.data.spec import AnyTask, Event, Task, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
+from mvitac.evaluation.events import check_event, with_event
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import (
     PROBES,
@@ -30,7 +31,7 @@ from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_n
 from mvitac.evaluation.scores import summarise
 from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import LATER, from_json, to_json, unknown
 from mvitac.run import Run, load_run
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.processes import in_threads
@@ -55,6 +56,16 @@ class ProbeConfig:
     """Also score the controls: majority class, untrained trunk, pixels, border, and the dataset's own."""
     imagenet: Path | None = None
     """File with ImageNet weights of the trunk, for the frozen-ImageNet control."""
+    event: tuple[str, ...] = field(default=(), metadata=LATER)
+    """TASK=CLASS, e.g. slip=yes: also score this class as an event in time. How early does a recording's frame raise an
+    alarm, before the first frame of this class, or before the recording's end if all of its frames have it?"""
+    fps: float | None = field(default=None, metadata=LATER)
+    """Frames per second, if the --clock of --event counts frames. Otherwise times are in its units."""
+    clock: str | None = field(default=None, metadata=LATER)
+    """Column with the time of each frame for --event: frame numbers, or seconds. Default: the one that orders frames
+    (--data.order, else frame, seq or time)."""
+    false_alarms: float = field(default=0.1, metadata=LATER)
+    """Share of recordings without the --event in which an alarm is accepted. It sets the threshold, on train and val."""
 
     def __post_init__(self) -> None:
         for name, values in (("probe", self.probes), ("task", self.tasks), ("modality", self.modalities)):
@@ -63,6 +74,16 @@ class ProbeConfig:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
         if self.imagenet and not self.imagenet.is_file():
             raise ValueError(f"imagenet {self.imagenet}: give a file that exists")
+        for name, _, happens in (asked.partition("=") for asked in self.event):
+            if not (name and happens):
+                raise ValueError(f"event {name or '='!r}: give a task and its class, such as slip=yes")
+        if (self.fps is not None or self.clock) and not self.event:
+            raise ValueError(f"{'clock' if self.clock else 'fps'} is for events: name one with --event TASK=CLASS")
+        self.event_of("")
+
+    def event_of(self, happens: str) -> Event:
+        """The class ``happens`` as an event with these options."""
+        return Event(happens=happens, clock=self.clock, fps=self.fps, false_alarms=self.false_alarms)
 
 
 class Scores(dict[str, Any]):
@@ -87,7 +108,8 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
         runs: Folders of runs: seeds of one method, or several methods, trained on one dataset.
         on: Another pack, or its folder, to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``on`` that a run was trained on.
-        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet.
+        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet, event, fps, clock,
+            false_alarms.
 
     Returns:
         The scores, a dict (see ``probe_runs``).
@@ -140,7 +162,9 @@ def probe_runs(
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
     for task, modality in product(tasks, modalities):
-        split_rows(pack, task, modality)
+        rows = split_rows(pack, task, modality)
+        if isinstance(task, Task) and task.event:
+            check_event(pack, task, rows.fitted, rows.test)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:
@@ -334,6 +358,10 @@ def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     """The tasks and modalities that ``session`` asks for; ValueError if the data lacks one."""
     known = {task.name: task for task in pack.spec.all_tasks}
+    for name, _, happens in (asked.partition("=") for asked in session.event):
+        if not isinstance(task := known.get(name), Task):
+            raise unknown("task with classes", name, [task.name for task in pack.spec.tasks])
+        known[name] = with_event(task, session.event_of(happens))
     if not known:
         raise ValueError(f"dataset {pack.spec.name!r} has no labels and no values: nothing to probe")
     for name in session.tasks:

@@ -18,6 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import Classifier, fit_knn, fit_linear, fit_papers, spread_out
+from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
 from mvitac.evaluation.regressors import Regressor, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
@@ -127,7 +128,21 @@ def probe_features(
         predict, extra = fit_values(x[:num], pack, task, rows, kind, seed)
         return {**score_predictions(pack, task, rows.test, predict(x[num:])), **extra}
     predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
-    return {**score_rows(pack, task, rows.test, predict(x[num:])), **extra}
+    predicted = predict(x[num:])
+    if task.event:
+        held = _held_out(x[:num], pack, task, rows, kind, seed)
+        extra = {**extra, "event": score_event(pack, task, rows.fitted, held, rows.test, predicted)}
+    return {**score_rows(pack, task, rows.test, predicted), **extra}
+
+
+def _held_out(x: np.ndarray, pack: Pack, task: Task, rows: ProbeSplit, kind: str, seed: int) -> np.ndarray:
+    """Class probabilities [len(rows.fitted), K], each row's by a probe that was fitted on other groups."""
+    fitted, found = rows.fitted, np.empty((len(x), len(task.classes)))
+    for train, val, held in group_folds(pack.column("group")[fitted].astype(str)):
+        part = ProbeSplit(fitted[train], fitted[val], fitted[held])
+        predict, _ = fit_probe(x[np.concatenate([train, val])], pack, task, part, kind, seed)
+        found[held] = predict(x[held])
+    return found
 
 
 def fit_probe(

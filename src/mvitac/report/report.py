@@ -154,6 +154,7 @@ def _page(study: Study) -> str:
         "collapse": ("Learning or collapsing?", evidence.collapse),
         "confusion": ("Confusion", evidence.confusions),
         "values": ("Predicted and true values", score_sections.values),
+        "events": ("Events over time", score_sections.events),
         "map": ("A map of the features", galleries.feature_maps),
         "gallery": ("Retrieval gallery", galleries.gallery),
         "settings": ("Settings", _settings),

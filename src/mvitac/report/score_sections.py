@@ -18,7 +18,7 @@ from mvitac.evaluation.score_text import (
     with_interval,
 )
 from mvitac.evaluation.scores import by_cell, summarise_again
-from mvitac.report import figures, html, tables, value_figures
+from mvitac.report import event_figures, figures, html, tables, value_figures
 from mvitac.report.palette import MODALITY_HUES
 from mvitac.report.sections import WORDS, Study, headline
 
@@ -144,6 +144,37 @@ def values(study: Study) -> str:
         f"A point is a test row ({study.sources[0]}). A flat cloud means that the probe answers about the same for all."
     )
     return html.paragraph(intro) + html.grid(drawn)
+
+
+def events(study: Study) -> str:
+    """How early each source raises an alarm, and the first method's scores over time for some recordings."""
+    records, drawn = study.result["records"], []
+    cells = by_cell(records, records[0]["probe"]) if records else {}
+    for task, found in study.result["summary"].items():
+        rows = tables.event_rows(found)
+        if not rows:
+            continue
+        muted = {row[0] for row in rows} - set(study.sources)
+        drawn.append(html.paragraph(tables.event_title(task, found) + "."))
+        drawn.append(html.table(list(tables.EVENT), rows, muted=muted, label=f"{task} as an event"))
+        modality, _, _ = headline(study, task)
+        event = cells[task, modality, study.sources[0]][0]["event"]
+        if event["traces"]:
+            name = f"{task}: score of {event['class']}, {WORDS[modality]}"
+            drawing = event_figures.traces(name, event, MODALITY_HUES[modality])
+            alt = f"Score of {event['class']} over time in test recordings with the event and without it"
+            drawn.append(
+                study.figure(f"event {task}", drawing, alt, f"{study.sources[0]}, recordings drawn at random.")
+            )
+    if not drawn:
+        return ""
+    intro = (
+        "A frame above the threshold raises an alarm. The threshold is chosen on other recordings than these, for a stated"
+        " share of false alarms. Detected: recordings with the event that raise an alarm. Before onset: from the first alarm"
+        " to the first frame of the event, or to the last frame of the recording if its onset is not labelled; median over"
+        " recordings with an alarm and its interval over recordings."
+    )
+    return html.paragraph(intro) + "".join(drawn)
 
 
 def _mean_ranges(records: Sequence[dict[str, Any]], t: int) -> list[dict[str, float]]:

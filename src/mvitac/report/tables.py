@@ -14,10 +14,12 @@ from mvitac.evaluation.score_text import (
     columns_of,
     covered,
     error_text,
+    lead_text,
     percent,
     score_name,
     sources_of,
     tested_on,
+    with_interval,
 )
 from mvitac.evaluation.scores import interval, leaks_in
 from mvitac.system.console import Console
@@ -26,6 +28,8 @@ PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "k
 VALUE_PROBE_NAMES = {"linear": "ridge regression"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
 """Columns of a retrieval table, in percent."""
+EVENT = ("", "features", "detected %", "false alarms %", "alarm before onset", "AUROC")
+"""Columns of a table of an event: shares of the recordings with and without it, and the median time."""
 
 
 def unseen_groups(group_by: str, records: Sequence[dict[str, Any]]) -> str:
@@ -60,6 +64,13 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         console.print(table)
         if score == "R2":
             console.print(_targets(name, task))
+        if events := event_rows(task):
+            table = Table(title=event_title(name, task), title_justify="left", title_style="bold")
+            for column in EVENT:
+                table.add_column(column, justify="right" if column in EVENT[2:] else "left")
+            for row in events:
+                table.add_row(*row)
+            console.print(table)
     console.print(f"95 % intervals: {covered(result['group_by'], trained)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
@@ -82,6 +93,26 @@ def _targets(name: str, task: dict[str, Any]) -> Table:
             table.add_row(above := target, style="bold")
         table.add_row(source, *(f"{percent(cell['mean'])}, {error_text(cell)}" if cell else "" for cell in cells))
     return table
+
+
+def event_rows(task: dict[str, Any]) -> list[list[str]]:
+    """Rows of ``EVENT`` of one task's summary; none without an event."""
+    rows = []
+    for source in sources_of(task):
+        for modality in (*columns_of(task), "none"):
+            if event := task.get(modality, {}).get(source, {}).get("event"):
+                found = (event[name] for name in ("detected", "false_alarms"))
+                shares = [with_interval(each["mean"], each["low"], each["high"]) for each in found]
+                shown = "" if modality == "none" else modality
+                rows.append([source, shown, *shares, lead_text(event), f"{event['auroc']:.2f}"])
+    return rows
+
+
+def event_title(name: str, task: dict[str, Any]) -> str:
+    """What a table of an event is about, such as 'slip: yes as an event (50 recordings with it, 101 without)'."""
+    event = next(cell["event"] for cells in task.values() for cell in cells.values() if "event" in cell)
+    num, without = event["detected"]["num"], event["false_alarms"]["num"]
+    return f"{name}: {event['class']} as an event ({num} recordings with it, {without} without)"
 
 
 def target_rows(task: dict[str, Any]) -> list[tuple[str, str, list[dict[str, Any] | None]]]:

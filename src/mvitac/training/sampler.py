@@ -11,6 +11,7 @@ import torch
 
 from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.windows import places
 from mvitac.run import Run
 from mvitac.system.distributed import World
 
@@ -252,20 +253,27 @@ def shard_order(
 
 
 def partners(
-    pack: Pack, rows: np.ndarray, generator: torch.Generator, of: Literal["touch_groups", "presses"] = "touch_groups"
+    pack: Pack,
+    rows: np.ndarray,
+    generator: torch.Generator,
+    of: Literal["touch_groups", "presses"] = "touch_groups",
+    within: float = 0.0,
 ) -> np.ndarray:
     """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
-    A row without such others is its own partner.
+    With ``within``, its distance in time is at most that. A row without such others is its own partner.
     """
     groups: np.ndarray = getattr(pack, of)
     split, shards = pack.column("split"), pack.shards
+    place = places(pack, pack.spec.window)[1] if within else np.zeros(0)
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]), of)
         others = others[(others != row) & (split[others] == split[row]) & pack.whole[others]]
         others = others[shards[others] == shards[row]]
+        if within:
+            others = others[abs(place[others] - place[row]) <= within + 1e-9]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found

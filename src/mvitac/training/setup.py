@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
+from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
 from mvitac.methods.base import Method
@@ -67,6 +68,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     pack = open_pack(run.data, world, quiet) if pack is None else pack
     if run.positives == "same-press":
         _ = pack.presses  # the ValueError comes before anything is written
+    if run.positives_within:
+        places(pack, pack.spec.window)  # the same
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)

@@ -88,10 +88,10 @@ def make_views(
     views = [rows] * num_views
     if run.positives != "same-image":
         of = "presses" if run.positives == "same-press" else "touch_groups"
-        views[1:] = [partners(pack, rows, generator, of) for _ in range(num_views - 1)]
+        views[1:] = [partners(pack, rows, generator, of, run.positives_within) for _ in range(num_views - 1)]
     sources = dict.fromkeys(pack.spec.modalities, views)
     if run.positives == "same-touch-pairs" and num_views == 1:
-        sources["touch"] = [partners(pack, rows, generator)]
+        sources["touch"] = [partners(pack, rows, generator, within=run.positives_within)]
     dtype = torch.bfloat16 if run.bf16 else torch.float32
     images: dict[str, list[Tensor]] = {}
     has = senses(pack, rows)

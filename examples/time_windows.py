@@ -1,0 +1,191 @@
+"""Windows of 1, 2, 4 and 8 frames, and slip as an event, without training (docs/results/time.md).
+
+    python examples/real_manifests.py DATA MANIFESTS
+    python examples/time_windows.py MANIFESTS slip_gsmini OUT.json
+
+All windows score the same rows in the same folds of objects. OUT.json keeps every finished score, so that a stopped script
+continues where it was.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import Event
+from mvitac.datasets.folder import FolderConfig
+from mvitac.evaluation.controls import thumbnails
+from mvitac.evaluation.events import with_event
+from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.probe import probe_features, split_rows
+from mvitac.evaluation.score_text import lead_text, percent, with_interval
+from mvitac.evaluation.scores import event_of, interval, paired_difference, pool
+from mvitac.model import fresh
+from mvitac.recipes import recipe
+from mvitac.system.files import read_json, write_json
+
+SETS: dict[str, dict[str, Any]] = {
+    "slip_gsmini": {
+        "options": {"touch": ("left", "right"), "labels": ("slip",), "touch_group": "experiment"},
+        "columns": {
+            "recording length": ("n_frames",),
+            "place in the recording": ("seq",),
+            "frames since the start": ("frame",),
+        },
+        "folds": 3,
+        "event": Event(happens="1", clock="frame", fps=25.0),
+    },
+    "slip_grasp": {
+        "options": {
+            "touch": ("touch",),
+            "labels": ("success",),
+            "touch_group": "grasp",
+            "label_only": ("seq<=4",),
+        },
+        "columns": {"width": ("width_mm",), "width in sweep": ("width_in_sweep",)},
+        "folds": 6,
+        "event": Event(happens="0"),
+    },
+    "physiclear": {
+        "options": {"touch": ("touch",), "labels": ("material",), "touch_group": "video"},
+        "columns": {"contact energy": ("contact_energy",)},
+        "folds": 0,
+        "event": None,
+    },
+}
+WINDOWS, SEEDS = (1, 2, 4, 8), (0, 1, 2)
+
+
+def folds_of(pack: Pack, num: int) -> Iterator[Pack]:
+    """``pack`` with the split of each fold (columns fold1, ...), or as it is."""
+    for k in range(num):
+        fold = copy.copy(pack)
+        column = pa.array(pack.column(f"fold{k + 1}").astype(str))
+        fold.table = pack.table.set_column(pack.table.schema.get_field_index("split"), "split", column)
+        yield fold
+    if not num:
+        yield pack
+
+
+def scored(
+    pack: Pack, num_folds: int, about: dict[str, Any], x: np.ndarray, event: Event | None = None
+) -> list[dict[str, Any]]:
+    """Records of a linear probe on features ``x`` [rows, D] for each task, pooled over the folds; also of its event."""
+    folds = []
+    for fold in folds_of(pack, num_folds):
+        records = []
+        for task in fold.spec.tasks:
+            rows = split_rows(fold, task)
+            task = with_event(task, event) if event else task
+            found = probe_features(x[rows.all], fold, task, rows, "linear", about["seed"] or 0)
+            records.append({**about, "task": task.name, "modality": "touch", "probe": "linear", **found})
+        folds.append(records)
+    return pool(folds)
+
+
+def motion(pack: Pack) -> np.ndarray:
+    """Mean absolute difference of each sensor's frame to the next one and to the oldest one of its window: [rows, F S]."""
+    found = []
+    for rows in np.array_split(np.arange(pack.num), max(1, pack.num // 256)):
+        images = pack.images["touch"][rows].astype(np.float32)
+        num, side = images.shape[:2]
+        frames = images.reshape(num, side, side, pack.spec.frames("touch"), -1, 3)
+        steps = np.diff(frames, axis=3)
+        steps = np.concatenate([steps, frames[:, :, :, :1] - frames[:, :, :, -1:]], axis=3)
+        found.append(abs(steps).mean((1, 2, 5)).reshape(num, -1))
+    return np.concatenate(found)
+
+
+def untrained(config: FolderConfig, pack: Pack, temporal: str, seed: int) -> np.ndarray:
+    """Features [rows, D] of recipe `demo`'s trunk before training."""
+    run = recipe("demo", config, phased=False)
+    run = replace(run, seed=seed, encoder=replace(run.encoder, temporal=temporal))
+    return pack_features(fresh(run, pack.spec, pack.size), pack, "touch", np.arange(pack.num)).numpy()
+
+
+def cases(config: FolderConfig, columns: dict[str, tuple[str, ...]]) -> Iterator[tuple[str, int | None, Any]]:
+    """Name, seed and features of everything that is scored; features are computed when called."""
+    plain = config.open(quiet=True)
+    for name, of in columns.items():
+        yield name, None, lambda of=of: (plain, np.stack([plain.column(c).astype(float) for c in of], axis=1))
+    shown = [(minus_first, frames) for minus_first in (True, False) for frames in WINDOWS]
+    for minus_first, frames in shown:
+        options = replace(config, num_frames=frames, minus_first=minus_first, order="seq")
+        name, pack = f"{frames}{', minus first' * minus_first}", options.open(quiet=True)
+        yield f"pixels {name}", None, lambda p=pack: (p, thumbnails(p, "touch", np.arange(p.num)))
+        for seed in SEEDS:
+            yield f"untrained {name}", seed, lambda o=options, p=pack, s=seed: (p, untrained(o, p, "stack", s))
+    for frames in WINDOWS[1:]:
+        options = replace(config, num_frames=frames, order="seq")
+        pack = options.open(quiet=True)
+        yield f"motion {frames}", None, lambda p=pack: (p, motion(p))
+        for seed in SEEDS:
+            yield f"untrained, mean {frames}", seed, lambda o=options, p=pack, s=seed: (p, untrained(o, p, "mean", s))
+
+
+def show(kept: dict[str, list[dict[str, Any]]], event: bool) -> None:
+    """Print every source with its interval, and its difference to the untrained trunk on single frames."""
+    by_source: dict[str, list[dict[str, Any]]] = {}
+    for record in (record for records in kept.values() for record in records if ("event" in record) == event):
+        by_source.setdefault(record["source"], []).append(record)
+    if not (base := by_source.get("untrained 1")):
+        return
+    for source, records in by_source.items():
+        if event:
+            found = event_of([record["event"] for record in records])
+            ends = [
+                with_interval(*(found[k][end] for end in ("mean", "low", "high"))) for k in ("detected", "false_alarms")
+            ]
+            print(f"{source:34} {ends[0]:20} {ends[1]:20} {lead_text(found):30} {found['auroc']:.2f}")
+            continue
+        mean, low, high, p = paired_difference(records, base)
+        auroc = [r["auroc"] for r in records if r["auroc"] is not None]
+        rank = f"{np.mean(auroc):.2f}" if auroc else ""
+        chance = "" if p is None else f" p {p:.3f}"
+        beside = "" if records is base else f"{100 * mean:+.1f} [{percent(low)}, {percent(high)}]{chance}"
+        print(f"{source:34} {with_interval(*interval(records)):22} {rank:5} {beside}")
+
+
+def main(manifests: Path, name: str, out: Path) -> None:
+    about = SETS[name]
+    shared: dict[str, Any] = {"path": manifests / f"{name}.csv", "vision": "", "group": "object", "size": 72}
+    config = FolderConfig(**shared, **about["options"], title=name)
+    kept: dict[str, list[dict[str, Any]]] = read_json(out, "scores") if out.exists() else {}
+
+    def score(source: str, seed: int | None, features: Any, event: Event | None = None) -> None:
+        if (key := f"{'event ' if event else ''}{source} seed {seed}") in kept:
+            return
+        pack, x = features()
+        kept[key] = scored(pack, about["folds"], {"source": source, "seed": seed}, x, event)
+        write_json(out, kept)
+        print(key, *(percent(r["accuracy"]) for r in kept[key]), flush=True)
+
+    def print_all() -> None:
+        print("\naccuracy %, AUROC, difference to the untrained trunk on single frames and its p")
+        show(kept, event=False)
+        print("\nevent: detected %, false alarms %, first alarm before the end, AUROC of recordings", flush=True)
+        show(kept, event=True)
+
+    if about["event"]:  # of all frames, also those after the ones to predict from
+        asked = [
+            *about["columns"],
+            *(f"{kind} {n}" for kind in ("pixels", "untrained") for n in ("1", "4, minus first")),
+        ]
+        for case in cases(replace(config, label_only=()), about["columns"]):
+            if case[0] in asked and not case[1]:  # one seed
+                score(*case, event=about["event"])
+    for case in cases(config, about["columns"]):
+        score(*case)
+    print_all()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
