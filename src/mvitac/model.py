@@ -23,7 +23,7 @@ from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Target
 from mvitac.methods.base import Method
-from mvitac.nn.encoders import SCRATCH, num_features, timm_trunk
+from mvitac.nn.encoders import SCRATCH, last_map, num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
 from mvitac.registry import from_json, to_json, unknown
@@ -71,6 +71,21 @@ class Model(nn.Module):
         # Not in the state dict: the weights of a run are the same with and without published probes.
         self.readouts: dict[str, LinearProbe] = {}
         self.eval()
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.run.seed
+
+    @property
+    def title(self) -> str:
+        """Name of the method."""
+        return self.run.method.name
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Sides in pixels of the images that probes, and heads trained along, see."""
+        return self.run.augment.eval_size, self.run.augment.size
 
     def __repr__(self) -> str:
         widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())
@@ -128,8 +143,7 @@ class Model(nn.Module):
             raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
 
     def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
-        view = encoder_input(images, self.run.augment.size if for_heads else self.run.augment.eval_size)
-        return self.encoders[modality](view).float()
+        return self.encoders[modality](encoder_input(images, self.sides[for_heads])).float()
 
     def _project(self, modality: str, features: Tensor) -> Tensor:
         if modality not in self.projectors:
@@ -185,6 +199,11 @@ class Model(nn.Module):
         check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
             return self._encode(modality, images, for_heads)
+
+    @torch.no_grad()
+    def last_map(self, modality: str, images: Tensor) -> Tensor:
+        """Places [B, P, D] of the trunk's last map (``nn.encoders.last_map``), of images as in ``features``."""
+        return last_map(self.encoders[modality], encoder_input(images, self.sides[0]))
 
     @torch.no_grad()
     def project(self, modality: str, features: Tensor) -> Tensor:
@@ -324,7 +343,7 @@ class Model(nn.Module):
     def weights_digest(self) -> str:
         """Content address of the weights and of the image size they expect, for caches."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
-        return digest([safetensors_digest(tensors), self.run.augment.eval_size])
+        return digest([safetensors_digest(tensors), self.sides[0]])
 
     def save(self, path: Path) -> None:
         """Write a .safetensors file with the run and the description of the data in its header."""

@@ -76,7 +76,7 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
         with shown(Console(stderr=True)), work(what):
             model = load(path)
             data = pack or model.open_data()
-            own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
+            own = {"source": names.get(str(path), ""), "seed": model.seed, "run": str(path)}
             leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
             records += [
                 {**own, **r, "leak": leaks[r["task"]]} for r in stress(model, data, *chosen(data, options.config))

@@ -85,8 +85,8 @@ def load(path: str | Path) -> Model:
     """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
     Args:
-        path: folder of a run or an artifact, or "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is
-            no folder here is looked up on the Hub.
+        path: folder of a run or an artifact, "external:..." for an encoder of other people (``mvitac.external``), or
+            "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is no folder here is looked up there.
 
     Raises:
         ValueError: nothing is there, or it is damaged.
@@ -95,6 +95,10 @@ def load(path: str | Path) -> Model:
         model = mvitac.load("artifacts/first")
         probabilities = model.predict(vision=photo, touch=press)
     """
+    if isinstance(path, str) and path.startswith("external:"):
+        from mvitac.external import load_external
+
+        return load_external(path)
     local = Path(path)
     found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.

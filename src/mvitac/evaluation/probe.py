@@ -201,7 +201,7 @@ def probe_model(
         return source
 
     maps = source_of(True) if "attentive" in probes else None
-    records = probe_all(source_of(False), pack, tasks, modalities, probes, model.run.seed, maps)
+    records = probe_all(source_of(False), pack, tasks, modalities, probes, model.seed, maps)
     return records + _own_heads(model, pack, tasks, modalities)
 
 

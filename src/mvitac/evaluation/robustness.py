@@ -79,7 +79,7 @@ def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Seque
 
     Rows and noise are drawn alike for all models of one seed, so that differences are paired.
     """
-    seed, records = model.run.seed, []
+    seed, records = model.seed, []
     noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
     for task, modality in product(tasks, modalities):
         names = names_in(modality, pack)

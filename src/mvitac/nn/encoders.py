@@ -127,10 +127,13 @@ def last_map(trunk: nn.Module, images: Tensor) -> Tensor:
     if found.ndim == 3:  # [B, tokens, D]
         front = int(getattr(trunk, "num_prefix_tokens", 0))
         side = math.isqrt(found.shape[1] - front)
-        if side <= MAP_SIDE or side * side != found.shape[1] - front:
+        grid: tuple[int, ...] = getattr(trunk, "grid", (1, side, side))  # steps of time, rows, columns
+        if max(grid[1:]) <= MAP_SIDE or math.prod(grid) != found.shape[1] - front:
             return found
-        grid = found[:, front:].mT.unflatten(2, (side, side))
-        return torch.cat([found[:, :front], F.adaptive_avg_pool2d(grid, MAP_SIDE).flatten(2).mT], dim=1)
+        places = found[:, front:].mT.unflatten(2, grid).flatten(1, 2)
+        places = F.adaptive_avg_pool2d(places, (min(grid[1], MAP_SIDE), min(grid[2], MAP_SIDE)))
+        places = places.unflatten(1, (-1, grid[0])).flatten(2).mT
+        return torch.cat([found[:, :front], places], dim=1)
     if found.shape[1] != num_features(trunk) == found.shape[3]:
         found = found.permute(0, 3, 1, 2)  # timm's Swin has channels last
     height, width = (min(side, MAP_SIDE) for side in found.shape[2:])

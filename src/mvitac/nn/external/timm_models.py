@@ -1,0 +1,67 @@
+"""Any model of timm: DINOv2, CLIP, ImageNet trunks, or random weights. Licences are those that timm states.
+
+Preprocessing is that of the model's ``pretrained_cfg`` (huggingface/pytorch-image-models @aa4b585).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from torch import nn
+
+from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.external.base import UNKNOWN, Adapter, Loaded, seeded
+from mvitac.nn.external.preprocessing import Preprocessing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timm(Adapter):
+    """A model of timm."""
+
+    name: ClassVar[str] = "timm"
+    expects: ClassVar[str] = "the name of a timm model"
+    reads: Literal["touch", "vision", "both"] = "both"
+    weights: str = "pretrained"
+    """pretrained (timm downloads them), random, or a file."""
+
+    def load(self) -> Loaded:
+        if self.place.endswith(".openai") and "quickgelu" not in self.place:
+            raise ValueError(
+                f"{self.place}: OpenAI's weights need QuickGELU: {self.place.replace('_clip_', '_clip_quickgelu_')}"
+            )
+        known = {"pretrained": IMAGENET, "random": SCRATCH}
+        try:
+            config = EncoderConfig(trunk=self.place).trunk
+            network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
+        except ValueError as error:  # in the words of this option
+            raise ValueError(
+                str(error).replace("--encoder.weights scratch", "weights=random").replace("--encoder.", "")
+            ) from None
+        cfg = network.pretrained_cfg  # type: ignore[union-attr]
+        height, width = cfg["input_size"][1:]  # type: ignore[index]
+        random, file = self.weights == "random", Path(self.weights)
+        return Loaded(
+            network=network,
+            preprocessing=Preprocessing(size=(height, width), mean=cfg["mean"], std=cfg["std"]),  # type: ignore[index]
+            title=f"{config}, {'random' if random else file.name if self.weights not in known else 'pretrained'}",
+            files=(file,) if self.weights not in known else (),
+            licence="none (random weights)"
+            if random
+            else (cfg.get("license") or UNKNOWN)
+            if self.weights in known
+            else UNKNOWN,  # type: ignore[union-attr]
+            source=f"https://huggingface.co/{cfg.get('hf_hub_id')}" if self.weights == "pretrained" else self.weights,  # type: ignore[union-attr]
+            trained_on="nothing" if random else UNKNOWN,
+        )
+
+    def _built(self, weights: str) -> nn.Module:
+        trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3 * (self.frames or 1))
+        usual = trunk.pretrained_cfg["input_size"][1:]  # type: ignore[index]
+        if self.size and hasattr(trunk, "set_input_size"):
+            trunk.set_input_size(img_size=self.sides(usual))  # type: ignore[operator]
+        if hasattr(trunk, "patch_embed"):
+            trunk.grid = (1, *trunk.patch_embed.grid_size)  # type: ignore[union-attr]
+        return trunk
