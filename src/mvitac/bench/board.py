@@ -2,36 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from mvitac.bench.charts import against_labels, against_parameters
 from mvitac.bench.result import problems, read_result, records_of, suite_of
+from mvitac.bench.suite import SuiteTask
 from mvitac.evaluation.leaks import UNKNOWN
-from mvitac.evaluation.score_text import cell_text, percent, score_name, tested_on
+from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
 from mvitac.evaluation.scores import by_cell, paired_difference, summarise
 from mvitac.report import html as page
 from mvitac.report.figures import to_svg
 from mvitac.report.tables import probe_name
 from mvitac.system.files import write_atomic
 
-LAST = ("majority", "mean", "border", "pixels", "untrained")
-"""Controls on the page, from left to right; the data's own columns come after majority and mean."""
+GUESS = "majority or mean"
+CONTROLS = (GUESS, "border", "pixels", "untrained")
+"""Controls from left to right; the data's own columns come after the first."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A task by one modality: the records of every encoder and control, by name, and their summary."""
+    """A task by one modality, with scores by the name of the encoder or control.
+
+    Attributes:
+        task: Set and task.
+        about: Its test groups.
+        records: Records of the probe, one for each seed.
+        cells: Their summary (``scores.summarise``).
+        few: [(fraction of the labels, summary)], from few labels to all.
+    """
 
     task: str
+    about: str
     modality: str
     records: dict[str, list[dict[str, Any]]]
     cells: dict[str, dict[str, Any]]
-    summary: dict[str, Any]
+    few: dict[str, list[tuple[float, dict[str, Any]]]]
 
     @cached_property
     def score(self) -> str:
@@ -40,30 +52,22 @@ class Row:
 
 @dataclass(frozen=True)
 class Board:
-    """The results of one suite.
-
-    Attributes:
-        results: As read, by the encoder's name.
-        rows: Task by task and modality by modality.
-        few: (task, modality) -> name -> [(share of labels, summary's cell)].
-        not_run: One line for each task that a result lacks.
-    """
+    """Results by the encoder's name, what they scored row by row, and a line for each task that a result lacks."""
 
     results: dict[str, dict[str, Any]]
     rows: list[Row]
-    few: dict[tuple[str, str], dict[str, list[tuple[float, dict[str, Any]]]]]
     not_run: list[str]
 
     @property
     def controls(self) -> list[str]:
         found = dict.fromkeys(name for row in self.rows for name in row.cells if name not in self.results)
-        return sorted(found, key=lambda name: LAST.index(name) if name in LAST else 1.5)
+        return sorted(found, key=lambda name: CONTROLS.index(name) if name in CONTROLS else 0.5)
 
     @cached_property
     def encoders(self) -> list[str]:
         """Names of encoders by their mean rank over the rows that all of them have, the best one first."""
         common = [row for row in self.rows if all(name in row.cells for name in self.results)]
-        ranks = {name: 0 for name in self.results}
+        ranks = dict.fromkeys(self.results, 0)
         for row in common:
             for rank, name in enumerate(sorted(self.results, key=lambda n: -row.cells[n]["mean"])):
                 ranks[name] += rank
@@ -95,12 +99,11 @@ def write_board(files: Sequence[Path], out: Path) -> Path:
 
 
 def gather(results: dict[str, dict[str, Any]]) -> Board:
-    """Put the blocks of all results side by side. Only those on the same rows are one row of the page."""
+    """Put the blocks of all results side by side. Only those on the same rows of data are one row of the page."""
     suite = suite_of(next(iter(results.values())))
     rows: list[Row] = []
-    few: dict[tuple[str, str], dict[str, list[tuple[float, dict[str, Any]]]]] = {}
     not_run: list[str] = []
-    for number, (one, ask) in enumerate((one, ask) for one in suite.sets for ask in one.tasks):
+    for number, (one, ask) in enumerate((each, ask) for each in suite.sets for ask in each.tasks):
         forms: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
         for name, result in results.items():
             block = result["blocks"][number]
@@ -109,48 +112,34 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
             else:
                 forms.setdefault((block["form"], block["data"]["rows"]), []).append((name, block))
         for (form, _), found in forms.items():
-            records = [r for i, (name, block) in enumerate(found) for r in _mine(block, results[name]["encoder"], i)]
             task = f"{one.name}: {ask.name}{f' ({form})' if len(one.forms) > 1 else ''}"
-            about = f"{task} ({tested_on(summarise(records, suite.probes[0])[ask.name], found[0][1]['group_by'])})"
-            rows += _rows(about, records, suite.probes[0])
-            for (_, modality, name), shares in _shares(records, suite.probes[0]).items():
-                if len(shares) > 1:
-                    few.setdefault((task, modality), {})[name] = shares
-    return Board(results, rows, few, not_run)
+            records = []
+            for name, block in found:  # controls are the same in all results: those of the first one are shown
+                mine = records_of(block, results[name]["encoder"])
+                records += [r for r in mine if r["source"] == name or block is found[0][1]]
+            rows += _rows(task, found[0][1]["group_by"], records, suite.probes[0], ask)
+    return Board(results, rows, not_run)
 
 
-def _mine(block: dict[str, Any], encoder: dict[str, Any], number: int) -> list[dict[str, Any]]:
-    """The records of a block; of controls, which are the same for every encoder, those of the first result."""
-    return [r for r in records_of(block, encoder) if r["source"] == encoder["name"] or not number]
-
-
-def _rows(task: str, records: list[dict[str, Any]], probe: str) -> list[Row]:
-    summary, cells = summarise(records, probe), by_cell(records, probe)
-    rows = []
-    for name, found in summary.items():
-        none = found.get("none", {})
-        for modality in (m for m in ("touch", "vision", "both") if m in found):
-            own = {
-                source: cells[name, modality if source in found[modality] else "none", source]
-                for source in {**none, **found[modality]}
-            }
-            rows.append(Row(task, modality, own, {**none, **found[modality]}, found))
+def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: SuiteTask) -> list[Row]:
+    """The rows of one task, one for each modality."""
+    records = [{**r, "source": GUESS} if r["source"] in ("majority", "mean") else r for r in records]
+    found, cells = summarise(records, probe)[ask.name], by_cell(records, probe)
+    shares = {}
+    for share in sorted(ask.labels):
+        kind = f"{100 * share:g} % of labels"
+        shares[share] = summarise([r for r in records if r["probe"] == kind], kind).get(ask.name, {})
+    rows, none = [], found.pop("none", {})
+    for modality in (m for m in ask.modalities if m in found):
+        own = {**none, **found[modality]}
+        lists = {name: cells.get((ask.name, modality, name)) or cells[ask.name, "none", name] for name in own}
+        few = {
+            name: [(s, each[modality][name]) for s, each in shares.items() if name in each.get(modality, ())]
+            for name in own
+        }
+        whole = {name: [*line, (1.0, own[name])] for name, line in few.items() if line}
+        rows.append(Row(task, tested_on({modality: own}, by), modality, lists, own, whole))
     return rows
-
-
-def _shares(
-    records: list[dict[str, Any]], probe: str
-) -> dict[tuple[str, str, str], list[tuple[float, dict[str, Any]]]]:
-    """(task, modality, name) -> (fraction of the labels, cell), from few labels to all."""
-    kinds = {r["probe"]: float(r["probe"].split()[0]) / 100 for r in records if r["probe"].endswith("% of labels")}
-    found: dict[tuple[str, str, str], list[tuple[float, dict[str, Any]]]] = {}
-    for kind, share in sorted([*kinds.items(), (probe, 1.0)], key=lambda item: item[1]):
-        mine = [r for r in records if r["probe"] == kind and r["modality"] != "none"]
-        for task, modalities in summarise(mine, kind).items():
-            for modality, cells in modalities.items():
-                for name, cell in cells.items():
-                    found.setdefault((task, modality, name), []).append((share, cell))
-    return found
 
 
 def order_of(row: Row, names: Sequence[str]) -> str:
@@ -161,7 +150,7 @@ def order_of(row: Row, names: Sequence[str]) -> str:
     clean = [name for name in names if name in row.cells and row.cells[name].get("leak", "") in ("", UNKNOWN)]
     found = sorted(clean, key=lambda name: -row.cells[name]["mean"])
     text = ""
-    for ours, theirs in zip(found, found[1:], strict=False):
+    for ours, theirs in pairwise(found):
         mean, low, high, _ = paired_difference(row.records[ours], row.records[theirs])
         sign = ">" if low > 0 else "≈"
         text += f"{ours} {percent(row.cells[ours]['mean'])} {sign} ({percent(mean)} [{percent(low)}, {percent(high)}]) "
@@ -170,96 +159,72 @@ def order_of(row: Row, names: Sequence[str]) -> str:
     return text + (f"; not ordered because of LEAK: {', '.join(left_out)}" if left_out else "")
 
 
+SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder has several), in percent: accuracy, or R2
+of values. Controls come first. Encoders follow by their mean rank, which is for reading only: the order of each task is
+below. An empty cell was not run."""
+ORDER = """'>' means that the 95 % interval of the difference to the next encoder, paired over test groups, excludes 0; '≈'
+that this order is not resolved. Differences are in points, not corrected for the number of comparisons."""
+LEAKS = """Leaks compare the rows and groups that an encoder was trained on with the test rows, where a list of them came
+with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
+DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.
+'other pixels': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
+FOOT = "<p>Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it.</p>"
+
+
 def _page(board: Board) -> str:
     suite = suite_of(next(iter(board.results.values())))
-    names = [probe_name(suite.probes[0], score) for score in dict.fromkeys(row.score for row in board.rows)]
-    chips = {
-        "suite": suite.name,
-        "definition": suite.digest()[:12],
-        "encoders": str(len(board.results)),
-        "probe": " or ".join(names),
-    }
+    probes = dict.fromkeys(probe_name(suite.probes[0], row.score) for row in board.rows)
+    chips = [("definition", suite.digest()[:12]), ("encoders", str(len(board.results))), ("probe", " or ".join(probes))]
     head = (
         f"<p class='eyebrow'>mvitac bench</p><h1>{escape(suite.name)}</h1><p class='verdict'>{escape(suite.title)}</p>"
-        f"<ul class='chips'>{''.join(f'<li>{escape(k)} <b>{escape(v)}</b></li>' for k, v in chips.items())}</ul>"
+        f"<ul class='chips'>{''.join(f'<li>{escape(k)} <b>{escape(v)}</b></li>' for k, v in chips)}</ul>"
     )
+    orders = [[f"{row.task}, {row.modality}", order_of(row, board.encoders)] for row in board.rows]
     sections = [
         ("scores", "Scores", _scores(board)),
-        ("order", "Order", _orders(board)),
+        ("order", "Order", _text_table(ORDER, ["", "from best to worst"], orders)),
         ("encoders", "Encoders and leaks", _encoders(board)),
-        ("parameters", "Score against parameters", _charts(board, labels=False)),
-        ("labels", "Score against labels", _charts(board, labels=True)),
+        ("parameters", "Score against parameters", page.grid(_by_parameters(board))),
+        ("labels", "Score against labels", page.grid(_by_labels(board))),
         ("data", "Data", _data(board)),
     ]
-    foot = "<p>Made by mvitac bench board from signed results. A result's digest shows changes; it does not prove who made it.</p>"
-    return page.html_page(f"mvitac bench: {suite.name}", head, [s for s in sections if s[2]], foot)
+    return page.html_page(f"mvitac bench: {suite.name}", head, sections, FOOT)
+
+
+def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return page.paragraph(" ".join(intro.split())) + page.table(columns, rows, words=True, label=columns[1])
 
 
 def _scores(board: Board) -> str:
-    intro = (
-        "Mean and 95 % interval over test groups (and seeds, where an encoder has several), in percent: accuracy, or R2 of"
-        " values. Controls come first; encoders follow by their mean rank, which is for reading only: the order of each"
-        " task is below. An empty cell was not run."
-    )
-    columns, rows, above = [*board.controls, *board.encoders], [], ""
-    errors: list[list[str]] = []
+    """A table of all scores, and folded below it one of the errors of values in their units."""
+    columns, rows, errors, above = [*board.controls, *board.encoders], [], [], ""
     for row in board.rows:
         if row.task != above:
-            rows.append([above := row.task])
-        label = f"{row.modality}{', R2' if row.score == 'R2' else ''}"
-        rows.append([label, *(cell_text(row.summary, name, row.modality) for name in columns)])
-        for t, target in enumerate(next(iter(row.cells.values())).get("targets", ())):
-            shown = [row.cells[name]["targets"][t] if name in row.cells else None for name in columns]
-            what = f"{row.task.partition(' (')[0]}, {row.modality}, {target['name']} ({target['unit']})"
-            errors.append([what, *("" if each is None else f"{each['mae']:.3g}" for each in shown)])
-    found = page.table(["", *columns], rows, label="scores")
-    if errors:
-        found += page.fold("Mean absolute errors in their units", page.table(["", *columns], errors, label="errors"))
-    return page.paragraph(intro) + found
-
-
-def _orders(board: Board) -> str:
-    intro = (
-        "'>' means that the 95 % interval of the difference to the next encoder, paired over the test groups, excludes 0; '≈'"
-        " means that this order is not resolved. Differences are in points, not corrected for the number of comparisons."
-    )
-    if len(board.results) < 2:
-        return ""
-    rows = [[f"{row.task.partition(' (')[0]}, {row.modality}", order_of(row, board.encoders)] for row in board.rows]
-    return page.paragraph(intro) + page.table(["", "from best to worst"], rows, words=True, label="order")
+            rows.append([f"{(above := row.task)} ({row.about})"])
+        cells = [row.cells.get(name) for name in columns]
+        shown = [with_interval(c["mean"], c["low"], c["high"], c.get("leak", "")) if c else "" for c in cells]
+        rows.append([f"{row.modality}{', R2' * (row.score == 'R2')}", *shown])
+        for t, target in enumerate(next(filter(None, cells)).get("targets", ())):
+            what = f"{row.task}, {row.modality}: {target['name']} ({target['unit']})"
+            errors.append([what, *(f"{c['targets'][t]['mae']:.3g}" if c else "" for c in cells)])
+    found = page.paragraph(" ".join(SCORES.split())) + page.table(["", *columns], rows, label="scores")
+    table = page.table(["", *columns], errors, label="errors")
+    return found + (page.fold("Mean absolute errors in their units", table) if errors else "")
 
 
 def _encoders(board: Board) -> str:
-    intro = (
-        "Leaks compare the rows and groups that an encoder was trained on with the test rows, where a list of them came with"
-        " the encoder. LEAK? stands where there is none and its owner's list of training data is not given either."
-    )
-    columns = [
-        "",
-        "leak",
-        "parameters",
-        "images seen",
-        "licence",
-        "trained on",
-        "seeds",
-        "input",
-        "weights",
-        "versions",
-    ]
+    columns = ["", "leak", "parameters", "images seen", "licence", "trained on", "seeds, input", "weights", "versions"]
     rows = []
     for name in board.encoders:
-        encoder, leaks = board.results[name]["encoder"], _leaks(board.results[name])
+        result, encoder = board.results[name], board.results[name]["encoder"]
         sizes = ", ".join(f"{m} {num / 1e6:.1f} M" for m, num in encoder["parameters"].items())
-        seen = f"{encoder['images_seen']:,}" if encoder["images_seen"] else "not known"
-        versions = ", ".join(f"{k} {v}" for k, v in board.results[name]["versions"].items() if k in ("mvitac", "torch"))
-        known = [
-            encoder["licence"] or "not given",
-            encoder["trained_on"] or "not given",
-            ", ".join(map(str, encoder["seeds"])),
-        ]
+        seen = "not known" if encoder["images_seen"] is None else f"{encoder['images_seen']:,}"
+        known = [encoder[key] or "not given" for key in ("licence", "trained_on")]
+        read = f"{', '.join(map(str, encoder['seeds']))}; {encoder['size']} px"
+        versions = ", ".join(f"{library} {result['versions'].get(library, '')}" for library in ("mvitac", "torch"))
         weights = ", ".join(one[:12] for one in encoder["weights"])
-        rows.append([name, leaks, sizes, seen, *known, f"{encoder['size']} px", weights, versions])
-    return page.paragraph(intro) + page.table(columns, rows, words=True, label="encoders")
+        rows.append([name, _leaks(result), sizes, seen, *known, read, weights, versions])
+    return _text_table(LEAKS, columns, rows)
 
 
 def _leaks(result: dict[str, Any]) -> str:
@@ -272,46 +237,30 @@ def _leaks(result: dict[str, Any]) -> str:
     return ". ".join([*found, *(["LEAK? not known"] if UNKNOWN in marks else [])]) or "none found"
 
 
-def _charts(board: Board, labels: bool) -> str:
-    drawn = []
-    for row in board.rows if not labels else ():
-        sizes = {n: r["encoder"]["parameters"] for n, r in board.results.items() if n in row.cells}
-        if row.modality != "touch" or len(sizes) < 2:
-            continue
+def _by_parameters(board: Board) -> Iterator[str]:
+    for row in (row for row in board.rows if row.modality == "touch"):
+        sizes = {name: board.results[name]["encoder"]["parameters"] for name in board.encoders if name in row.cells}
         points = {name: (each["touch"], row.cells[name]) for name, each in sizes.items()}
-        level = row.cells.get("untrained", {}).get("mean")
-        title = row.task.partition(" (")[0]
-        drawn.append((title, against_parameters(title, points, level, f"{row.score} %, touch")))
-    for (task, modality), lines in board.few.items() if labels else ():
-        title = f"{task}, {modality}"
-        drawn.append(
-            (title, against_labels(title, {n: lines[n] for n in (*board.encoders, *board.controls) if n in lines}))
-        )
-    figures = [
-        page.figure(to_svg(figure, f"{labels} {title}", f"{title}: the numbers are in the results"))
-        for title, figure in drawn
-    ]
-    return page.grid(figures) if figures else ""
+        drawn = against_parameters(row.task, points, row.cells["untrained"]["mean"], f"{row.score} %, touch")
+        yield page.figure(to_svg(drawn, f"parameters {row.task}", f"{row.task} against parameters; numbers are above"))
+
+
+def _by_labels(board: Board) -> Iterator[str]:
+    for row in (row for row in board.rows if row.few):
+        lines = {name: row.few[name] for name in (*board.encoders, *board.controls) if name in row.few}
+        title = f"{row.task}, {row.modality}"
+        drawn = against_labels(title, lines)
+        yield page.figure(to_svg(drawn, f"labels {title}", f"{title} against labels; numbers are in the results"))
 
 
 def _data(board: Board) -> str:
-    rows: dict[tuple[str, str, str], list[str]] = {}
+    rows: dict[tuple[str, str, str], dict[str, None]] = {}
     for name, result in board.results.items():
-        for block in result["blocks"]:
-            if "not_run" not in block:
-                rows.setdefault((block["set"], block["form"], block["data"]["rows"][:12]), [])
-                mine = rows[block["set"], block["form"], block["data"]["rows"][:12]]
-                mine.append(f"{name} ({block['pinned']})") if f"{name} ({block['pinned']})" not in mine else None
-    intro = (
-        "Rows with another digest are never compared. 'same': also the images are those that the suite was measured on."
-        " 'other pixels': made or decoded on another machine. 'not pinned': the suite has no digest of this form."
+        for block in (block for block in result["blocks"] if "not_run" not in block):
+            key = (block["set"], block["form"], block["data"]["rows"][:12])
+            rows.setdefault(key, {})[f"{name} ({block['pinned']})"] = None
+    table = _text_table(
+        DATA, ["", "form", "digest of rows", "results"], [[*k, ", ".join(who)] for k, who in rows.items()]
     )
-    table = page.table(
-        ["", "form", "digest of rows", "results"], [[*key, ", ".join(who)] for key, who in rows.items()], words=True
-    )
-    lost = (
-        page.fold(f"{len(board.not_run)} tasks that were not run", page.code("\n".join(board.not_run)))
-        if board.not_run
-        else ""
-    )
-    return page.paragraph(intro) + table + lost
+    lost = page.fold(f"{len(board.not_run)} tasks that were not run", page.code("\n".join(board.not_run)))
+    return table + (lost if board.not_run else "")

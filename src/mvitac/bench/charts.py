@@ -35,6 +35,8 @@ def against_parameters(
         handles.append(axes.axhline(_cut(level), color=colour("grey2"), linestyle=":", linewidth=1.2))
         names.append("untrained")
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
     axes.margins(x=0.15)
     _label(axes, "parameters in millions", what)
     legend_below(figure, handles, names, 2)

@@ -51,21 +51,19 @@ def trimmed(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _folded(block: dict[str, Any]) -> dict[str, Any]:
-    """``block`` with what its records share written once: sizes of groups, and sums of true values."""
+    """``block`` with what its records share written once: the sizes of groups, and the sums of true values."""
+    if "records" not in block:
+        return block
     rows: list[dict[str, Any]] = []
     records = []
-    for record in block.get("records", ()):
-        record = dict(record)
-        if "group_sums" in record:
-            sums = record.pop("group_sums")
-            same = {name: sums[name] for name in SHARED}
-            record["group_sums"] = {name: sums[name] for name in SUMS if name not in SHARED}
-        else:
-            same = {"group_sizes": record.pop("group_sizes")}
+    for record in block["records"]:
+        sums = record.get("group_sums")
+        same = {name: sums[name] for name in SHARED} if sums else {"group_sizes": record["group_sizes"]}
+        own = {"group_sums": {name: sums[name] for name in SUMS if name not in SHARED}} if sums else {}
         if same not in rows:
             rows.append(same)
-        records.append({**record, "rows": rows.index(same)})
-    return {**block, "rows": rows, "records": records} if "records" in block else block
+        records.append({**{k: v for k, v in record.items() if k != "group_sizes"}, **own, "rows": rows.index(same)})
+    return {**block, "rows": rows, "records": records}
 
 
 def records_of(block: dict[str, Any], encoder: dict[str, Any]) -> list[dict[str, Any]]:
@@ -103,27 +101,10 @@ def sign(
 
 
 def write_result(path: Path, value: dict[str, Any]) -> None:
-    """Write a result: a line per block and record, so that a change is seen in few lines."""
-    lines = []
-    for name, part in value.items():
-        if name == "blocks":
-            inner = ",\n".join(_lines(block) for block in part)
-            lines.append(f'"blocks": [\n{inner}\n]')
-        else:
-            lines.append(f"{json.dumps(name)}: {_compact(part)}")
+    """Write a result, one line for each of its fields."""
+    lines = (f"{json.dumps(k)}: {json.dumps(v, separators=(',', ':'), allow_nan=False)}" for k, v in value.items())
     text = "{\n" + ",\n".join(lines) + "\n}\n"
     write_atomic(path, lambda file: file.write(text.encode()))
-
-
-def _lines(block: dict[str, Any]) -> str:
-    head = _compact({key: value for key, value in block.items() if key != "records"})
-    if "records" not in block:
-        return head
-    return f'{head[:-1]},"records":[\n' + ",\n".join(map(_compact, block["records"])) + "\n]}"
-
-
-def _compact(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False)
 
 
 def read_result(path: Path) -> dict[str, Any]:
@@ -168,6 +149,8 @@ def problems(value: dict[str, Any]) -> list[str]:
         if len(block["leaks"]) != len(value["encoder"]["seeds"]):
             found.append(f"{where}: has {len(block['leaks'])} leak marks for {len(value['encoder']['seeds'])} seeds")
         records = records_of(block, value["encoder"])
+        if block["records"] and value["encoder"]["name"] in {r["source"] for r in block["records"]}:
+            found.append(f"{where}: the encoder has the name of a control, {value['encoder']['name']!r}: give --name")
         if lacking := {"untrained", "pixels"} - {r["source"] for r in records}:
             found.append(f"{where}: lacks the controls {', '.join(sorted(lacking))}")
         for record in records:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -72,16 +72,6 @@ class SuiteSet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Untrained:
-    """The control "untrained": a random trunk, read like every other encoder."""
-
-    trunk: str = "resnet18"
-    size: int = 64
-    """Side of its input in pixels."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Suite:
     """A versioned set of tasks."""
 
@@ -91,7 +81,8 @@ class Suite:
     """Probes of encoders; the page shows the first. Controls have the linear one."""
     seed: int
     """Seed of the probes, and of which labels are kept."""
-    untrained: Untrained
+    untrained: tuple[str, ...]
+    """The seeds of the control "untrained": external encoders with random weights."""
     sets: tuple[SuiteSet, ...]
 
     def __post_init__(self) -> None:
