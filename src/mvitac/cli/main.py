@@ -30,6 +30,9 @@ how good the features are.
   pretrain             pre-train encoders (--method, --data, --recipe)
   probe RUN...         linear probes next to their controls
   compare              many runs into the paper's tables (--plan NAME or FILE)
+  bench MODEL          any encoder on a fixed suite of tasks, as one JSON file
+  bench board FILE...  a page that compares such results
+  bench check FILE...  check their digests and sums
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
@@ -60,6 +63,9 @@ COMMANDS = {
     "pretrain": "pretrain:pretrain",
     "probe": "evaluate:probe",
     "compare": "compare:compare",
+    "bench": "bench:bench",
+    "bench board": "bench:board",
+    "bench check": "bench:check",
     "report": "evaluate:report",
     "publish": "deploy:publish",
     "export": "deploy:export",
@@ -134,8 +140,8 @@ def _run(arguments: list[str]) -> int:
         return 0
     name, rest = arguments[0], arguments[1:]
     _check_once(rest)
-    if name == "data":
-        name, rest = f"data {rest[0]}", rest[1:]
+    if name == "data" or (rest and f"{name} {rest[0]}" in COMMANDS):
+        name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in COMMANDS:
         from mvitac.registry import unknown
 

@@ -78,12 +78,12 @@ def controls_of(
     Returns:
         Probe records and retrieval records, each with its "source" and "seed".
     """
-    records = _label_controls(pack, tasks)
+    records = label_controls(pack, tasks)
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)
     fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
     with work("fitting probes of the controls", num, "probes"):
-        records += _pixel_controls(pack, tasks, modalities)
+        records += pixel_controls(pack, tasks, modalities)
         found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes)
         records += found
         for name in weights:
@@ -97,7 +97,7 @@ def _named(source: str, seed: int | None, found: Records) -> Records:
     return [{"source": source, "seed": seed, **record} for record in found]
 
 
-def _label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
+def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
     """What needs no image: the most common class or the mean value, and the dataset's own controls (table columns)."""
     records = []
     for task in tasks:
@@ -121,7 +121,7 @@ def _guess(pack: Pack, task: AnyTask, rows: ProbeSplit) -> dict[str, Any]:
     return score_rows(pack, task, rows.test, np.eye(num)[np.full(len(rows.test), common)])
 
 
-def _pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
+def pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
     """Thumbnails of every modality, and the border of the tactile image."""
 
     def pixels(modality: str, rows: np.ndarray) -> np.ndarray:

@@ -211,7 +211,7 @@ def probe_model(
         by_modality = {m: features(model, pack, m, rows, maps=maps) for m, rows in own.items()}
 
         def source(modality: str, rows: np.ndarray) -> np.ndarray:
-            return _joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
+            return joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
 
         return source
 
@@ -220,7 +220,7 @@ def probe_model(
     return records + _own_heads(model, pack, tasks, modalities)
 
 
-def _joined(parts: list[np.ndarray]) -> np.ndarray:
+def joined(parts: list[np.ndarray]) -> np.ndarray:
     """Features [N, D] of several modalities, or maps [N, P, D], side by side. Narrow maps are filled up with zeros."""
     if parts[0].ndim == 3:
         width = max(part.shape[2] for part in parts)
