@@ -161,11 +161,15 @@ def shard_order(
 
 
 def partners(
-    pack: Pack, rows: np.ndarray, generator: torch.Generator, of: Literal["touch_groups", "presses"] = "touch_groups"
+    pack: Pack,
+    rows: np.ndarray,
+    generator: torch.Generator,
+    of: Literal["touch_groups", "presses"] = "touch_groups",
+    other_sensor: bool = False,
 ) -> np.ndarray:
     """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
-    A row without such others is its own partner.
+    With ``other_sensor``, the other row is of another sensor. A row without such others is its own partner.
     """
     groups: np.ndarray = getattr(pack, of)
     split, shards = pack.column("split"), pack.shards
@@ -176,6 +180,8 @@ def partners(
         others = pack.rows_of(int(groups[row]), of)
         others = others[(others != row) & (split[others] == split[row]) & whole[others]]
         others = others[shards[others] == shards[row]]
+        if other_sensor:
+            others = others[pack.sensors[others] != pack.sensors[row]]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found

@@ -60,6 +60,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     pack = open_pack(run.data, world, quiet) if pack is None else pack
     if run.positives == "same-press":
         _ = pack.presses  # the ValueError comes before anything is written
+    run.method.check_pack(pack)
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)
