@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -25,9 +25,10 @@ from mvitac.evaluation.probe import (
     with_classes,
 )
 from mvitac.evaluation.scores import summarise
+from mvitac.evaluation.sensors import Standardise, describe_statistics, sensor_records
 from mvitac.model import Model, load
 from mvitac.nn.encoders import build_trunk
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import LATER, from_json, to_json, unknown
 from mvitac.run import Run, load_run
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.processes import in_threads
@@ -52,9 +53,20 @@ class ProbeConfig:
     """Also score the controls: majority class, untrained trunk, pixels, border, and the dataset's own."""
     imagenet: Path | None = None
     """File with ImageNet weights of the trunk, for the frozen-ImageNet control."""
+    standardise: tuple[Standardise, ...] = field(default=(), metadata=LATER)
+    """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
+    their own mean and standard deviation. batch-norm: take the statistics of BatchNorm anew. colours: show images of a
+    sensor that --learn-on lacks in the colours of one that it has."""
+    sensors: bool = field(default=False, metadata=LATER)
+    """Also say how well touch features tell the sensor, and how often they find the same press through another one."""
 
     def __post_init__(self) -> None:
-        for name, values in (("probe", self.probes), ("task", self.tasks), ("modality", self.modalities)):
+        for name, values in (
+            ("probe", self.probes),
+            ("task", self.tasks),
+            ("modality", self.modalities),
+            ("standardise", self.standardise),
+        ):
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
@@ -103,7 +115,7 @@ def probe_runs(
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     if session.controls:
         specs = [m.spec for m in models]
-        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
+        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
     result = {
         "data": pack.spec.name,
@@ -119,6 +131,13 @@ def probe_runs(
         "retrieval": retrieval,
         "summary": summarise(records, session.probes[0]),
     }
+    if set(session.standardise) - {"colours"}:
+        result["statistics"] = describe_statistics(pack)
+    if session.sensors:
+        found_by = zip(names, models, strict=True)
+        result["sensors"] = [
+            {"source": n, "seed": m.run.seed, **r} for n, m in found_by for r in sensor_records(m, pack)
+        ]
     for path in paths:
         write_json(path / "probe.json", result)
     return result
@@ -162,6 +181,7 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
     except (ValueError, KeyError, TypeError):  # 0.1.0 wrote the scores of the run alone
         return None
     whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
+    whole &= not asked.standardise
     return result if same and whole and scored == {path.resolve() for path in paths} else None
 
 
@@ -232,7 +252,7 @@ def _probe_run(
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of one run."""
     own, pack = {"source": source, "seed": model.run.seed, "run": str(path)}, scored.pack
-    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
+    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes, session.standardise)]
     leaks = {task.name: scored.leak(learned, split_rows(pack, task).test) for task in tasks}
     for record in records:
         record["source"] += END_TO_END if record["probe"] == "own" else ""

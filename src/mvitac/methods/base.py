@@ -184,8 +184,9 @@ class MethodConfig(Registered, ABC):
         """Raise ValueError if ``pack`` lacks rows that a setting needs. Called before anything is written."""
         if not self.sensor_view:
             return
-        rows = self.training_rows(pack)
-        pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
+        rows, pairs = self.training_rows(pack), np.zeros((2, 0), np.int64)
+        if "press" in pack.table.column_names:
+            pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
         if not (np.bincount(pairs[0]) > 1).any():
             raise ValueError(
                 "lambda_sensor needs presses of one spot through two sensors, rows with the same value in column press"

@@ -106,6 +106,8 @@ class MViTacConfig(MethodConfig):
 
     def without_idle(self, spec: DataSpec) -> Self:
         mine = replace(self, losses=tuple(part for part in possible_losses(spec) if part in self.losses))
+        if "touch" not in spec.modalities:
+            mine = replace(mine, lambda_sensor=0.0)
         return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
@@ -115,6 +117,8 @@ class MViTacConfig(MethodConfig):
                 f"losses {', '.join(self.losses)} need another modality than dataset {spec.name!r} has:"
                 f" give some of {', '.join(possible)}"
             )
+        if self.sensor_view and "touch" not in spec.modalities:
+            raise ValueError(f"lambda_sensor {self.lambda_sensor}: dataset {spec.name!r} has no touch, leave it out")
         return MViTac(self, spec, encoder)
 
 
