@@ -20,9 +20,9 @@ from mvitac.data.source import Sample
 from mvitac.evaluation import sensors as module
 from mvitac.evaluation.features import features
 from mvitac.evaluation.sensors import (
+    RecolouredPack,
     cross_sensor,
     describe_statistics,
-    in_known_colours,
     sensor_records,
     touch_features,
     unlabelled_rows,
@@ -104,7 +104,11 @@ def test_features_are_standardised_by_each_sensors_own_images(model: Model, othe
         own = others.sensors[rows] == number
         expected = (features(model, others, "touch", rows[own]) - seen.mean(0)) / (seen.std(0) + 1e-6)
         np.testing.assert_allclose(found[own], expected, rtol=1e-5, atol=1e-5)
-    for modality, kinds in (("vision", ("features",)), ("touch", ()), ("touch", ("colours",))):
+    for modality, kinds in (
+        ("vision", ("features",)),
+        ("touch", ()),
+        ("touch", ("colours",)),
+    ):  # colours: no new sensor here
         plain = touch_features(model, others, modality, rows, kinds, maps=False)  # type: ignore[arg-type]
         np.testing.assert_array_equal(plain, features(model, others, modality, rows))
     maps = touch_features(model, others, "touch", rows, ("features",), maps=True)
@@ -135,24 +139,37 @@ def test_batch_norm_takes_the_statistics_of_the_given_images(model: Model, other
     np.testing.assert_allclose(found[own], features(anew, others, "touch", others.rows("test")[own]), rtol=1e-5)
 
 
-def test_only_new_sensors_change_colours(others: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "learn_colours", lambda images: len(images))
-    monkeypatch.setattr(module, "recolour", lambda images, source, target: 255 - images)
-    known = with_columns(others, sensor=np.full(others.num, "plain"))
-    made = in_known_colours(others, known)
-    new = others.sensors == 0
-    np.testing.assert_array_equal(made.images["touch"][new], 255 - others.images["touch"][new])
-    np.testing.assert_array_equal(made.images["touch"][~new], others.images["touch"][~new])
-    np.testing.assert_array_equal(made.images["vision"][:5], others.images["vision"][:5])
-    assert made.digest != others.digest  # features are cached by it
+def test_new_sensors_are_shown_as_each_known_one(
+    pack: Pack, others: Pack, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only they change, and their features are the mean over the known sensors."""
+    monkeypatch.setattr(module, "learn_colours", lambda images: float(images.mean()))
+    monkeypatch.setattr(module, "recolour", lambda images, source, target: (images // 2 + int(target)).astype(np.uint8))
+    learn = with_columns(pack, sensor=np.where(pack.labels("bright"), "lit", "dim"))
+    both = RecolouredPack(learn, with_columns(others, sensor=np.full(120, "new")))
+    assert both.sensor_names == ("dim", "lit", "new") and both.new == {2} and len(both.looks) == 2
+    for look in both.looks:
+        np.testing.assert_array_equal(look.images["touch"][:120], pack.images["touch"])
+        assert (look.images["touch"][120:] != others.images["touch"]).mean() > 0.9
+        np.testing.assert_array_equal(look.images["vision"][120:], others.images["vision"])
+    assert len({both.digest, *(look.digest for look in both.looks)}) == 3  # features are cached by it
+    rows = np.concatenate([both.rows("val"), both.rows("test")])
+    found = touch_features(model, both, "touch", rows, ("colours",), maps=False)
+    each = [features(model, look, "touch", rows) for look in both.looks]
+    np.testing.assert_allclose(found, (each[0] + each[1]) / 2, rtol=1e-4, atol=1e-5)
+    both_kinds = touch_features(model, both, "touch", rows, ("features", "colours"), maps=False)
+    seen = np.mean([features(model, look, "touch", unlabelled_rows(both, 2)) for look in both.looks], axis=0)
+    new = rows >= 120
+    np.testing.assert_allclose(
+        both_kinds[new], (found[new] - seen.mean(0)) / (seen.std(0) + 1e-6), rtol=1e-3, atol=1e-3
+    )
     with pytest.raises(ValueError, match=r"all sensors of .* are in"):
-        in_known_colours(known, others)
+        RecolouredPack(learn, with_columns(others, sensor=np.full(120, "lit")))
 
 
-def test_stripes_have_no_slope_colours(others: Pack) -> None:
-    known = with_columns(others, sensor=np.full(others.num, "plain"))
-    with pytest.raises(ValueError, match=r"'(negative|plain)'.*leave --standardise colours out"):
-        in_known_colours(others, known)
+def test_stripes_have_no_slope_colours(pack: Pack, others: Pack) -> None:
+    with pytest.raises(ValueError, match=r"'(negative|plain|toy)'.*leave --standardise colours out"):
+        RecolouredPack(pack, others)
 
 
 def test_a_probe_for_the_sensor(model: Model, others: Pack, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.robustness import STRESSES, stress
 from mvitac.evaluation.scores import summarise, summarise_again
-from mvitac.evaluation.sensors import in_known_colours
+from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.model import load
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_sensors, print_summary
@@ -52,8 +52,8 @@ def probe(argv: list[str]) -> None:
     if options.learn_on:
         if not pack:
             raise ValueError("--learn-on fits the probes: name the pack on which they are scored, --on PACK")
-        learn = Pack(options.learn_on)
-        pack = JoinedPack(learn, in_known_colours(pack, learn) if "colours" in options.config.standardise else pack)
+        join = RecolouredPack if "colours" in options.config.standardise else JoinedPack
+        pack = join(Pack(options.learn_on), pack)
     elif "colours" in options.config.standardise:
         raise ValueError("--standardise colours shows a new sensor as one of --learn-on: name that pack as well")
     with shown(Console(stderr=True)):

@@ -56,7 +56,7 @@ class ProbeConfig:
     standardise: tuple[Standardise, ...] = field(default=(), metadata=LATER)
     """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
     their own mean and standard deviation. batch-norm: take the statistics of BatchNorm anew. colours: show images of a
-    sensor that --learn-on lacks in the colours of one that it has."""
+    sensor that --learn-on lacks in the colours of those that it has, and take the mean features."""
     sensors: bool = field(default=False, metadata=LATER)
     """Also say how well touch features tell the sensor, and how often they find the same press through another one."""
 
@@ -131,7 +131,7 @@ def probe_runs(
         "retrieval": retrieval,
         "summary": summarise(records, session.probes[0]),
     }
-    if set(session.standardise) - {"colours"}:
+    if session.standardise:
         result["statistics"] = describe_statistics(pack)
     if session.sensors:
         found_by = zip(names, models, strict=True)

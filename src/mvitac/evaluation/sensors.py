@@ -7,25 +7,28 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import nn
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.jpeg import Lazy
-from mvitac.data.pack import Images, Pack
+from mvitac.data.pack import Pack
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
-from mvitac.system.files import digest
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, learn_colours, recolour
 from mvitac.transforms.preprocess import encoder_input
 
 Standardise = Literal["colours", "batch-norm", "features"]
-NUM_STATISTICS = 512
+NUM_STATISTICS = 256
 """Images of a sensor that statistics are taken from, at most."""
+MAX_LOOKS = 4
+"""Known sensors in whose colours a new one is shown, at most."""
 
 
 def unlabelled_rows(pack: Pack, sensor: int, num: int = NUM_STATISTICS) -> np.ndarray:
@@ -62,17 +65,24 @@ def touch_features(
         rows: Pack rows, ascending.
         standardise: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
             each sensor. features: each sensor's features are standardised by their own mean and standard deviation.
+            colours: those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``.
         maps: Return the trunk's last feature maps [N, P, D] instead of features [N, D].
     """
-    if modality != "touch" or not set(standardise) - {"colours"}:
+    if modality != "touch" or not standardise:
         return features(model, pack, modality, rows, maps=maps)
     parts, sensors = {}, pack.sensors[rows]
     for number in np.unique(sensors):
-        known = unlabelled_rows(pack, int(number))
-        here = with_statistics(model, pack, known) if "batch-norm" in standardise else model
-        z = features(here, pack, modality, rows[sensors == number], maps=maps).astype(np.float32)
+        shown = pack.looks if isinstance(pack, RecolouredPack) and number in pack.new else [pack]
+        known, own = unlabelled_rows(pack, int(number)), rows[sensors == number]
+        models = [with_statistics(model, look, known) if "batch-norm" in standardise else model for look in shown]
+
+        def mean(rows: np.ndarray, each: list[tuple[Model, Pack]]) -> np.ndarray:
+            return np.mean([features(m, look, modality, rows, maps=maps) for m, look in each], axis=0, dtype=np.float32)
+
+        each = list(zip(models, shown, strict=True))
+        z = mean(own, each)
         if "features" in standardise:
-            seen = features(here, pack, modality, known, maps=maps).astype(np.float32)
+            seen = mean(known, each)
             axes = tuple(range(seen.ndim - 1))
             z = (z - seen.mean(axes)) / (seen.std(axes) + 1e-6)
         parts[number] = z
@@ -108,11 +118,11 @@ def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
 
 
 class _Recoloured(Lazy):
-    """Touch images, those of some rows through a function."""
+    """Touch images, those of some sensors through a function."""
 
-    def __init__(self, images: Images, change: dict[int, Callable[[np.ndarray], np.ndarray]], sensors: np.ndarray):
-        super().__init__(images.shape)  # type: ignore[arg-type]
-        self.images, self.change, self.sensors = images, change, sensors
+    def __init__(self, pack: Pack, change: dict[int, Callable[[np.ndarray], np.ndarray]]) -> None:
+        self.images, self.sensors, self.change = pack.images["touch"], pack.sensors, change
+        super().__init__(self.images.shape)  # type: ignore[arg-type]
 
     def _made(self, rows: np.ndarray) -> np.ndarray:
         made = np.array(self.images[rows])
@@ -122,32 +132,41 @@ class _Recoloured(Lazy):
         return made
 
 
-def in_known_colours(pack: Pack, known: Pack) -> Pack:
-    """``pack`` with the touch images of sensors that ``known`` lacks in the colours of one of its own.
+class RecolouredPack(JoinedPack):
+    """A joined pack that also shows the touches of sensors that ``learn`` lacks in the colours of those that it has.
 
-    The target is the sensor of ``known`` with the most rows, by name if two have as many.
+    Attributes:
+        new: Numbers of the sensors that ``learn`` lacks.
+        looks: One pack for each known sensor (at most ``MAX_LOOKS``, those with the most rows), with its colours.
 
     Raises:
-        ValueError: If ``known`` has all sensors of ``pack``, or the colours of a sensor cannot be learned.
+        ValueError: If ``learn`` has all sensors of ``score``, or the colours of a sensor cannot be learned.
     """
-    if pack.spec.touch_channels != 3 or pack.spec.frames("touch") > 1:
-        raise ValueError("--standardise colours knows single images of one gel only: leave it out")
-    new = [n for n, name in enumerate(pack.sensor_names) if name not in known.sensor_names]
-    if not new:
-        raise ValueError(f"--standardise colours: all sensors of {pack.path} are in {known.path} too, leave it out")
-    most = int(np.argmax(np.bincount(known.sensors, minlength=len(known.sensor_names))))
-    target = _colours_of(known, most)
-    learned = {n: _colours_of(pack, n) for n in new}
-    made = copy.copy(pack)
-    change: dict[int, Callable[[np.ndarray], np.ndarray]] = {
-        n: (lambda images, own=own: recolour(images, own, target)) for n, own in learned.items()
-    }
-    made.images = {**pack.images, "touch": _Recoloured(pack.images["touch"], change, pack.sensors)}
-    made.digests = {**pack.digests, "colours": digest([known.digest, most])}
-    return made
+
+    def __init__(self, learn: Pack, score: Pack) -> None:
+        super().__init__(learn, score)
+        if self.spec.touch_channels != 3 or self.spec.frames("touch") > 1:
+            raise ValueError("--standardise colours knows single images of one gel only: leave it out")
+        self.new = {n for n, name in enumerate(self.sensor_names) if name not in learn.sensor_names}
+        if not self.new:
+            raise ValueError(
+                f"--standardise colours: all sensors of {score.path} are in {learn.path} too, leave it out"
+            )
+        rows = np.bincount(self.sensors[: learn.num], minlength=len(self.sensor_names))
+        old = np.argsort(-rows, kind="stable")[: min(len(learn.sensor_names), MAX_LOOKS)]
+        learned = {number: _colours_of(self, number) for number in self.new}
+        self.looks = [self._look(learned, number, _colours_of(self, int(number))) for number in old]
+
+    def _look(self, learned: dict[int, GelColours], number: int, target: GelColours) -> Pack:
+        look: Pack = copy.copy(self)
+        change = {n: partial(recolour, source=own, target=target) for n, own in learned.items()}
+        look.images = {**self.images, "touch": _Recoloured(self, change)}
+        look.digests = {**self.digests, "colours": self.sensor_names[number]}
+        return look
 
 
 def _colours_of(pack: Pack, number: int) -> GelColours:
+    """The colours of a sensor of ``pack``, learned from unlabelled images."""
     try:
         return learn_colours(pack.images["touch"][unlabelled_rows(pack, number, NUM_IMAGES)])
     except ValueError as error:
