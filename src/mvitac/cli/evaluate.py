@@ -13,9 +13,10 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.robustness import STRESSES, stress
 from mvitac.evaluation.scores import summarise, summarise_again
+from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.model import load
 from mvitac.report.report import write_report
-from mvitac.report.tables import print_retrieval, print_summary
+from mvitac.report.tables import print_retrieval, print_sensors, print_summary
 from mvitac.system.console import Console
 from mvitac.system.files import read_json
 from mvitac.system.progress import shown, work
@@ -53,7 +54,10 @@ def probe(argv: list[str]) -> None:
     if options.learn_on:
         if not pack:
             raise ValueError("--learn-on fits the probes: name the pack on which they are scored, --on PACK")
-        pack = JoinedPack(Pack(options.learn_on), pack)
+        join = RecolouredPack if "colours" in options.config.standardise else JoinedPack
+        pack = join(Pack(options.learn_on), pack)
+    elif "colours" in options.config.standardise:
+        raise ValueError("--standardise colours shows a new sensor as one of --learn-on: name that pack as well")
     with shown(Console(stderr=True)):
         result = probe_runs(options.runs, options.config, pack, allow_leak=options.allow_leak, weights=options.weights)
     say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
@@ -65,6 +69,7 @@ def probe(argv: list[str]) -> None:
         if mine := [r for r in stressed if r["probe"] == kind]:
             print_summary({**result, "summary": summarise(mine + majority, kind)}, say, probe=kind)
     print_retrieval(result, say)
+    print_sensors(result, say)
     result["records"] += stressed
     save_json(options.json, result)
 

@@ -116,6 +116,7 @@ def _side(pack: Pack, tasks: list[tuple[AnyTask, AnyTask]], splits: set[str], na
     columns["id"] = pa.array([f"{name}/{one}" for one in columns["id"].to_pylist()])
     for column in splits:
         columns[column] = pa.array([s if s in keep else "hidden" for s in pack.table.column(column).to_pylist()])
+    columns["sensor"] = pa.array(np.array(pack.sensor_names)[pack.sensors])
     for modality in pack.spec.modalities:
         columns[f"has_{modality}"] = pa.array(pack.has(modality))
     own = {task.name: task for task in pack.spec.tasks}

@@ -250,6 +250,20 @@ class Pack:
         return np.unique(self.column("press").astype(str), return_inverse=True)[1]
 
     @functools.cached_property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the touch sensors (column sensor), sorted. Without the column, all rows are of one sensor."""
+        if "sensor" not in self.table.column_names:
+            return (self.spec.name,)
+        return tuple(np.unique(self.column("sensor").astype(str)).tolist())
+
+    @functools.cached_property
+    def sensors(self) -> np.ndarray:
+        """int64 [N], number of each row's touch sensor in ``sensor_names``."""
+        if "sensor" not in self.table.column_names:
+            return np.zeros(self.num, np.int64)
+        return np.searchsorted(self.sensor_names, self.column("sensor").astype(str))
+
+    @functools.cached_property
     def _rows_by(self) -> dict[str, list[np.ndarray]]:
         return {}
 

@@ -29,6 +29,7 @@ from mvitac.evaluation.probe import (
     score_rows,
     split_rows,
 )
+from mvitac.evaluation.sensors import Standardise
 from mvitac.model import fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.run import Run
@@ -63,6 +64,7 @@ def controls_of(
     probes: Sequence[str],
     imagenet: Path | None = None,
     specs: Sequence[DataSpec] = (),
+    standardise: tuple[Standardise, ...] = (),
 ) -> tuple[Records, Records]:
     """Score every control for ``runs``.
 
@@ -74,6 +76,7 @@ def controls_of(
         probes: Probes of the trunks; all other controls get logistic regression.
         imagenet: A file of ImageNet weights for one more trunk.
         specs: What the runs were trained on, where that is not ``pack``.
+        standardise: As for the runs (``sensors.touch_features``), for the trunks.
 
     Returns:
         Probe records and retrieval records, each with its "source" and "seed".
@@ -84,12 +87,12 @@ def controls_of(
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
     with work("fitting probes of the controls", num, "probes"):
         records += pixel_controls(pack, tasks, modalities)
-        found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes)
+        found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes, standardise)
         records += found
         for name in weights:
             run, spec = starts[0]
             start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
-            records += _named("imagenet", None, probe_model(start, pack, tasks, modalities, probes))
+            records += _named("imagenet", None, probe_model(start, pack, tasks, modalities, probes, standardise))
     return records, retrieval
 
 
@@ -140,11 +143,16 @@ def _untrained_trunks(
     tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     probes: Sequence[str],
+    standardise: tuple[Standardise, ...],
 ) -> tuple[Records, Records]:
     # Built one by one: threads would share the random generator.
     models = [fresh(scratch(run), spec, pack.size) for run, spec in starts]
     scored = in_threads(
-        lambda model: (probe_model(model, pack, tasks, modalities, probes), cross_modal(model, pack)), models
+        lambda model: (
+            probe_model(model, pack, tasks, modalities, probes, standardise),
+            cross_modal(model, pack),
+        ),
+        models,
     )
     records, retrieval = [], []
     for (run, _), (found, ranked) in zip(starts, scored, strict=True):

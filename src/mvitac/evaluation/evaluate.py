@@ -29,6 +29,7 @@ from mvitac.evaluation.probe import (
 )
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
+from mvitac.evaluation.sensors import Standardise, describe_statistics, sensor_records
 from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import LATER, from_json, to_json, unknown
@@ -66,9 +67,20 @@ class ProbeConfig:
     (--data.order, else frame, seq or time)."""
     false_alarms: float = field(default=0.1, metadata=LATER)
     """Share of recordings without the --event in which an alarm is accepted. It sets the threshold, on train and val."""
+    standardise: tuple[Standardise, ...] = field(default=(), metadata=LATER)
+    """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
+    their own mean and standard deviation. batch-norm: take the statistics of BatchNorm anew. colours: show images of a
+    sensor that --learn-on lacks in the colours of those that it has, and take the mean features."""
+    sensors: bool = field(default=False, metadata=LATER)
+    """Also say how well touch features tell the sensor, and how often they find the same press through another one."""
 
     def __post_init__(self) -> None:
-        for name, values in (("probe", self.probes), ("task", self.tasks), ("modality", self.modalities)):
+        for name, values in (
+            ("probe", self.probes),
+            ("task", self.tasks),
+            ("modality", self.modalities),
+            ("standardise", self.standardise),
+        ):
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
@@ -174,7 +186,7 @@ def probe_runs(
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     if session.controls:
         specs = [m.spec for m in models]
-        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
+        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
     result = {
         "data": pack.spec.name,
@@ -190,6 +202,13 @@ def probe_runs(
         "retrieval": retrieval,
         "summary": summarise(records, session.probes[0]),
     }
+    if session.standardise:
+        result["statistics"] = describe_statistics(pack)
+    if session.sensors:
+        found_by = zip(names, models, strict=True)
+        result["sensors"] = [
+            {"source": n, "seed": m.run.seed, **r} for n, m in found_by for r in sensor_records(m, pack)
+        ]
     for path in paths:
         write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
     return Scores(result)
@@ -233,6 +252,7 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
     except (ValueError, KeyError, TypeError):  # 0.1.0 wrote the scores of the run alone
         return None
     whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
+    whole &= not asked.standardise
     return result if same and whole and scored == {path.resolve() for path in paths} else None
 
 
@@ -304,7 +324,7 @@ def _probe_run(
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of one run."""
     own, pack = {"source": source, "seed": model.run.seed, "run": str(path)}, scored.pack
-    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
+    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes, session.standardise)]
     leaks = {task.name: scored.leak(learned, split_rows(pack, task).test) for task in tasks}
     for record in records:
         record["source"] += END_TO_END if record["probe"] == "own" else ""

@@ -22,6 +22,7 @@ from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
 from mvitac.evaluation.regressors import Regressor, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
+from mvitac.evaluation.sensors import Standardise, touch_features
 from mvitac.evaluation.trained_probes import TRAINED, fit_network
 from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
@@ -193,9 +194,16 @@ def fit_values(
 
 
 def probe_model(
-    model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str]
+    model: Model,
+    pack: Pack,
+    tasks: Sequence[AnyTask],
+    modalities: Sequence[str],
+    probes: Sequence[str],
+    standardise: tuple[Standardise, ...] = (),
 ) -> list[dict[str, Any]]:
     """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
+
+    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones.
 
     Returns:
         One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
@@ -208,7 +216,7 @@ def probe_model(
     own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
 
     def source_of(maps: bool) -> FeatureSource:
-        by_modality = {m: features(model, pack, m, rows, maps=maps) for m, rows in own.items()}
+        by_modality = {m: touch_features(model, pack, m, rows, standardise, maps=maps) for m, rows in own.items()}
 
         def source(modality: str, rows: np.ndarray) -> np.ndarray:
             return joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])

@@ -99,9 +99,7 @@ def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Seque
     return records
 
 
-def few_labels(
-    x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, share: float, seed: int
-) -> dict[str, Any]:
+def few_labels(x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, share: float, seed: int) -> dict[str, Any]:
     """Scores of the linear probe on features ``x`` of ``rows.all``, fitted with ``share`` of the labels (``SHARES``)."""
     case = _Case(pack, task, rows, {"": x}, seed)
     return case.probe(*_few(rows, _strata(case), share, seed))

@@ -207,6 +207,24 @@ class MethodConfig(Registered, ABC):
             )
 
     @property
+    def sensor_view(self) -> bool:
+        """Whether ``Views.images["touch"]`` ends with one more view, of the same press through another sensor."""
+        return False
+
+    def check_pack(self, pack: Pack) -> None:
+        """Raise ValueError if ``pack`` lacks rows that a setting needs. Called before anything is written."""
+        if not self.sensor_view:
+            return
+        rows, pairs = self.training_rows(pack), np.zeros((2, 0), np.int64)
+        if "press" in pack.table.column_names:
+            pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
+        if not (np.bincount(pairs[0]) > 1).any():
+            raise ValueError(
+                "lambda_sensor needs presses of one spot through two sensors, rows with the same value in column press"
+                " and another in column sensor, and there are none to train on: simulate with --data.sensors-per-press 2"
+            )
+
+    @property
     def label_splits(self) -> tuple[str, ...]:
         """Splits whose labels ``Views.labels`` has."""
         return ("train",)

@@ -50,6 +50,9 @@ class MViTacConfig(MethodConfig):
     """Temperature tau of InfoNCE. The paper compares .07, .2, .5 and 1; .07 is best."""
     lambda_inter: float = 1.0
     """Weight of the two inter-modal losses (eq. 14). Not given in the paper; 1 in the authors' code."""
+    lambda_sensor: float = field(default=0.0, metadata=LATER_IN_DIGEST)
+    """Weight of one more loss beside eq. 14: a touch view is told from others by the same press through another sensor
+    (rows with the same value in column press and another in column sensor). 0: none (paper)."""
     momentum: float = 0.99
     """Momentum m of eq. 1-3. Not given in the paper; .99 in the authors' code."""
     momentum_end: float | None = None
@@ -82,7 +85,7 @@ class MViTacConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(
             positive=("temperature",),
-            weight=("lambda_inter",),
+            weight=("lambda_inter", "lambda_sensor"),
             share=("momentum", "momentum_end"),
             width=("out", "hidden"),
         )
@@ -94,6 +97,10 @@ class MViTacConfig(MethodConfig):
             )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
+
+    @property
+    def sensor_view(self) -> bool:
+        return self.lambda_sensor > 0
 
     @property
     def both_ways(self) -> bool:
@@ -108,6 +115,8 @@ class MViTacConfig(MethodConfig):
 
     def without_idle(self, spec: DataSpec) -> Self:
         mine = replace(self, losses=tuple(part for part in possible_losses(spec) if part in self.losses))
+        if "touch" not in spec.modalities:
+            mine = replace(mine, lambda_sensor=0.0)
         return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
@@ -117,6 +126,8 @@ class MViTacConfig(MethodConfig):
                 f"losses {', '.join(self.losses)} need another modality than dataset {spec.name!r} has:"
                 f" give some of {', '.join(possible)}"
             )
+        if self.sensor_view and "touch" not in spec.modalities:
+            raise ValueError(f"lambda_sensor {self.lambda_sensor}: dataset {spec.name!r} has no touch, leave it out")
         return MViTac(self, spec, encoder)
 
 
@@ -167,12 +178,14 @@ class MViTac(Contrastive):
     def queries(self, batch: Views) -> Embeddings:
         """Eq. 4, 6, 9, 12."""
         views = (0, 1) if self.config.both_ways else (0,)
-        return embed("q", self.query, batch, views)
+        return embed("q", self.query, batch, views, more=self.config.keys == "end-to-end")
 
     def keys(self, batch: Views) -> Embeddings:
         """Eq. 5, 7, 10, 13. End-to-end keys are the queries themselves, so there is nothing to add."""
         views = (1, 0) if self.config.both_ways else (1,)
-        return embed("k", self.key, batch, views) | {("both", m): positions for m, positions in batch.both.items()}
+        return embed("k", self.key, batch, views, more=True) | {
+            ("both", m): positions for m, positions in batch.both.items()
+        }
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         k = "q" if self.config.keys == "end-to-end" else "k"
@@ -185,6 +198,11 @@ class MViTac(Contrastive):
                 losses[part] = torch.stack(terms).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         minimised = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
+        if (
+            self.config.sensor_view and ("q", "touch", 0, "intra") in z
+        ):  # its key is the same press through another sensor
+            losses["sensor"] = info_nce(z["q", "touch", 0, "intra"], z[k, "touch", 2, "intra"], self.config.temperature)
+            minimised.append(self.config.lambda_sensor * losses["sensor"])
         return {"loss": torch.stack(minimised).sum(), **losses}  # eq. 14; losses that are not minimised are logged too
 
     def view_pairs(self, head: str) -> tuple[tuple[int, int], ...]:
@@ -205,15 +223,17 @@ class MViTac(Contrastive):
             key.follow(self.query[modality], m)  # type: ignore[operator]  # eq. 1-3
 
 
-def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...]) -> Embeddings:
+def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...], *, more: bool) -> Embeddings:
     """Embeddings of ``views`` of each modality by both heads, keyed ``(name, modality, view, head)``.
+
+    With ``more``, also of the views after the first two (``MethodConfig.sensor_view``).
 
     On a CPU the two towers run side by side, except with dropout, which needs one order of random numbers.
     """
 
     def of(modality: str) -> Embeddings:
         z: Embeddings = {}
-        for view in views:
+        for view in (*views, *(range(2, len(batch.images[modality])) if more else ())):
             images = batch.images[modality][view]
             z[name, modality, view, "intra"], z[name, modality, view, "inter"] = towers[modality](images)
         return z

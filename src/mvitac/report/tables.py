@@ -141,6 +141,22 @@ def print_retrieval(result: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
+def print_sensors(result: dict[str, Any], console: Console) -> None:
+    """Print which statistics of touch sensors were used, and what features tell of the sensor, if either was asked for."""
+    for line in result.get("statistics", ()):
+        console.print(line, markup=False, highlight=False)
+    if not result.get("sensors"):
+        return
+    table = Table(title="touch sensors", title_justify="left", title_style="bold")
+    for column in ("", "", "%", "chance %"):
+        table.add_column(column)
+    for source, name in dict.fromkeys((r["source"], r["name"]) for r in result["sensors"]):
+        found = [r for r in result["sensors"] if (r["source"], r["name"]) == (source, name)]
+        shown = [percent(sum(r[key] for r in found) / len(found)) for key in ("score", "chance")]
+        table.add_row(source, "R@5: " * (name != "which sensor") + name, *shown)
+    console.print(table)
+
+
 def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Rows of source, direction and ``RETRIEVAL`` in percent, averaged over seeds."""
     rows = []

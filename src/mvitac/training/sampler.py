@@ -258,10 +258,12 @@ def partners(
     generator: torch.Generator,
     of: Literal["touch_groups", "presses"] = "touch_groups",
     within: float = 0.0,
+    other_sensor: bool = False,
 ) -> np.ndarray:
     """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
-    With ``within``, its distance in time is at most that. A row without such others is its own partner.
+    With ``within``, its distance in time is at most that; with ``other_sensor``, it is of another sensor. A row without
+    such others is its own partner.
     """
     groups: np.ndarray = getattr(pack, of)
     split, shards = pack.column("split"), pack.shards
@@ -274,6 +276,8 @@ def partners(
         others = others[shards[others] == shards[row]]
         if within:
             others = others[abs(place[others] - place[row]) <= within + 1e-9]
+        if other_sensor:
+            others = others[pack.sensors[others] != pack.sensors[row]]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found

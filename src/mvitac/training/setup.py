@@ -70,6 +70,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
         _ = pack.presses  # the ValueError comes before anything is written
     if run.positives_within:
         places(pack, pack.spec.window)  # the same
+    run.method.check_pack(pack)
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)

@@ -92,6 +92,8 @@ def make_views(
     sources = dict.fromkeys(pack.spec.modalities, views)
     if run.positives == "same-touch-pairs" and num_views == 1:
         sources["touch"] = [partners(pack, rows, generator, within=run.positives_within)]
+    if run.method.sensor_view:
+        sources["touch"] = [*sources["touch"], partners(pack, rows, generator, "presses", other_sensor=True)]
     dtype = torch.bfloat16 if run.bf16 else torch.float32
     images: dict[str, list[Tensor]] = {}
     has = senses(pack, rows)
