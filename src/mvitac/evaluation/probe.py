@@ -222,15 +222,19 @@ def _own_heads(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: S
         if whole not in modalities or task.name not in known or set(_outputs(task)) - set(known[task.name]):
             continue  # not a task that it learned, or not all of its classes or targets
         rows = split_rows(pack, task, whole).test
-        z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
-        # Match columns by name: this pack may order the classes differently or have fewer.
-        columns = [known[task.name].index(name) for name in _outputs(task)]
-        if isinstance(task, Task):
-            result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
-        else:
-            result = score_predictions(pack, task, rows, model.estimate(task.name, z).numpy()[:, columns])
-        records.append({"task": task.name, "modality": whole, "probe": "own", **result})
+        records.append({"task": task.name, "modality": whole, "probe": "own", **score_own_head(model, pack, task, rows)})
     return records
+
+
+def score_own_head(model: Model, pack: Pack, task: AnyTask, rows: np.ndarray) -> dict[str, Any]:
+    """Scores on pack ``rows`` of the head that ``model`` trained for a task of this name."""
+    known = next(_outputs(own) for own in model.spec.all_tasks if own.name == task.name)
+    z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
+    # Match columns by name: this pack may order the classes differently or have fewer.
+    columns = [known.index(name) for name in _outputs(task)]
+    if isinstance(task, Task):
+        return score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
+    return score_predictions(pack, task, rows, model.estimate(task.name, z).numpy()[:, columns])
 
 
 def _outputs(task: AnyTask) -> tuple[Any, ...]:
@@ -322,16 +326,16 @@ def retrieved_rows(pack: Pack) -> np.ndarray:
     return pack.rows("test", only=only, having=pack.spec.modalities)
 
 
-def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
-    """Retrieval of test groups across modalities, in both directions.
+def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
+    """Retrieval of groups across modalities, in both directions, among ``rows`` (default: ``retrieved_rows``).
 
     Returns:
         One record per direction: R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. Empty without a
-        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` test groups.
+        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
-    rows = retrieved_rows(pack)
+    rows = retrieved_rows(pack) if rows is None else rows
     sizes = np.bincount(_group_numbers(pack, rows))
     if len(sizes) < MIN_GALLERY:
         return []

@@ -18,8 +18,9 @@ from mvitac.evaluation.score_text import (
     score_name,
     sources_of,
     tested_on,
+    with_interval,
 )
-from mvitac.evaluation.scores import interval, leaks_in
+from mvitac.evaluation.scores import interval, leaks_in, paired_difference
 from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
@@ -133,3 +134,37 @@ def by_direction(records: Sequence[dict[str, Any]]) -> dict[tuple[str, str], lis
     for record in records:
         found.setdefault((record["source"], record["direction"]), []).append(record)
     return found
+
+
+def print_finetuning(result: dict[str, Any], console: Console) -> None:
+    """Print the result of ``experiments.finetune``: a table per task, with a column for each share of the labels."""
+    fractions = list(dict.fromkeys(record["fraction"] for record in result["records"]))
+    for task in dict.fromkeys(record["task"] for record in result["records"]):
+        cells: dict[str, dict[float, list[dict[str, Any]]]] = {}
+        for record in result["records"]:
+            if record["task"] == task:
+                cells.setdefault(record["source"], {}).setdefault(record["fraction"], []).append(record)
+        first, *others = cells
+        score, seeds = ("R2" if "r2" in result["records"][0] else "accuracy"), len(cells[first][fractions[0]])
+        about = f"{score} % on test {result['group_by']}s; {seeds} seed{'s' * (seeds != 1)}"
+        table = Table(title=f"{result['data']}: {task} ({about})", title_justify="left", title_style="bold")
+        table.add_column("")
+        for fraction in fractions:
+            table.add_column(f"{fraction:g} % of groups", justify="right", no_wrap=True)
+        for source, found in cells.items():
+            table.add_row(source, *(with_interval(*interval(r), leaks_in(r)).replace(" LEAK", "\nLEAK") for r in found.values()))
+        table.add_section()
+        for source in others:
+            table.add_row(f"gain over {source}", *(gain_text(cells[first][f], cells[source][f]) for f in fractions))
+        console.print(table)
+    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
+    for note in result["notes"]:
+        console.print(f"note: {note}", markup=False, highlight=False)
+    for leak in result["leaks"]:
+        console.print(f"LEAK: {leak}", markup=False, highlight=False)
+
+
+def gain_text(ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]) -> str:
+    """The paired difference of two sources in points, with its interval, such as '+3.1 [+0.4, +5.8]'."""
+    mean, low, high, _ = paired_difference(ours, theirs)
+    return f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
