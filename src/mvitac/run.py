@@ -14,6 +14,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.initial import Init
 from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -91,6 +92,7 @@ class Run:
     method: MethodConfig = MViTacConfig()
     data: DatasetConfig
     encoder: EncoderConfig = EncoderConfig()
+    init: Init = field(default=Init(), metadata=LATER_IN_DIGEST)
     renew_norms: int = field(default=0, metadata=LATER_IN_DIGEST)
     """Batches on which the running statistics of BatchNorm are estimated anew before the first step, for data of another
     sensor than that of --init. 0 = keep them."""
@@ -221,8 +223,9 @@ class Run:
         return replace(self, recipe="", method=self.method.without_idle(spec), augment=replace(self.augment, **unseen))
 
     def digest(self) -> str:
-        """Content address of all settings that decide the outcome."""
-        value = to_json(self, for_digest=True)
+        """Content address of all settings that decide the outcome. Start weights count by content, not by path."""
+        init = self.init if self.init.digest else self.init.resolved()
+        value = to_json(replace(self, init=replace(init, path=None)), for_digest=True)
         for name in NOT_IN_DIGEST:
             del value[name]
         for name in self.data.without_effect:

@@ -219,7 +219,8 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         write_json(partial / "run.json", record)
         if learned is not None:
             write_sources(partial, learned)
-        manifest = {**_describe(model, pack), "scores": scores}
+        start = {"start": start} if (start := record.get("start")) else {}
+        manifest = {**_describe(model, pack), **start, "scores": scores}
         write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
         write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})

@@ -13,7 +13,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
-from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import (
     PROBES,
     Probe,
@@ -198,15 +198,16 @@ def check_unseen(
     """What each run at ``paths`` learned from; None where that is not known.
 
     Raises:
-        ValueError: If a run saw what other data than its own would score. In its own data the split was chosen, so the
-            scores only say LEAK.
+        ValueError: If a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
+            its own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
     for path, model in zip(paths, models, strict=True):
         digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
         sources.append(learned := read_sources(path, model.run, digest, pack))
-        for task in tasks if learned is not None and digest != pack.digest and not allow_leak else ():
-            if leak := scored.leak(learned, split_rows(pack, task).test):
+        refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
+        for task in tasks if refused else ():
+            if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 raise ValueError(
                     f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}; give a pack whose test"
                     " groups it was not trained on, or --allow-leak to score it with LEAK beside every score"

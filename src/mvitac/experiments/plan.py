@@ -145,7 +145,7 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
     """``run`` with fields changed by dotted name; values as in JSON."""
     value = to_json(run)
     for name, new in changes.items():
-        *path, last = name.split(".")
+        *path, last = ("init", "path") if name == "init" else name.split(".")
         inner = value
         for part in path:
             inner = inner.get(part) if isinstance(inner, dict) else None

@@ -140,10 +140,17 @@ def last_map(trunk: nn.Module, images: Tensor) -> Tensor:
 def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:
     trunk = _from_timm(config, channels)
     if config.stem == "random" and channels != 3:
-        names = trunk.pretrained_cfg["first_conv"]  # type: ignore[index]
-        for name in [names] if isinstance(names, str) else names:
+        for name in stem_names(trunk):
             trunk.get_submodule(name).reset_parameters()  # type: ignore[operator]
     return trunk
+
+
+def stem_names(trunk: nn.Module) -> list[str]:
+    """Names of the convolutions of a timm model that see the image."""
+    known = (getattr(trunk, "pretrained_cfg", None) or {}).get("first_conv")
+    if known:
+        return [known] if isinstance(known, str) else list(known)
+    return [name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d)][:1]
 
 
 def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
