@@ -49,7 +49,12 @@ def test_only_the_part_gets_gradients(part: str) -> None:
         assert (parameter.grad is not None) == parameter.requires_grad, name
     trained = {name for name, p in method.named_parameters() if p.requires_grad}
     assert all(f"heads.{i}.weight" in trained for i in (0, 1))
-    frozen = {"head": "trunks", "attentive": "trunks.touch.trunk", "last-stage": "trunks.touch.layer1", "lora": "original"}
+    frozen = {
+        "head": "trunks",
+        "attentive": "trunks.touch.trunk",
+        "last-stage": "trunks.touch.layer1",
+        "lora": "original",
+    }
     assert part == "all" or not any(frozen[part] in name for name in trained)
 
 

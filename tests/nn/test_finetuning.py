@@ -56,7 +56,9 @@ def test_lora_trains_few_numbers_and_merges_into_plain_weights(trunk: str) -> No
     assert {type(m) for m in whole.modules()} == {type(m) for m in plain.modules()}
 
 
-@pytest.mark.parametrize(("trunk", "stage"), [("mvitac_tiny", "layer4."), ("test_vit", "blocks.5."), ("test_vit", "norm.")])
+@pytest.mark.parametrize(
+    ("trunk", "stage"), [("mvitac_tiny", "layer4."), ("test_vit", "blocks.5."), ("test_vit", "norm.")]
+)
 def test_last_stage(trunk: str, stage: str) -> None:
     network = tiny(trunk)
     if stage == "norm.":  # what follows the last block is trained with it
@@ -67,7 +69,9 @@ def test_last_stage(trunk: str, stage: str) -> None:
     known = timm.create_model(trunk, num_classes=0)
     last = known.feature_info[-1]["module"]  # type: ignore[index, union-attr]
     before = {n for n, _ in network.named_parameters()} - trained
-    assert all(n.startswith((f"{last}.", "norm", "fc_norm")) for n in trained) and not any(n.startswith(f"{last}.") for n in before)
+    assert all(n.startswith((f"{last}.", "norm", "fc_norm")) for n in trained) and not any(
+        n.startswith(f"{last}.") for n in before
+    )
 
 
 def test_frozen_layers_keep_their_statistics() -> None:
@@ -117,4 +121,6 @@ def test_statistics_anew_are_those_of_the_batches() -> None:
     torch.testing.assert_close(norm.running_var, variance)
     assert norm.momentum == 0.3
     z = network.eval()(torch.cat(batches))
-    torch.testing.assert_close(z, F.relu((network[0](torch.cat(batches)) - mean[:, None, None]) / (variance + 1e-5).sqrt()[:, None, None]))
+    torch.testing.assert_close(
+        z, F.relu((network[0](torch.cat(batches)) - mean[:, None, None]) / (variance + 1e-5).sqrt()[:, None, None])
+    )

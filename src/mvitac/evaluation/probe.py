@@ -92,6 +92,18 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
     return ProbeSplit(train, val, test)
 
 
+def scorable(pack: Pack) -> list[AnyTask]:
+    """The tasks of ``pack`` that have labelled rows in train and test."""
+    found = []
+    for task in pack.spec.all_tasks:
+        try:
+            split_rows(pack, task)
+        except ValueError:
+            continue
+        found.append(task)
+    return found
+
+
 def _check_measured(values: np.ndarray, task: ValueTask, rows: dict[str, np.ndarray]) -> None:
     """Check that each target has two different values in each of ``rows``: without them it has no R2."""
     for t, target in enumerate(task.targets):
@@ -202,7 +214,7 @@ def probe_model(
 
     maps = source_of(True) if "attentive" in probes else None
     records = probe_all(source_of(False), pack, tasks, modalities, probes, model.run.seed, maps)
-    return records + _own_heads(model, pack, tasks, modalities)
+    return records + own_heads(model, pack, tasks, modalities)
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
@@ -213,28 +225,28 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
-def _own_heads(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> list[dict[str, Any]]:
-    """Records of the heads that the model trained along with its encoders."""
+def own_heads(
+    model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], among: np.ndarray | None = None
+) -> list[dict[str, Any]]:
+    """Records of the heads that the model trained along with its encoders, on test rows or on the labelled ``among``."""
     whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
     known = {task.name: _outputs(task) for task in model.spec.all_tasks if task.name in model.tasks}
     records = []
     for task in tasks:
         if whole not in modalities or task.name not in known or set(_outputs(task)) - set(known[task.name]):
             continue  # not a task that it learned, or not all of its classes or targets
-        rows = split_rows(pack, task, whole).test
-        records.append({"task": task.name, "modality": whole, "probe": "own", **score_own_head(model, pack, task, rows)})
+        rows = split_rows(pack, task, whole).test if among is None else among[pack.answered(task)[among]]
+        if not len(rows):
+            continue
+        z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
+        # Match columns by name: this pack may order the classes differently or have fewer.
+        columns = [known[task.name].index(name) for name in _outputs(task)]
+        if isinstance(task, Task):
+            result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
+        else:
+            result = score_predictions(pack, task, rows, model.estimate(task.name, z).numpy()[:, columns])
+        records.append({"task": task.name, "modality": whole, "probe": "own", **result})
     return records
-
-
-def score_own_head(model: Model, pack: Pack, task: AnyTask, rows: np.ndarray) -> dict[str, Any]:
-    """Scores on pack ``rows`` of the head that ``model`` trained for a task of this name."""
-    known = next(_outputs(own) for own in model.spec.all_tasks if own.name == task.name)
-    z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
-    # Match columns by name: this pack may order the classes differently or have fewer.
-    columns = [known.index(name) for name in _outputs(task)]
-    if isinstance(task, Task):
-        return score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
-    return score_predictions(pack, task, rows, model.estimate(task.name, z).numpy()[:, columns])
 
 
 def _outputs(task: AnyTask) -> tuple[Any, ...]:

@@ -1,8 +1,7 @@
 """``mvitac adapt``: a model on unlabelled data of a new sensor, what it gains there and what it forgets of the old ones.
 
-First the running statistics of BatchNorm are estimated anew on the new data (Li et al., arXiv:1603.04779), then the run's
-own method goes on from its weights for a few steps. The folder is that of a run like any other, with the scores before and
-after in adapted.json.
+First the running statistics of BatchNorm are estimated anew on the new data (arXiv:1603.04779), then the run's own method
+goes on from its weights for a few steps. The result is a run like any other, with all scores in adapted.json.
 """
 
 from __future__ import annotations
@@ -14,23 +13,19 @@ from typing import Any
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import scratch
-from mvitac.evaluation.evaluate import check_unseen
+from mvitac.evaluation.evaluate import check_channels, check_unseen
 from mvitac.evaluation.leaks import Scored, Source, read_sources
-from mvitac.evaluation.probe import cross_modal, probe_model, retrieved_rows, split_rows
+from mvitac.evaluation.probe import cross_modal, probe_model, retrieved_rows, scorable, split_rows
 from mvitac.model import Model, load
 from mvitac.nn.initial import Init
 from mvitac.run import Run
 from mvitac.system.files import brief, write_json
-from mvitac.system.progress import work
 from mvitac.training.loop import train
 from mvitac.training.setup import check_out
 
 NEW, OLD, TRANSFER = "new data", "old data", "probes of old labels on new data"
-BEFORE, AFTER = "before", "after"
-Say = Callable[[str], object]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +47,6 @@ class Adaptation:
     allow_leak: bool = False
     """Score also on rows or groups that the model was trained on. LEAK stands beside every such score."""
 
-    def __post_init__(self) -> None:
-        if self.batches < 0 or self.steps < 0 or not self.batches + self.steps:
-            raise ValueError(f"steps {self.steps}, batches {self.batches}: give numbers >= 0, not both 0")
-        if self.lr is not None and not self.lr > 0:
-            raise ValueError(f"lr {self.lr}: give a positive learning rate")
-
 
 def adapt(
     ancestor: Path,
@@ -67,9 +56,9 @@ def adapt(
     *,
     resume: bool = False,
     quiet: bool = False,
-    say: Say = print,
+    say: Callable[[str], object] = print,
 ) -> dict[str, Any]:
-    """Adapt the model at ``ancestor`` to ``data`` and score both on the new and on the old data.
+    """Adapt the model at ``ancestor`` to ``data``, and score both models on the new and on the old data.
 
     Args:
         ancestor: Folder of a finished run, or of an artifact.
@@ -82,31 +71,26 @@ def adapt(
 
     Returns:
         The content of adapted.json: "records", each with "data" (what it was scored on), "source" (before or after), "task"
-        (or a direction of retrieval), "modality" and its scores.
+        (R@5 for retrieval), "modality" (or direction) and its scores.
 
     Raises:
         ValueError: If the data does not fit the model, or the model saw what would be scored.
     """
     check_out(out, resume)
     model, pack = load(ancestor), data.open(quiet=quiet)
-    run = _run_of(model, ancestor, data, pack, asked)
-    old = _old_pack(model, asked.old, say)
-    packs = {NEW: pack} | ({OLD: old} if old else {})
-    sources = {  # before anything is trained
-        name: check_unseen([ancestor], [model], one, _scorable(one), allow_leak=asked.allow_leak)[0]
+    check_channels(ancestor, model, pack, tuple(model.encoders))
+    packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
+    sources = {  # refuses leaks before anything is trained
+        name: check_unseen([ancestor], [model], one, scorable(one), allow_leak=asked.allow_leak)[0]
         for name, one in packs.items()
     }
-    train(run, out, resume=resume, quiet=quiet, pack=pack)
-    after = load(out)
-    if old and (joined := _joined(old, pack, say)):
-        packs[TRANSFER], sources[TRANSFER] = joined, sources[NEW]
-    records = []
+    train(_run_of(model, ancestor, data, pack, asked), out, resume=resume, quiet=quiet, pack=pack)
+    records, after = [], load(out)
     for name, one in packs.items():
-        with work(f"scores on {name}"):
-            learned = {BEFORE: sources[name], AFTER: read_sources(out, after.run, pack.digest, one)}
-            for source, scored in ((BEFORE, model), (AFTER, after)):
-                found = _scores(scored, one, learned[source], retrieval=name != TRANSFER)
-                records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
+        learned = read_sources(out, after.run, pack.digest, one)
+        for source, scored, known in (("before", model, sources[name]), ("after", after, learned)):
+            found = _scores(scored, one, known, retrieval=name != TRANSFER)
+            records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
     result = {"ancestor": str(ancestor), "group_by": pack.spec.group_by, "records": records}
     write_json(out / "adapted.json", result)
     return result
@@ -114,80 +98,40 @@ def adapt(
 
 def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, asked: Adaptation) -> Run:
     """The run of ``model`` on the new data, from its weights."""
-    check_channels(model, pack, model.encoders)
     old = scratch(model.run)
-    num = len(old.method.training_rows(pack))
-    return replace(
-        old,
-        recipe="adapt",
-        data=data,
-        init=Init(path=ancestor),
-        renew_norms=asked.batches,
-        steps=asked.steps,
-        optim=replace(old.optim, lr=asked.lr or old.optim.lr / 10, schedule="cosine", warmup=0.1),
-        batch_size=asked.batch_size or max(2, min(old.batch_size, num)),
-        seed=asked.seed,
-        eval_every=0,
-        checkpoint_every=0,
-    )
+    lr = old.optim.lr / 10 if asked.lr is None else asked.lr
+    size = asked.batch_size or max(2, min(old.batch_size, len(old.method.training_rows(pack))))
+    optim = replace(old.optim, lr=lr, schedule="cosine", warmup=0.1)
+    run = replace(old, recipe="adapt", data=data, init=Init(path=ancestor), renew_norms=asked.batches, optim=optim)
+    return replace(run, steps=asked.steps, batch_size=size, seed=asked.seed, eval_every=0, checkpoint_every=0)
 
 
-def check_channels(model: Model, pack: Pack, modalities: Sequence[str]) -> None:
-    """Raise ValueError unless images of ``pack`` have the channels that ``model`` was trained on."""
-    for modality in modalities:
-        model.check_modality(modality)
-        own, given = model.spec.channels(modality), pack.spec.channels(modality)
-        if own != given:
-            raise ValueError(
-                f"the model was trained on {modality} of {own} channels, {pack.spec.name!r} has {given or 'no ' + modality}:"
-                " give data of the same modalities, sensors side by side, and frames"
-            )
-
-
-def _old_pack(model: Model, given: Path | None, say: Say) -> Pack | None:
-    """What the model was trained on, or the pack that was named."""
-    if given:
-        return Pack(given)
+def _old_packs(model: Model, given: Path | None, new: Pack, say: Callable[[str], object]) -> dict[str, Pack]:
+    """What the model was trained on, or the pack ``given``; and, joined with ``new``, probes that are learned on it."""
     try:
-        return model.open_data(quiet=True)
+        old = Pack(given) if given else model.open_data(quiet=True)
     except ValueError as error:
+        if given:
+            raise
         say(f"what is forgotten is not scored: {brief(error)} (--old PACK names data of the old sensors)")
-        return None
-
-
-def _joined(old: Pack, new: Pack, say: Say) -> Pack | None:
-    """Probes learned on ``old`` and scored on ``new``: a sensor nobody labelled. None if the packs do not allow it."""
+        return {}
     try:
-        return JoinedPack(old, new) if _scorable(old) and _scorable(new) else None
+        return {OLD: old} | ({TRANSFER: JoinedPack(old, new)} if scorable(old) and scorable(new) else {})
     except ValueError as error:
         say(f"{TRANSFER}: not scored ({error})")
-        return None
-
-
-def _scorable(pack: Pack) -> list[AnyTask]:
-    """The tasks that have rows to fit and rows to score."""
-    found = []
-    for task in pack.spec.all_tasks:
-        try:
-            split_rows(pack, task)
-        except ValueError:
-            continue
-        found.append(task)
-    return found
+        return {OLD: old}
 
 
 def _scores(model: Model, pack: Pack, learned: Sequence[Source] | None, *, retrieval: bool) -> list[dict[str, Any]]:
-    """Records of linear probes of every task, and of retrieval across modalities."""
-    tasks, scored = _scorable(pack), Scored(pack)
+    """Records of linear probes of every task, and of retrieval between modalities: on test groups, or val without any."""
+    tasks, scored = {task.name: task for task in scorable(pack)}, Scored(pack)
     modalities = [*pack.spec.modalities, *(["both"] if len(pack.spec.modalities) == 2 else [])]
-    records = probe_model(model, pack, tasks, modalities, ["linear"]) if tasks else []
-    records = [record for record in records if record["probe"] == "linear"]
-    by_name = {task.name: task for task in tasks}
-    for record in records:
-        record["leak"] = scored.leak(learned, split_rows(pack, by_name[record["task"]]).test)
+    records = []
+    for record in probe_model(model, pack, [*tasks.values()], modalities, ["linear"]) if tasks else ():
+        leak = scored.leak(learned, split_rows(pack, tasks[record["task"]]).test)
+        records += [{**record, "leak": leak}] if record["probe"] == "linear" else []
     rows = retrieved_rows(pack)
     rows = rows if len(rows) else pack.rows("val", having=pack.spec.modalities)
-    for found in cross_modal(model, pack, rows) if retrieval else ():
-        leak = scored.leak(learned, rows)
-        records.append({**found, "task": "R@5", "modality": found["direction"], "leak": leak})
+    for record in cross_modal(model, pack, rows) if retrieval and len(rows) else ():
+        records.append({**record, "task": "R@5", "modality": record["direction"], "leak": scored.leak(learned, rows)})
     return records

@@ -1,14 +1,14 @@
 """``mvitac finetune``: train a model's encoders with labels, beside the frozen probe and training from scratch.
 
-    <out>/seed0/              the fine-tuned model of each seed: a run like any other, with its scores in scores.json
-          scratch/seed0/      the same network from random weights, with the same labels
-          choice.json         what was tried on held-out groups, and the scores there
-          scores.json         all scores on test rows
-          10-percent/...      the same for each further share of the labelled groups
+    <out>/seed0/            the fine-tuned model of each seed: a run like any other, its scores in scores.json
+          scratch/seed0/    the same network from random weights, with the same labels
+          choice.json       what was tried on held-out groups, and the scores there
+          scores.json       all scores on test rows
+          10-percent/...    the same for another share of the labelled groups
 
 Settings are chosen on held-out groups of the labelled rows, never on test rows: first the learning rate, then the number of
 steps, then whether the heads start as linear probes (LP-FT, arXiv:2202.10054). The final model learns from all of these
-groups. A call that is repeated continues.
+groups. A call that is repeated with ``resume`` continues.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,23 +25,24 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import scratch
-from mvitac.evaluation.evaluate import ProbeConfig, check_unseen, chosen
+from mvitac.evaluation.evaluate import ProbeConfig, check_channels, check_unseen, chosen
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
-from mvitac.evaluation.probe import ProbeSplit, probe_features, score_own_head, split_rows
+from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split_rows
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, load
 from mvitac.nn.finetuning import Part
 from mvitac.nn.initial import Init
+from mvitac.registry import unknown
 from mvitac.run import Optim, Run
-from mvitac.system.files import check_place, digest, read_json, write_json
+from mvitac.system.files import check_place, read_json, write_json
 from mvitac.training.loop import train
 from mvitac.transforms.random_views import Augment, ViewAugment
 
 FROZEN, SCRATCH = "frozen, linear probe", "from scratch"
-CHOICE = "choice"
-"""Folder of the run that is tried, and the stem of the file with what was tried."""
-Say = Callable[[str], object]
+LIGHT = ViewAugment(scale=(0.8, 1.0), flip=0.0, grayscale=0.0)
+OPTIM = Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=0.05, decay_norms=False, schedule="cosine", warmup=0.1)
+Records = list[dict[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,21 +53,21 @@ class Finetuning:
     """Tasks with classes to learn. Default: all of the data, unless --values names some."""
     values: tuple[str, ...] = ()
     """Tasks with values to learn."""
-    train: Part = "all"
-    """What of the encoders is trained, beside new heads. all. last-stage: the last stage of the trunk. lora: low-rank updates
-    of all layers, and BatchNorm. attentive: an attention over the last feature map. head: nothing."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
     """Modalities to learn from. Default: all that the model and the data have."""
+    train: Part = "all"
+    """What of the encoders is trained, beside new heads. last-stage: the last stage of the trunk. lora: low-rank updates of
+    all layers, and BatchNorm. attentive: an attention over the last feature map. head: nothing."""
+    rank: int = 8
+    """Rank of the updates of lora."""
     lr: tuple[float, ...] = (3e-4, 1e-4, 1e-3, 3e-3)
-    """Learning rates to try (AdamW, cosine schedule). The first is used where there are too few groups to choose."""
+    """Learning rates to try. The first is used where there are too few groups to choose."""
     steps: tuple[int, ...] = (200, 600)
     """Numbers of steps to try."""
     batch_size: int = 32
     """Pairs per step; at most all labelled rows."""
-    rank: int = 8
-    """Rank of the updates of lora."""
     fractions: tuple[float, ...] = (100.0,)
-    """Percentages of the labelled groups to learn from, such as 1 5 10 100: one row of models each."""
+    """Percentages of the labelled groups to learn from, such as 1 5 10 100."""
     seeds: int = 1
     """Number of seeds. Each draws its own groups, batches and views."""
     from_scratch: bool = True
@@ -79,46 +79,19 @@ class Finetuning:
         for name in ("lr", "steps", "fractions"):
             if not (given := getattr(self, name)) or len(set(given)) < len(given):
                 raise ValueError(f"{name} {given}: give at least one number, and none twice")
-        if not all(0 < percent <= 100 for percent in self.fractions):
-            raise ValueError(f"fractions {self.fractions}: give percentages above 0, at most 100")
-        if self.seeds < 1:
-            raise ValueError(f"seeds {self.seeds}: give at least 1")
-
-
-@dataclass(frozen=True)
-class _Job:
-    """Fine-tuning of one model on one pack."""
-
-    asked: Finetuning
-    ancestor: Path
-    model: Model
-    pack: Pack
-    run: Run
-    tasks: tuple[AnyTask, ...]
-    out: Path
-    say: Say
-
-    def settings(self, percent: float, seed: int, *, start: bool, **changes: Any) -> Run:
-        """The run with these labels; ``changes`` are lr, steps, and heads_from and hold_out of the method."""
-        lr, steps = changes.pop("lr"), changes.pop("steps")
-        assert isinstance(self.run.method, SupervisedConfig)
-        method = replace(self.run.method, share=percent / 100, share_seed=seed, **changes)
-        method = method if start else replace(method, train="all")
-        run = replace(self.run, method=method, seed=seed, steps=steps, optim=replace(self.run.optim, lr=lr))
-        rows = len(method.training_rows(self.pack))
-        return replace(run, batch_size=max(2, min(run.batch_size, rows)), init=run.init if start else Init())
-
-    def folder(self, percent: float) -> Path:
-        return self.out if percent == 100 else self.out / f"{percent:g}-percent"
-
-    @cached_property
-    def modality(self) -> str:
-        names = self.run.method.modalities  # type: ignore[attr-defined]
-        return "both" if len(names) == 2 else names[0]
+        if not all(0 < percent <= 100 for percent in self.fractions) or self.seeds < 1:
+            raise ValueError("give fractions in percent, above 0, at most 100, and at least 1 seed")
 
 
 def finetune(
-    ancestor: Path, data: DatasetConfig, asked: Finetuning, out: Path, *, resume: bool = False, say: Say = print
+    ancestor: Path,
+    data: DatasetConfig,
+    asked: Finetuning,
+    out: Path,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    say: Callable[[str], object] = print,
 ) -> dict[str, Any]:
     """Fine-tune the model at ``ancestor`` on the labels of ``data``, and score it next to what it must beat.
 
@@ -128,11 +101,12 @@ def finetune(
         asked: What to train.
         out: Folder for the runs and scores.
         resume: Continue in ``out``.
+        quiet: Show no progress bars.
         say: Called with lines of progress.
 
     Returns:
-        The content of scores.json: "records", "summary" (fraction -> task -> modality -> source), "chosen" (fraction ->
-        source -> settings), "leaks".
+        The content of scores.json: "records", each with its "fraction"; "chosen" (fraction -> source -> settings); "models"
+        (folders of the fine-tuned models of the last fraction); "leaks".
 
     Raises:
         ValueError: If the labels, the data and the model do not fit together, or there are too few groups.
@@ -140,211 +114,181 @@ def finetune(
     check_place(out / "scores.json")
     if out.exists() and any(out.iterdir()) and not resume:
         raise ValueError(f"{out} is not empty: continue it with --resume, or choose another --out")
-    job = _prepared(ancestor, data, asked, out, say)
-    _check_same(job)
-    sources = check_unseen([ancestor], [job.model], job.pack, job.tasks, allow_leak=asked.allow_leak)[0]
-    records: list[dict[str, Any]] = []
-    settings: dict[str, Any] = {}
-    for percent in asked.fractions:
-        found, settings[f"{percent:g}"] = _fraction(job, percent, sources)
-        records += found
+    model, pack = load(ancestor), data.open(quiet=quiet)
+    tasks = _tasks(asked, pack)
+    method = _method(asked, tasks, ancestor, model, pack)
+    modality = "both" if len(method.modalities) == 2 else method.modalities[0]
+    job = _Job(asked, model, pack, _run_of(model, ancestor, data, pack, method), tasks, modality, out, say, quiet)
+    for task in tasks:
+        job.test(task)
+        _check_classes(job, task)
+    if 100 in asked.fractions and len(asked.lr) + len(asked.steps) > 2 and (why := job.too_few(100)):
+        raise ValueError(f"{why}: give one --lr and one --steps")
+    sources = check_unseen([ancestor], [model], pack, tasks, allow_leak=asked.allow_leak)[0]
+    found = {percent: _fraction(job, percent, sources) for percent in asked.fractions}
+    records = [record for own, _ in found.values() for record in own]
     result = {
-        "data": job.pack.spec.name,
-        "pack": job.pack.digest,
-        "ancestor": str(ancestor),
-        "group_by": job.pack.spec.group_by,
-        "notes": list(job.pack.spec.notes),
-        "leaks": leaks_of(records),
-        "trained": asked.train,
-        "chosen": settings,
-        "records": records,
+        **{"data": pack.spec.name, "pack": pack.digest, "ancestor": str(ancestor), "group_by": pack.spec.group_by},
+        **{"notes": list(pack.spec.notes), "leaks": leaks_of(records), "records": records},
+        "chosen": {f"{percent:g}": settings for percent, (_, settings) in found.items()},
+        "models": [str(job.folder(asked.fractions[-1]) / f"seed{seed}") for seed in range(asked.seeds)],
     }
     write_json(out / "scores.json", result)
     return result
 
 
-def _prepared(ancestor: Path, data: DatasetConfig, asked: Finetuning, out: Path, say: Say) -> _Job:
-    """Open model and data, and check that they fit together."""
-    model = load(ancestor)
-    pack = data.open()
-    known = {"labels": [t.name for t in pack.spec.tasks], "values": [t.name for t in pack.spec.values]}
-    for option, names in known.items():
-        for name in getattr(asked, option):
-            if name not in names:
-                raise ValueError(f"--{option} {name}: {pack.spec.name!r} has {', '.join(names) or 'none'}")
-    names = (*asked.labels, *asked.values) or tuple(known["labels"] or known["values"])
-    tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
-    modalities = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
-    for modality in modalities:
-        model.check_modality(modality)
-        if model.spec.channels(modality) != pack.spec.channels(modality):
-            raise ValueError(
-                f"{ancestor} was trained on {modality} of {model.spec.channels(modality)} channels, {pack.spec.name!r} has"
-                f" {pack.spec.channels(modality)}: give data of the same sensors and frames"
-            )
-    if not modalities:
-        raise ValueError(f"{ancestor} has {', '.join(model.encoders)}, {pack.spec.name!r} has none of it")
-    method = SupervisedConfig(tasks=names, modalities=modalities, train=asked.train, rank=asked.rank)
-    if asked.modalities:
-        method.modalities_of(pack.spec)
+def _tasks(asked: Finetuning, pack: Pack) -> tuple[AnyTask, ...]:
+    known = {"task with classes": pack.spec.tasks, "task with values": pack.spec.values}
+    for (what, tasks), names in zip(known.items(), (asked.labels, asked.values), strict=True):
+        for name in names:
+            if name not in (have := [task.name for task in tasks]):
+                raise unknown(f"{what} of {pack.spec.name!r}", name, have or ["none"])
+    default = tuple(task.name for task in pack.spec.tasks or pack.spec.values)
+    return tuple(chosen(pack, ProbeConfig(tasks=(*asked.labels, *asked.values) or default))[0])
+
+
+def _method(
+    asked: Finetuning, tasks: tuple[AnyTask, ...], ancestor: Path, model: Model, pack: Pack
+) -> SupervisedConfig:
+    modalities: Any = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
+    check_channels(ancestor, model, pack, modalities or tuple(model.encoders))
+    names = tuple(task.name for task in tasks)
+    return SupervisedConfig(tasks=names, modalities=modalities, train=asked.train, rank=asked.rank)
+
+
+def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
+    """Fine-tuning with all labels: light views at the size at which the frozen features are probed."""
     side = min(model.run.augment.eval_size, pack.size)
-    light = ViewAugment(scale=(0.8, 1.0), flip=0.0, grayscale=0.0)
-    run = replace(
-        scratch(model.run),
-        recipe="finetune",
-        data=data,
-        method=method,
-        init=Init(path=ancestor, modalities=modalities, heads=False).resolved(),
-        augment=Augment(size=side, vision=light, touch=light),
-        optim=Optim(
-            name="adamw", lr=1e-3, eps=1e-8, weight_decay=0.05, decay_norms=False, schedule="cosine", warmup=0.1
-        ),
-        batch_size=asked.batch_size,
-        sampler="shuffle",
-        positives="same-image",
-        chunk=0,
-        precision="auto",
-        eval_every=0,
-        checkpoint_every=0,
-    )
-    job = _Job(asked, ancestor, model, pack, run, tasks, out, say)
-    for task in tasks:
-        split_rows(pack, task, job.modality)
-        _check_classes(job, task)
-    return job
+    run = replace(scratch(model.run), recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
+    run = replace(run, init=Init(path=ancestor, modalities=method.modalities, heads=False).resolved(), renew_norms=0)
+    run = replace(run, augment=Augment(size=side, vision=LIGHT, touch=LIGHT), sampler="shuffle", positives="same-image")
+    return replace(run, chunk=0, eval_every=0, checkpoint_every=0)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Fine-tuning of one model on one pack."""
+
+    asked: Finetuning
+    model: Model
+    pack: Pack
+    run: Run
+    """With all labels."""
+    tasks: tuple[AnyTask, ...]
+    modality: str
+    out: Path
+    say: Callable[[str], object]
+    quiet: bool
+
+    def method(self, percent: float, seed: int, **changes: Any) -> SupervisedConfig:
+        return replace(self.run.method, share=percent / 100, share_seed=seed, **changes)  # type: ignore[call-arg]
+
+    def run_of(self, percent: float, seed: int, kind: str, settings: dict[str, Any], *, hold_out: bool = False) -> Run:
+        """The run of ``kind`` on this share of the labels with these lr, steps and start of the heads."""
+        method = self.method(percent, seed, hold_out=hold_out, heads_from=settings["heads_from"])
+        if kind == SCRATCH:
+            method = replace(method, train="all")
+        size = max(2, min(self.asked.batch_size, len(method.training_rows(self.pack))))
+        optim = replace(self.run.optim, lr=settings["lr"])
+        run = replace(self.run, method=method, seed=seed, steps=settings["steps"], optim=optim, batch_size=size)
+        return replace(run, init=Init()) if kind == SCRATCH else run
+
+    def too_few(self, percent: float, seed: int = 0) -> str:
+        """Why no groups can be held out of this share of the labels; "" if some can."""
+        try:
+            self.method(percent, seed, hold_out=True).training_rows(self.pack)
+        except ValueError as error:
+            return str(error)
+        return ""
+
+    def folder(self, percent: float) -> Path:
+        return self.out if percent == 100 else self.out / f"{percent:g}-percent"
+
+    def test(self, task: AnyTask) -> np.ndarray:
+        return split_rows(self.pack, task, self.modality).test
+
+    def named(self, found: Records, kind: str, percent: float, seed: int, learned: list[Source] | None) -> Records:
+        """Records with their source and leaks."""
+        rows, scored = {task.name: self.test(task) for task in self.tasks}, Scored(self.pack)
+        known = {"source": kind, "seed": seed, "fraction": percent}
+        return [{**known, **record, "leak": scored.leak(learned, rows[record["task"]])} for record in found]
+
+    def answered(self, task: AnyTask, rows: np.ndarray) -> np.ndarray:
+        return rows[self.pack.answered(task, "train", "val")[rows]]
 
 
 def _check_classes(job: _Job, task: AnyTask) -> None:
-    if not isinstance(task, Task):
-        return
-    rows = job.run.method.training_rows(job.pack)
-    seen = {task.classes[label] for label in set(job.pack.labels(task.name, "train", "val")[rows]) - {-1}}
-    if len(seen) < 2:
-        raise ValueError(
-            f"task {task.name!r} has labels of one class only in train ({', '.join(seen)}): there is nothing to learn"
-        )
+    if isinstance(task, Task):
+        labels = job.pack.labels(task.name)[job.answered(task, job.run.method.training_rows(job.pack))]
+        if len(seen := {task.classes[label] for label in labels}) < 2:
+            raise ValueError(
+                f"task {task.name!r} has labels of one class only in train ({', '.join(seen)}): nothing to learn"
+            )
 
 
-def _check_same(job: _Job) -> None:
-    """Check that what is in the folder is about the same model, data and settings; note them if it is new."""
-    key = digest([job.run.digest(), job.pack.digest, repr(replace(job.asked, seeds=1, fractions=(100.0,)))])
-    file = job.out / "finetune.json"
-    if file.exists() and read_json(file, "a fine-tuning")["digest"] != key:
-        raise ValueError(f"{job.out} holds other settings, data or weights: give the same ones, or another --out")
-    if not file.exists():
-        if job.out.exists() and any(job.out.iterdir()):
-            raise ValueError(f"{job.out} is no fine-tuning to continue: choose another --out")
-        write_json(file, {"digest": key, "ancestor": str(job.ancestor)})
-
-
-# -- one share of the labels --------------------------------------------------------------------------------------------
-
-
-def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Choose settings, train and score every seed. Returns records and the chosen settings."""
-    folder, records, settings = job.folder(percent), [], {}
-    scored = Scored(job.pack)
-    kinds = {f"fine-tuned, {job.asked.train}": True} | ({SCRATCH: False} if job.asked.from_scratch else {})
+def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[Records, dict[str, Any]]:
+    """Choose settings, then train and score every seed. Returns records and the chosen settings of each kind."""
+    kinds = [f"fine-tuned, {job.asked.train}", *([SCRATCH] if job.asked.from_scratch else [])]
+    settings = {kind: _choose(job, percent, kind) for kind in kinds}
+    records = []
     for seed in range(job.asked.seeds):
-        for kind, start in kinds.items():
-            settings[kind] = settings.get(kind) or _choose(job, percent, kind, start)
-            path = folder / f"seed{seed}" if start else folder / "scratch" / f"seed{seed}"
-            best = {key: settings[kind][key] for key in ("lr", "steps", "heads_from")}
-            run = job.settings(percent, seed, start=start, **best)
+        for kind in kinds:
+            path = job.folder(percent) / ("scratch" if kind == SCRATCH else "") / f"seed{seed}"
+            run = job.run_of(percent, seed, kind, settings[kind])
             job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
-            train(run, path, resume=True, quiet=True, pack=job.pack)
-            own = _own_scores(job, path, percent, kind, scored)
+            train(run, path, resume=True, quiet=job.quiet, pack=job.pack)
+            own = own_heads(load(path), job.pack, job.tasks, [job.modality])
+            own = job.named(own, kind, percent, seed, read_sources(path, run, job.pack.digest, job.pack))
+            own = [{**record, "run": str(path)} for record in own]
             write_json(path / "scores.json", {"data": job.pack.spec.name, "pack": job.pack.digest, "records": own})
             records += own
-        records += _frozen(job, percent, seed, scored, sources)
+        frozen = [_frozen(job, percent, seed, task) for task in job.tasks]
+        records += job.named(frozen, FROZEN, percent, seed, sources)
     return records, settings
 
 
-def _choose(job: _Job, percent: float, kind: str, start: bool) -> dict[str, Any]:
-    """The settings with the best score on held-out groups, tried one after the other."""
-    asked = job.asked
-    best: dict[str, Any] = {"lr": asked.lr[0], "steps": asked.steps[0], "heads_from": "probe" if start else "random"}
-    plan = {"lr": asked.lr, "steps": asked.steps, "heads_from": ("probe", "random") if start else ("random",)}
-    if all(len(values) == 1 for values in plan.values()):
+def _choose(job: _Job, percent: float, kind: str) -> dict[str, Any]:
+    """The settings with the best score on held-out groups of the first seed, tried one after the other."""
+    starts = ("random",) if kind == SCRATCH else ("probe", "random")
+    tried = {"lr": job.asked.lr, "steps": job.asked.steps, "heads_from": starts}
+    best: dict[str, Any] = {name: values[0] for name, values in tried.items()}
+    if why := job.too_few(percent):
+        job.say(f"{percent:g} %: {kind}: {why}: the first of --lr and --steps is used")
         return best
-    try:
-        job.settings(percent, 0, start=start, hold_out=True, **best)
-    except ValueError as error:
-        if percent == 100 and max(len(asked.lr), len(asked.steps)) > 1:
-            raise ValueError(f"{error}: give one --lr and one --steps") from None
-        job.say(f"{percent:g} %: {kind}: {error}: first of --lr and --steps")
-        return best
-    for name, values in plan.items():
-        scores = {value: _tried(job, percent, kind, start, {**best, name: value}) for value in values}
-        best[name] = max(scores, key=lambda value: scores[value])  # the first of equals
-    best["held out"] = _tried(job, percent, kind, start, best)
+    for name, values in tried.items():
+        if len(values) > 1:
+            scores = [_held_out_score(job, percent, kind, {**best, name: value}) for value in values]
+            best[name] = values[int(np.argmax(scores))]  # the first of equals
     return best
 
 
-def _tried(job: _Job, percent: float, kind: str, start: bool, settings: dict[str, Any]) -> float:
-    """Score on held-out groups with ``settings``, mean over tasks; from choice.json if it was tried before."""
-    folder = job.folder(percent)
-    file, work = folder / f"{CHOICE}.json", folder / CHOICE
+def _held_out_score(job: _Job, percent: float, kind: str, settings: dict[str, Any]) -> float:
+    """Score on held-out groups, mean over tasks; from choice.json if it was tried before."""
+    file, work = job.folder(percent) / "choice.json", job.folder(percent) / "choice"
     tried: dict[str, float] = read_json(file, "what was tried") if file.exists() else {}
-    settings = {key: settings[key] for key in ("lr", "steps", "heads_from")}
-    name = f"{kind}: " + ", ".join(f"{key} {value}" for key, value in settings.items())
+    run = job.run_of(percent, 0, kind, settings, hold_out=True)
+    name = f"{kind}: {', '.join(f'{key} {value}' for key, value in settings.items())} ({run.digest()[:8]})"
     if name not in tried:
-        run = job.settings(percent, 0, start=start, hold_out=True, **settings)
-        path = work / digest(run.digest())[:12]
-        train(run, path, resume=True, quiet=True, pack=job.pack)
-        learned = run.method.training_rows(job.pack)
-        everything = replace(run.method, hold_out=False).training_rows(job.pack)  # type: ignore[call-arg]
-        model, scores = load(path), []
-        for task in job.tasks:
-            rows = _answered(job, task, np.setdiff1d(everything, learned))
-            scores.append(_score(score_own_head(model, job.pack, task, rows)) if len(rows) else np.nan)
-        tried[name] = float(np.nanmean(scores))
+        train(run, work / run.digest()[:8], resume=True, quiet=True, pack=job.pack)
+        learned, model = run.method.training_rows(job.pack), load(work / run.digest()[:8])
+        held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
+        found = own_heads(model, job.pack, job.tasks, [job.modality], held)
+        tried[name] = float(np.mean([record["r2" if "r2" in record else "accuracy"] for record in found]))
         write_json(file, tried)
         job.say(f"{percent:g} %: {name}: {100 * tried[name]:.1f} on held-out {job.pack.spec.group_by}s")
     shutil.rmtree(work, ignore_errors=True)
     return tried[name]
 
 
-def _score(record: dict[str, Any]) -> float:
-    return record["accuracy"] if "accuracy" in record else record["r2"]
-
-
-def _answered(job: _Job, task: AnyTask, rows: np.ndarray) -> np.ndarray:
-    return rows[job.pack.answered(task, "train", "val")[rows]]
-
-
-def _own_scores(job: _Job, path: Path, percent: float, kind: str, scored: Scored) -> list[dict[str, Any]]:
-    """Test scores of the heads of the run in ``path``."""
-    model = load(path)
-    learned = read_sources(path, model.run, job.pack.digest, job.pack)
-    records = []
-    for task in job.tasks:
-        rows = split_rows(job.pack, task, job.modality).test
-        known = {"source": kind, "seed": model.run.seed, "run": str(path), "fraction": percent, "task": task.name}
-        known |= {"modality": job.modality, "probe": "own", "leak": scored.leak(learned, rows)}
-        records.append({**known, **score_own_head(model, job.pack, task, rows)})
-    return records
-
-
-def _frozen(
-    job: _Job, percent: float, seed: int, scored: Scored, sources: list[Source] | None
-) -> list[dict[str, Any]]:
-    """Test scores of linear probes on the frozen encoders, fitted on the rows that this seed is fine-tuned on."""
-    method = replace(job.run.method, share=percent / 100, share_seed=seed)  # type: ignore[call-arg]
-    rows = method.training_rows(job.pack)
-    try:
-        learned = replace(method, hold_out=True).training_rows(job.pack)
-    except ValueError:  # too few groups: C is chosen on the rows that the probe is fitted on
-        learned = rows
-    records, names = [], job.run.method.modalities  # type: ignore[attr-defined]
-    for task in job.tasks:
-        fitted, held = _answered(job, task, learned), _answered(job, task, np.setdiff1d(rows, learned))
-        test = split_rows(job.pack, task, job.modality).test
-        if not len(held) or (isinstance(task, Task) and len(set(job.pack.labels(task.name)[fitted])) < 2):
-            fitted = held = _answered(job, task, rows)
-        parts = ProbeSplit(fitted, held, test)
-        x = np.concatenate([features(job.model, job.pack, m, parts.all) for m in names], axis=1)
-        known = {"source": FROZEN, "seed": seed, "fraction": percent, "task": task.name, "modality": job.modality}
-        known |= {"probe": "linear", "leak": scored.leak(sources, test)}
-        records.append({**known, **probe_features(x, job.pack, task, parts, "linear", seed)})
-    return records
+def _frozen(job: _Job, percent: float, seed: int, task: AnyTask) -> dict[str, Any]:
+    """Test scores of a linear probe on the frozen encoders, fitted on the rows that this seed is fine-tuned on."""
+    rows = job.answered(task, job.method(percent, seed).training_rows(job.pack))
+    fitted = held = rows  # with too few groups, C or alpha is chosen on the rows that the probe is fitted on
+    if not job.too_few(percent, seed):
+        fitted = np.intersect1d(rows, job.method(percent, seed, hold_out=True).training_rows(job.pack))
+        held = np.setdiff1d(rows, fitted)
+    parts = ProbeSplit(fitted, held if len(held) else fitted, job.test(task))
+    names = job.run.method.modalities  # type: ignore[attr-defined]
+    x = np.concatenate([features(job.model, job.pack, m, parts.all) for m in names], axis=1)
+    known = {"task": task.name, "modality": job.modality, "probe": "linear"}
+    return {**known, **probe_features(x, job.pack, task, parts, "linear", seed)}

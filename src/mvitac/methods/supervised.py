@@ -149,7 +149,7 @@ class SupervisedConfig(LabelledConfig):
         return rows[np.isin(pack.column("group")[rows].astype(str), kept if self.hold_out else [*kept, *held])]
 
     def _drawn_groups(self, pack: Pack, rows: np.ndarray) -> tuple[list[str], list[str]]:
-        """Names of the groups to learn from, and of those to choose settings on. A larger share adds groups to a smaller one.
+        """Names of the groups to learn from, and of those to choose settings on. A larger share adds to a smaller one.
 
         Raises:
             ValueError: If groups are to be held out, and there are too few.
@@ -177,8 +177,8 @@ class SupervisedConfig(LabelledConfig):
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
         trunks = {m: build_trunk(encoder, spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
-        if self.train == "attentive":
-            trunks = {m: AttentivePool(trunk) for m, trunk in trunks.items()}
+        for m in trunks if self.train == "attentive" else ():
+            trunks[m] = AttentivePool(trunks[m])
         width = sum(num_features(trunk) for trunk in trunks.values())
         return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)), self.train, self.rank)
 
@@ -190,7 +190,8 @@ class Supervised(Method):
         self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module], part: Part = "all", rank: int = 8
     ) -> None:
         super().__init__()
-        self.part, self.rank = part, rank
+        self.part: Part = part
+        self.rank = rank
         self.trunks = nn.ModuleDict(trunks)
         # A list, because task names may contain characters that module names may not.
         self.tasks = tuple(classifiers)

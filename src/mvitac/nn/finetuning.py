@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,6 @@ from torch.nn.utils import parametrize
 from mvitac.nn.encoders import last_map, num_features
 
 Part = Literal["all", "last-stage", "lora", "attentive", "head"]
-PARTS: tuple[str, ...] = get_args(Part)
 
 
 class Lora(nn.Module):
@@ -115,9 +114,9 @@ def merged(trunk: nn.Module) -> nn.Module:
     trunk = copy.deepcopy(trunk)
     for module in list(trunk.modules()):
         if parametrize.is_parametrized(module, "weight"):
-            weight = module.weight.detach().clone()
+            weight = torch.as_tensor(module.weight).detach().clone()
             # remove_parametrizations would also change the class, which the copy shares with the original.
-            module.__class__ = type(module).__bases__[0]
+            module.__class__ = type(module).__bases__[0]  # type: ignore[assignment]
             del module.parametrizations
             module.weight = nn.Parameter(weight)
     return trunk

@@ -97,11 +97,9 @@ def load_trunk(trunk: nn.Module, state: dict[str, Tensor]) -> None:
         ValueError: If they are different networks; ``trunk`` is then unchanged.
     """
     inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
-    if "query" in state and not isinstance(trunk, AttentivePool):
-        return load_trunk(trunk, inner)
-    if isinstance(trunk, AttentivePool):
-        load_trunk(trunk.trunk, inner if "query" in state else state)
-        return
+    if isinstance(trunk, AttentivePool) or "query" in state:  # a learned pooling starts anew
+        single = trunk.trunk if isinstance(trunk, AttentivePool) else trunk
+        return load_trunk(single, inner if "query" in state else state)
     single = trunk.trunk if isinstance(trunk, PerFrame) else trunk
     _load_single(single, inner or state)
     if isinstance(trunk, PerFrame) and inner and fits(trunk, state):
