@@ -99,6 +99,9 @@ class Run:
     data: DatasetConfig
     encoder: EncoderConfig = EncoderConfig()
     init: Init = field(default=Init(), metadata=LATER_IN_DIGEST)
+    renew_norms: int = field(default=0, metadata=LATER_IN_DIGEST)
+    """Batches on which the running statistics of BatchNorm are estimated anew before the first step, for data of another
+    sensor than that of --init. 0 = keep them."""
     augment: Augment = Augment()
     optim: Optim = Optim()
     batch_size: int = 256
@@ -106,7 +109,7 @@ class Run:
     epochs: float = 240.0
     """Passes over the training rows (paper: 240)."""
     steps: int | None = None
-    """Number of steps. If given, epochs is ignored."""
+    """Number of steps. If given, epochs is ignored. 0 is for renew_norms alone."""
     sampler: Literal["shuffle", "one-per-touch", "spread"] = "shuffle"
     """Order of the rows. shuffle: random permutation (paper). The others keep near-duplicates from being negatives of each
     other: spread distributes the rows of a touch group over the whole epoch. one-per-touch takes one row of each group,
@@ -157,7 +160,9 @@ class Run:
             raise ValueError(
                 "positives_within has no effect on same-image positives: choose --positives same-touch, or same-press"
             )
-        if self.steps is not None and self.steps < 1:
+        if self.renew_norms < 0:
+            raise ValueError(f"renew_norms {self.renew_norms}: give a number of batches >= 0")
+        if self.steps is not None and self.steps < (0 if self.renew_norms else 1):
             raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
         if not 0 <= self.seed < 1 << 63:
             raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
@@ -169,7 +174,7 @@ class Run:
 
     def num_steps(self, num_rows: int) -> int:
         """Number of optimiser steps of the whole run on ``num_rows`` training rows."""
-        return self.steps or max(1, round(self.epochs * self.steps_per_epoch(num_rows)))
+        return max(1, round(self.epochs * self.steps_per_epoch(num_rows))) if self.steps is None else self.steps
 
     def steps_per_epoch(self, num_rows: int) -> int:
         """Number of full batches in one epoch. The last short batch is dropped: its queries would have fewer negatives."""

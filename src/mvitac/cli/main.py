@@ -28,6 +28,8 @@ how good the features are.
   data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
   data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
+  finetune MODEL       train its encoders with labels, next to frozen and scratch
+  adapt MODEL          go on without labels on the data of a new sensor
   probe RUN...         linear probes next to their controls
   compare              many runs into the paper's tables (--plan NAME or FILE)
   bench MODEL          any encoder on a fixed suite of tasks, as one JSON file
@@ -61,6 +63,8 @@ COMMANDS = {
     "data show": "data_info:show",
     "data export-lerobot": "data:export_lerobot",
     "pretrain": "pretrain:pretrain",
+    "finetune": "finetune:finetune",
+    "adapt": "finetune:adapt",
     "probe": "evaluate:probe",
     "compare": "compare:compare",
     "bench": "bench:bench",

@@ -275,12 +275,17 @@ def _check_models(paths: Sequence[Path], models: Sequence[Model], pack: Pack) ->
     """Check that each model can embed this data and that its probe.json can be written."""
     for path, model in zip(paths, models, strict=True):
         check_place(path / "probe.json")
-        for modality in pack.spec.modalities:
-            if model.spec.channels(modality) != pack.spec.channels(modality):
-                raise ValueError(
-                    f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
-                    f" it was trained on {model.spec.name!r}"
-                )
+        check_channels(path, model, pack, pack.spec.modalities)
+
+
+def check_channels(path: Path, model: Model, pack: Pack, modalities: Sequence[str]) -> None:
+    """Raise ValueError unless the ``model`` at ``path`` was trained on images like those of ``pack``."""
+    for modality in modalities:
+        if model.spec.channels(modality) != pack.spec.channels(modality):
+            raise ValueError(
+                f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
+                f" it was trained on {model.spec.name!r}, with {model.spec.channels(modality)}"
+            )
 
 
 def check_unseen(

@@ -94,6 +94,18 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
     return ProbeSplit(train, val, test)
 
 
+def scorable(pack: Pack) -> list[AnyTask]:
+    """The tasks of ``pack`` that have labelled rows in train and test."""
+    found = []
+    for task in pack.spec.all_tasks:
+        try:
+            split_rows(pack, task)
+        except ValueError:
+            continue
+        found.append(task)
+    return found
+
+
 def _check_measured(values: np.ndarray, task: ValueTask, rows: dict[str, np.ndarray]) -> None:
     """Check that each target has two different values in each of ``rows``: without them it has no R2."""
     for t, target in enumerate(task.targets):
@@ -225,7 +237,7 @@ def probe_model(
 
     maps = source_of(True) if "attentive" in probes else None
     records = probe_all(source_of(False), pack, tasks, modalities, probes, model.seed, maps)
-    return records + _own_heads(model, pack, tasks, modalities)
+    return records + own_heads(model, pack, tasks, modalities)
 
 
 def joined(parts: list[np.ndarray]) -> np.ndarray:
@@ -236,15 +248,19 @@ def joined(parts: list[np.ndarray]) -> np.ndarray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
-def _own_heads(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> list[dict[str, Any]]:
-    """Records of the heads that the model trained along with its encoders."""
+def own_heads(
+    model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], among: np.ndarray | None = None
+) -> list[dict[str, Any]]:
+    """Records of the heads that the model trained along with its encoders, on test rows or on the labelled ``among``."""
     whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
     known = {task.name: _outputs(task) for task in model.spec.all_tasks if task.name in model.tasks}
     records = []
     for task in tasks:
         if whole not in modalities or task.name not in known or set(_outputs(task)) - set(known[task.name]):
             continue  # not a task that it learned, or not all of its classes or targets
-        rows = split_rows(pack, task, whole).test
+        rows = split_rows(pack, task, whole).test if among is None else among[pack.answered(task)[among]]
+        if not len(rows):
+            continue
         z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
         # Match columns by name: this pack may order the classes differently or have fewer.
         columns = [known[task.name].index(name) for name in _outputs(task)]
@@ -345,16 +361,16 @@ def retrieved_rows(pack: Pack) -> np.ndarray:
     return pack.rows("test", only=only, having=pack.spec.modalities)
 
 
-def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
-    """Retrieval of test groups across modalities, in both directions.
+def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
+    """Retrieval of groups across modalities, in both directions, among ``rows`` (default: ``retrieved_rows``).
 
     Returns:
         One record per direction: R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. Empty without a
-        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` test groups.
+        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
-    rows = retrieved_rows(pack)
+    rows = retrieved_rows(pack) if rows is None else rows
     sizes = np.bincount(_group_numbers(pack, rows))
     if len(sizes) < MIN_GALLERY:
         return []

@@ -16,6 +16,7 @@ from timm.models import adapt_input_conv
 from torch import Tensor, nn
 
 from mvitac.nn.encoders import PerFrame, stem_names
+from mvitac.nn.finetuning import AttentivePool
 from mvitac.nn.weights import read_safetensors, safetensors_digest
 
 MODEL = "model.safetensors"
@@ -96,6 +97,9 @@ def load_trunk(trunk: nn.Module, state: dict[str, Tensor]) -> None:
         ValueError: If they are different networks; ``trunk`` is then unchanged.
     """
     inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
+    if isinstance(trunk, AttentivePool) or "query" in state:  # a learned pooling starts anew
+        single = trunk.trunk if isinstance(trunk, AttentivePool) else trunk
+        return load_trunk(single, inner if "query" in state else state)
     single = trunk.trunk if isinstance(trunk, PerFrame) else trunk
     _load_single(single, inner or state)
     if isinstance(trunk, PerFrame) and inner and fits(trunk, state):

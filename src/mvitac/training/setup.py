@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,11 @@ from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
 from mvitac.methods.base import Method
+from mvitac.methods.supervised import Supervised, SupervisedConfig
 from mvitac.model import Model, load
+from mvitac.nn.finetuning import renew_norms
 from mvitac.nn.memory_bank import replicated, shard_banks
+from mvitac.nn.momentum import Momentum
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import describe, pick_device, pick_precision
@@ -25,11 +29,12 @@ from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
+from mvitac.training.heads import fit_heads
 from mvitac.training.sampler import check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
 from mvitac.training.step import Step
-from mvitac.training.views import gel_mirror, values_of
+from mvitac.training.views import gel_mirror, load_chunks, values_of
 from mvitac.transforms.gel_flip import GelMirror
 
 
@@ -89,6 +94,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     num_steps = run.num_steps(len(rows))
     kept: dict[str, Any] = {}
     start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
+    if start == 0:
+        _before_first_step(run, method, pack, rows, device, world, mirror)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
     if not resumed and world.writes:
@@ -213,6 +220,29 @@ def _build_method(
     _check_image_size(method, run, pack)
     synchronise_norms(method, world)
     return method, taken
+
+
+def _before_first_step(
+    run: Run,
+    method: Method,
+    pack: Pack,
+    rows: np.ndarray,
+    device: torch.device,
+    world: World,
+    mirror: GelMirror | None,
+) -> None:
+    """Estimate statistics of BatchNorm and fit heads, if the run asks for it. Their rows are a function of the seed."""
+    if run.renew_norms:
+        if world.size > 1:
+            raise ValueError("renew_norms works on one process only: leave it out, or start without torchrun")
+        steps = load_chunks(run, pack, rows, method.views, device, world, 0, run.renew_norms, mirror)
+        renew_norms(method.train(), (partial(method, chunk()) for chunks in steps for chunk in chunks))
+        for module in method.modules():
+            if isinstance(module, Momentum):
+                module.restart()
+    if isinstance(run.method, SupervisedConfig) and run.method.heads_from == "probe":
+        assert isinstance(method, Supervised)
+        fit_heads(method, run, pack, rows)
 
 
 @torch.no_grad()
