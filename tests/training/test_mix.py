@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from mvitac.cli.main import main
 from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
@@ -250,13 +251,17 @@ def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path)
     """A task of one part is of its rows alone, a common one of all rows with the modality; a control where it is known."""
     run = mix_run(parts["a"], parts["gel"], steps=1, eval_every=0)
     out = train(run, tmp_path / "run", quiet=True)
-    result = probe_runs([out], ProbeConfig(tasks=("pattern", "a/bright", "gel/bright"), modalities=("touch",)))
+    result = probe_runs([out], ProbeConfig())
     pack = run.data.open()
-    own = {r["task"]: r["num_test"] for r in result["records"] if r["source"] == "mvitac"}
+    records = [r for r in result["records"] if r["source"] == "mvitac"]
+    own = {r["task"]: r["num_test"] for r in records if r["modality"] == "touch"}
     num = [len(part.rows("test")) for part in pack.parts.values()]
     assert own == {"pattern": sum(num), "a/bright": num[0], "gel/bright": num[1]}
     assert {r["task"] for r in result["records"] if r["source"] == "noise only"} == {"a/bright"}
+    assert {r["modality"] for r in records if r["task"] == "gel/bright"} == {"touch"}
+    assert {(r["modality"], r["num_test"]) for r in records if r["task"] == "pattern"} >= {("both", num[0])}
     assert not result["leaks"]
+    assert main(["report", str(out), "--out", str(tmp_path / "report.html")]) == 0
 
 
 def test_every_method_says_what_it_takes() -> None:

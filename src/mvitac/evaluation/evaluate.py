@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +20,7 @@ from mvitac.evaluation.probe import (
     probe_model,
     probes_of,
     retrieved_rows,
+    seen_by,
     split_rows,
     with_classes,
 )
@@ -92,8 +92,9 @@ def probe_runs(
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
-    for task, modality in product(tasks, modalities):
-        split_rows(pack, task, modality)
+    for task in tasks:
+        for modality in seen_by(pack, task, modalities):
+            split_rows(pack, task, modality)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:
