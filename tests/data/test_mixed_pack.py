@@ -71,7 +71,8 @@ def test_one_task_if_classes_agree_else_two(pack: Pack, gel: Pack) -> None:
         expected = np.full(mix.num, -1)
         expected[first : first + part.num] = part.labels("bright")
         np.testing.assert_array_equal(mix.labels(name), expected)
-    assert mix.spec.controls == {"noise only": ("noise",)}
+    assert mix.spec.controls == {"noise only": ("toy/noise",)}  # a column of this name is no control in gel
+    np.testing.assert_array_equal(np.isfinite(mix.column("toy/noise")), mix.column("part") == "toy")
 
 
 @dataclass

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from mvitac.cli.main import main
 from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.base import MethodConfig, Views
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
@@ -243,6 +245,23 @@ def test_what_a_mix_cannot_do_is_refused(parts: dict[str, str], tmp_path: Path) 
         with pytest.raises(ValueError, match=message):
             train(run, tmp_path / "run", quiet=True)
     train(mix_run(*ragged, batch_size=8, chunk=4, steps=1, data={"batches": "one-part"}), tmp_path / "run", quiet=True)
+
+
+def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path) -> None:
+    """A task of one part is of its rows alone, a common one of all rows with the modality; a control where it is known."""
+    run = mix_run(parts["a"], parts["gel"], steps=1, eval_every=0)
+    out = train(run, tmp_path / "run", quiet=True)
+    result = probe_runs([out], ProbeConfig())
+    pack = run.data.open()
+    records = [r for r in result["records"] if r["source"] == "mvitac"]
+    own = {r["task"]: r["num_test"] for r in records if r["modality"] == "touch"}
+    num = [len(part.rows("test")) for part in pack.parts.values()]
+    assert own == {"pattern": sum(num), "a/bright": num[0], "gel/bright": num[1]}
+    assert {r["task"] for r in result["records"] if r["source"] == "noise only"} == {"a/bright"}
+    assert {r["modality"] for r in records if r["task"] == "gel/bright"} == {"touch"}
+    assert {(r["modality"], r["num_test"]) for r in records if r["task"] == "pattern"} >= {("both", num[0])}
+    assert not result["leaks"]
+    assert main(["report", str(out), "--out", str(tmp_path / "report.html")]) == 0
 
 
 def test_every_method_says_what_it_takes() -> None:

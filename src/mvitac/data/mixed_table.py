@@ -20,13 +20,17 @@ Renamed = Mapping[str, Mapping[str, str]]
 
 
 def renamed_columns(parts: Mapping[str, Pack]) -> Renamed:
-    """Names of all columns that are taken over. Where kinds or units of a name do not agree, it becomes <part>/<name>."""
+    """Names of all columns that are taken over.
+
+    A name becomes <part>/<name> if its columns differ in kind or unit, or only some of them are a task's or a control's.
+    """
     kinds: dict[str, set[str]] = {}
     for pack in parts.values():
-        units = {target.name: f" in {target.unit}" for task in pack.spec.values for target in task.targets}
+        uses = {target.name: f" in {target.unit}" for task in pack.spec.values for target in task.targets}
+        uses |= {c: f"{uses.get(c, '')}, control" for used in pack.spec.controls.values() for c in used}
         for column in pack.table.schema:
             if not OWN.fullmatch(column.name) and not pa.types.is_null(column.type):
-                kinds.setdefault(column.name, set()).add(_kind(column.type) + units.get(column.name, ""))
+                kinds.setdefault(column.name, set()).add(_kind(column.type) + uses.get(column.name, ""))
     return {
         part: {n: n if len(kinds[n]) == 1 else f"{part}/{n}" for n in pack.table.column_names if n in kinds}
         for part, pack in parts.items()

@@ -108,7 +108,8 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
         found = {"majority" if isinstance(task, Task) else "mean": _guess(pack, task, rows)}
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column)[rows.all].astype(float) for column in columns], axis=1)
-            found[name] = probe_features(x, pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0)
+            if np.isfinite(x).all():  # else rows of a part of a mix that has no such control
+                found[name] = probe_features(x, pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0)
         for name, result in found.items():
             records += _named(name, None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
     return records

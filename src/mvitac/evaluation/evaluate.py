@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +23,7 @@ from mvitac.evaluation.probe import (
     probe_model,
     probes_of,
     retrieved_rows,
+    seen_by,
     split_rows,
     with_classes,
 )
@@ -173,10 +173,11 @@ def probe_runs(
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
-    for task, modality in product(tasks, modalities):
-        rows = split_rows(pack, task, modality)
-        if isinstance(task, Task) and task.event:
-            check_event(pack, task, rows.fitted, rows.test)
+    for task in tasks:
+        for modality in seen_by(pack, task, modalities):
+            rows = split_rows(pack, task, modality)
+            if isinstance(task, Task) and task.event:
+                check_event(pack, task, rows.fitted, rows.test)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:

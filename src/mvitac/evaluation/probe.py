@@ -122,6 +122,13 @@ def names_in(modality: str, pack: Pack) -> tuple[str, ...]:
     return tuple(pack.spec.modalities) if modality == "both" else () if modality == "none" else (modality,)
 
 
+def seen_by(pack: Pack, task: AnyTask, modalities: Sequence[str]) -> list[str]:
+    """Those of ``modalities`` that ``task`` can be probed by: of a mix, those that the parts of its rows have."""
+    rows = np.flatnonzero(pack.answered(task))
+    has = {m: not pack.parts or bool(pack.has(m)[rows].any()) for m in pack.spec.modalities}
+    return [modality for modality in modalities if all(has[m] for m in names_in(modality, pack))]
+
+
 def _num_classes(pack: Pack, task: AnyTask, rows: np.ndarray) -> int:
     """Number of classes among ``rows``; 0 for values."""
     return 0 if isinstance(task, ValueTask) else len(set(labels_of(pack, task)[rows]))
@@ -224,7 +231,9 @@ def probe_model(
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
         return []
-    needed = np.unique(np.concatenate([split_rows(pack, task, m).all for task in tasks for m in modalities]))
+    needed = np.unique(
+        np.concatenate([split_rows(pack, t, m).all for t in tasks for m in seen_by(pack, t, modalities)])
+    )
     own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
 
     def source_of(maps: bool) -> FeatureSource:
@@ -315,7 +324,7 @@ def probe_all(
     papers = _papers(source, pack, with_classes(tasks), modalities, seed) if "paper" in probes else {}
     records = []
     for task in tasks:
-        for modality in modalities:
+        for modality in seen_by(pack, task, modalities):
             rows = split_rows(pack, task, modality)
             x = source(modality, rows.all)
             for kind in probes_of(task, probes):
@@ -338,7 +347,7 @@ def _papers(
     found: dict[tuple[str, str], Classifier] = {}
     for modality in modalities:
         sharing: dict[bytes, list[Task]] = {}
-        for task in tasks:
+        for task in (task for task in tasks if seen_by(pack, task, [modality])):
             sharing.setdefault(split_rows(pack, task, modality).fitted.tobytes(), []).append(task)
         for key, group in sharing.items():
             rows = np.frombuffer(key, np.int64)

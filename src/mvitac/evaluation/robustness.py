@@ -26,6 +26,7 @@ from mvitac.evaluation.probe import (
     probe_features,
     score_predictions,
     score_rows,
+    seen_by,
     split_rows,
 )
 from mvitac.model import Model
@@ -83,7 +84,7 @@ def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Seque
     noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
     for task, modality in product(tasks, modalities):
         names = names_in(modality, pack)
-        if not set(names) <= set(model.encoders):
+        if not set(names) <= set(model.encoders) or not seen_by(pack, task, [modality]):
             continue
         rows = split_rows(pack, task, modality)
         case = _Case(pack, task, rows, {m: features(model, pack, m, rows.all) for m in names}, seed)
