@@ -38,6 +38,7 @@ class ExternalModel(Model):
 
     Attributes:
         text: What named the encoders.
+        name: Their names.
         parts: modality -> opened encoder.
         notes: What the data lacks that an encoder wants.
     """
@@ -52,6 +53,7 @@ class ExternalModel(Model):
     ) -> None:
         nn.Module.__init__(self)
         self.text, self.parts, self.spec, self.notes = text, parts, spec, notes
+        self.name = " + ".join(dict.fromkeys(part.title for part in parts.values()))
         self.stored = stored or self.sides[0]
         gains = {"touch": 2.0 if spec.difference else 0.0, "vision": 0.0}
         if spec.window.minus_first:
@@ -86,8 +88,7 @@ class ExternalModel(Model):
     @property
     def title(self) -> str:
         """Its name in tables; (NC): the licence allows no commercial use."""
-        names = dict.fromkeys(part.title + " (NC)" * is_noncommercial(part.licence) for part in self.parts.values())
-        return " + ".join(names)
+        return self.name + " (NC)" * any(is_noncommercial(part.licence) for part in self.parts.values())
 
     @property
     def trained_on(self) -> tuple[str, ...]:
@@ -134,7 +135,11 @@ class ExternalModel(Model):
     def untrained(self) -> ExternalModel | None:
         """The same networks with random weights, as a control; None where that is not possible."""
         parts = {m: random for m, part in self.parts.items() if (random := part.untrained())}
-        return ExternalModel(self.text, parts, self.spec, self.stored) if parts else None
+        if not parts:
+            return None
+        made = ExternalModel(self.text, parts, self.spec, self.stored)
+        made.name = f"{self.name}, untrained"
+        return made
 
     def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
         found = self.encoders[modality](images).float()

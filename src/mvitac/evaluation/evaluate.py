@@ -86,8 +86,8 @@ def probe_runs(
 
     Returns:
         A dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary", "asked" (the
-        config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has a "leak", which is
-        empty unless its test rows, or their groups, were trained on.
+        config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has a "leak", which
+        is empty unless its test rows, or their groups, were trained on.
 
     Raises:
         ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
@@ -157,6 +157,8 @@ def _probe_models(
     session: ProbeConfig,
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of runs, given as folder, model, name and what it learned from."""
+    if not each:
+        return [], []
     rows = Scored(pack)
     num = len(each) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
     with work("fitting probes", num, "probes"):

@@ -63,13 +63,14 @@ def _leak(model: ExternalModel) -> str:
 
 def about_lines(described: Sequence[dict[str, Any]]) -> list[str]:
     """What stands below a table about its encoders (``ExternalModel.describe``): licence, parameters, training data."""
-    lines: dict[str, None] = {}
+    senses: dict[str, list[str]] = {}
     for model in described:
         for modality, encoder in model["encoders"].items():
             use = ", no commercial use" if encoder["noncommercial"] else ""
-            lines[
-                f"{encoder['title']}: {encoder['parameters'] / 1e6:.3g} M parameters, {encoder['features']} features of"
-                f" {modality}; licence {encoder['licence']}{use}; trained on {encoder['trained_on']}; {encoder['source']}"
-            ] = None
-        lines.update(dict.fromkeys(f"{model['title']}: {note}" for note in model["notes"]))
-    return list(lines)
+            line = (
+                f"{encoder['title']}: {encoder['parameters'] / 1e6:.3g} M parameters; licence {encoder['licence']}{use};"
+                f" trained on {encoder['trained_on']}; {encoder['source']}; {encoder['features']} features of"
+            )
+            senses.setdefault(line, []).append(modality)
+    lines = [f"{line} {' and '.join(dict.fromkeys(found))}" for line, found in senses.items()]
+    return [*lines, *dict.fromkeys(f"{model['title']}: {note}" for model in described for note in model["notes"])]

@@ -212,7 +212,7 @@ def parse(text: str) -> Adapter:
     while pairs and "=" not in pairs[0]:  # a comma in a file's name
         head += f",{pairs.pop(0)}"
     name, _, place = head.partition("/" if head.startswith("timm/") else ":")
-    if name not in Adapter.choices and Path(head).suffix in FILES:
+    if name not in Adapter.choices and Path(head).suffix in FILES and (":" not in head or Path(head).exists()):
         name, place = "file", head
     if name not in Adapter.choices or not place:
         known = [f"{START}{choice}{'/' if choice == 'timm' else ':'}..." for choice in Adapter.choices]

@@ -37,9 +37,8 @@ class Timm(Adapter):
         try:
             network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
         except ValueError as error:  # in the words of this option
-            raise ValueError(
-                str(error).replace("--encoder.weights scratch", "weights=random").replace("--encoder.", "")
-            ) from None
+            text = str(error).replace("--encoder.weights ", "weights=").replace("weights=scratch", "weights=random")
+            raise ValueError(text.replace("another --encoder.trunk", "the name of another")) from None
         cfg: dict[str, Any] = getattr(network, "pretrained_cfg", None) or {}
         usual = resolve_data_config(pretrained_cfg={"name": self.place, **cfg})
         random, file = self.weights == "random", Path(self.weights)
