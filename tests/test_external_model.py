@@ -122,7 +122,7 @@ def test_backgrounds_are_subtracted_where_the_pack_has_them(pack: Pack) -> None:
 
 def test_one_encoder_for_each_sense(pack: Pack) -> None:
     model = load_external(f"{TINY},reads=touch,title=a+{TINY},seed=1,title=b")
-    assert {m: part.title for m, part in model.parts.items()} == {"vision": "b", "touch": "a"}
+    assert {m: part.loaded.title for m, part in model.parts.items()} == {"vision": "b", "touch": "a"}
     assert set(load_external(f"{TINY},reads=vision").encoders) == {"vision"}
     for text in (f"{TINY}+{TINY}", f"{TINY},reads=touch+{TINY},reads=touch"):
         with pytest.raises(ValueError, match="one encoder"):
@@ -290,7 +290,8 @@ def test_an_encoder_is_probed_beside_a_run(smoke_run: Path, pack: Pack) -> None:
 
 
 def test_a_plan_has_rows_of_encoders(pack: Pack, tmp_path: Path) -> None:
-    row = Row(label="theirs", encoder=f"{TINY},licence=CC-BY-NC-4.0,trained-on=photos,reads=touch")
+    encoder = f"external:{onnx_mean(tmp_path / 'mean.onnx')},licence=CC-BY-NC-4.0,trained-on=photos,reads=touch"
+    row = Row(label="theirs", encoder=encoder)
     plan = small(pack, rows=(ROWS[0], row, Row(label="lost", encoder="external:none.onnx")), seeds=1)
     config = ProbeConfig(tasks=("pattern",), controls=False)
     work = lay_out(plan, pack, tmp_path, config)

@@ -424,7 +424,7 @@ def test_random_weights_for_the_control_leave_the_encoder_as_it_is(tmp_path: Pat
     found = open_encoder(tvl(tmp_path)[0])
     before = {name: value.clone() for name, value in found.loaded.network.state_dict().items()}
     untrained = found.untrained()
-    assert untrained is not None and isinstance(untrained, OpenEncoder) and untrained.trained_on == "nothing"
+    assert untrained is not None and isinstance(untrained, OpenEncoder) and untrained.loaded.trained_on == "nothing"
     assert all(torch.equal(value, before[name]) for name, value in found.loaded.network.state_dict().items())
     again = randomised(found.loaded.network, 0).state_dict()
     for name, value in untrained.encoder.network.state_dict().items():

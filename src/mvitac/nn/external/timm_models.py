@@ -14,7 +14,7 @@ from timm.data.config import resolve_data_config
 from torch import nn
 
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
-from mvitac.nn.external.base import UNKNOWN, Adapter, Loaded, seeded
+from mvitac.nn.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
 from mvitac.nn.external.preprocessing import Preprocessing
 
 
@@ -48,9 +48,9 @@ class Timm(Adapter):
             preprocessing=Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
             title=f"{self.place}, {self.weights if named else file.name}",
             files=() if named else (file,),
-            licence="none (random weights)" if random else (named and cfg.get("license")) or UNKNOWN,
+            licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
             source=f"https://huggingface.co/{cfg.get('hf_hub_id')}" if named and not random else self.weights,
-            trained_on="nothing" if random else UNKNOWN,
+            trained_on=NOTHING if random else UNKNOWN,
         )
 
     def _built(self, weights: str) -> nn.Module:
