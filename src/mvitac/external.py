@@ -38,6 +38,7 @@ class ExternalModel(Model):
 
     Attributes:
         text: What named the encoders.
+        name: Their names.
         parts: modality -> opened encoder.
         notes: What the data lacks that an encoder wants.
     """
@@ -52,6 +53,7 @@ class ExternalModel(Model):
     ) -> None:
         nn.Module.__init__(self)
         self.text, self.parts, self.spec, self.notes = text, parts, spec, notes
+        self.name = " + ".join(dict.fromkeys(part.loaded.title for part in parts.values()))
         self.stored = stored or self.sides[0]
         gains = {"touch": 2.0 if spec.difference else 0.0, "vision": 0.0}
         if spec.window.minus_first:
@@ -81,18 +83,18 @@ class ExternalModel(Model):
     @property
     def sides(self) -> tuple[int, int]:
         """The largest side of its inputs."""
-        return (max(max(part.encoder.preprocessing.size) for part in self.parts.values()),) * 2
+        side = max(max(part.encoder.preprocessing.size) for part in self.parts.values())
+        return side, side
 
     @property
     def title(self) -> str:
         """Its name in tables; (NC): the licence allows no commercial use."""
-        names = dict.fromkeys(part.title + " (NC)" * is_noncommercial(part.licence) for part in self.parts.values())
-        return " + ".join(names)
+        return self.name + " (NC)" * any(is_noncommercial(part.loaded.licence) for part in self.parts.values())
 
     @property
     def trained_on(self) -> tuple[str, ...]:
         """What its encoders were trained on, as far as it is known; ("nothing",) for random weights."""
-        return tuple(dict.fromkeys(part.trained_on for part in self.parts.values()))
+        return tuple(dict.fromkeys(part.loaded.trained_on for part in self.parts.values()))
 
     def on(self, pack: Pack) -> tuple[ExternalModel, Pack]:
         """This model and ``pack``, for each other.
@@ -134,7 +136,11 @@ class ExternalModel(Model):
     def untrained(self) -> ExternalModel | None:
         """The same networks with random weights, as a control; None where that is not possible."""
         parts = {m: random for m, part in self.parts.items() if (random := part.untrained())}
-        return ExternalModel(self.text, parts, self.spec, self.stored) if parts else None
+        if not parts:
+            return None
+        made = ExternalModel(self.text, parts, self.spec, self.stored)
+        made.name = f"{self.name}, untrained"
+        return made
 
     def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
         found = self.encoders[modality](images).float()
@@ -165,11 +171,11 @@ class ExternalModel(Model):
         layout: Layout = encoder.layout  # type: ignore[assignment]
         preprocessing = part.encoder.preprocessing
         return {
-            "title": part.title,
-            "licence": part.licence,
-            "noncommercial": is_noncommercial(part.licence),
+            "title": part.loaded.title,
+            "licence": part.loaded.licence,
+            "noncommercial": is_noncommercial(part.loaded.licence),
             "source": part.loaded.source,
-            "trained_on": part.trained_on,
+            "trained_on": part.loaded.trained_on,
             "files": {file.name: digest_file(file) for file in part.loaded.files},
             "parameters": sum(p.numel() for p in part.loaded.network.parameters()),
             "features": encoder.num_features,

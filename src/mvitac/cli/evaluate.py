@@ -11,6 +11,7 @@ from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, chosen, probe_runs
+from mvitac.evaluation.external_encoders import about_lines
 from mvitac.evaluation.robustness import STRESSES, stress
 from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.evaluation.sensors import RecolouredPack
@@ -26,8 +27,11 @@ from mvitac.system.progress import shown, work
 class _ProbeOptions:
     """Score frozen features by linear probes, kNN and retrieval, each next to its controls."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Positional[tuple[Path, ...]] = ()
     """Folder of each finished run: seeds of one method, or several methods, on the same data."""
+    encoder: tuple[str, ...] = ()
+    """Other people's encoders to probe on --on, e.g. external:timm/NAME, external:sparsh:FILE or external:FILE.onnx
+    (docs/encoders.md)."""
     config: Annotated[ProbeConfig, tyro.conf.arg(name="")] = ProbeConfig()
     on: Path | None = None
     """Probe on this pack instead of the data the runs were trained on."""
@@ -47,7 +51,7 @@ class _ProbeOptions:
 
 
 def probe(argv: list[str]) -> None:
-    """mvitac probe RUN... [--on PACK] [--learn-on PACK] [--json FILE]"""
+    """mvitac probe RUN... [--encoder external:...] [--on PACK] [--learn-on PACK] [--json FILE]"""
     options = parse(_ProbeOptions, argv, "probe")
     check_json(options.json)
     pack = Pack(options.on) if options.on else None
@@ -59,7 +63,8 @@ def probe(argv: list[str]) -> None:
     elif "colours" in options.config.standardise:
         raise ValueError("--standardise colours shows a new sensor as one of --learn-on: name that pack as well")
     with shown(Console(stderr=True)):
-        result = probe_runs(options.runs, options.config, pack, allow_leak=options.allow_leak, weights=options.weights)
+        more = {"allow_leak": options.allow_leak, "weights": options.weights, "encoders": options.encoder}
+        result = probe_runs(options.runs, options.config, pack, **more)
     say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
     print_summary(result, say, probe=options.config.probes[0])
     for kind in options.config.probes[1:]:
@@ -68,6 +73,8 @@ def probe(argv: list[str]) -> None:
     for kind in STRESSES:
         if mine := [r for r in stressed if r["probe"] == kind]:
             print_summary({**result, "summary": summarise(mine + majority, kind)}, say, probe=kind)
+    for line in about_lines(result["encoders"]):
+        say.print(f"encoder: {line}")
     print_retrieval(result, say)
     print_sensors(result, say)
     result["records"] += stressed

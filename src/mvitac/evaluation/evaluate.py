@@ -15,6 +15,7 @@ from mvitac.data.spec import AnyTask, Event, Task, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
 from mvitac.evaluation.events import check_event, with_event
+from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import (
     PROBES,
@@ -144,6 +145,7 @@ def probe_runs(
     *,
     allow_leak: bool = False,
     weights: Which = "last",
+    encoders: Sequence[str] = (),
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
@@ -157,17 +159,22 @@ def probe_runs(
         pack: Other data to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
         weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
+        encoders: Other people's encoders to probe beside the runs ("external:..."). They need ``pack``.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
-        "asked" (the config) and "models" (digests of the weights). A record has a "leak", which is empty unless its test
-        rows, or their groups, were trained on.
+        "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has
+        a "leak", which is empty unless its test rows, or their groups, were trained on.
 
     Raises:
         ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
             trained on rows or groups that other data than its own would score.
     """
-    _check_paths(paths)
+    if paths or not encoders:
+        _check_paths(paths)
+    elif session.imagenet:
+        raise ValueError("imagenet is the trunk of a run: give --encoder external:timm/NAME,weights=FILE instead")
+    others = open_encoders(encoders, pack)
     models = [load(path, weights) for path in paths]
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
@@ -185,6 +192,7 @@ def probe_runs(
     sources = check_unseen(paths, models, pack, tasks, allow_leak=allow_leak)
     each = list(zip(paths, models, names, sources, strict=True))
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
+    records += probe_encoders(others, tasks, modalities, session.probes, controls=session.controls)
     if session.controls:
         specs = [m.spec for m in models]
         found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
@@ -194,6 +202,7 @@ def probe_runs(
         "pack": pack.digest,
         "asked": to_json(session),
         "models": _digests(paths, weights),
+        "encoders": [model.describe() for model, _ in others],
         "group_by": pack.spec.group_by,
         "notes": list(pack.spec.notes),
         "leaks": leaks_of([*records, *retrieval]),
@@ -217,7 +226,9 @@ def probe_runs(
 
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
     """``pack``, or the data that all of ``models`` were trained on."""
-    packs = [pack or model.open_data() for model in models]
+    if pack:
+        return pack
+    packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError(
             "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
@@ -233,6 +244,8 @@ def _probe_models(
     session: ProbeConfig,
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of runs, given as folder, model, name and what it learned from."""
+    if not each:
+        return [], []
     rows = Scored(pack)
     num = len(each) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
     with work("fitting probes", num, "probes"):

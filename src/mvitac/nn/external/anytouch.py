@@ -23,6 +23,7 @@ NAMES = {
     "pre_layrnorm": "pre_norm",  # the owner's spelling
     "post_layernorm": "head.0",
 }
+CLS = "embeddings.class_embedding"
 UNUSED = r"embeddings\.(patch_embedding\.weight|position_ids|new_position_ids|class_embedding)"
 
 
@@ -71,16 +72,11 @@ def _tower(adapter: Adapter, tensors: Tensors, embed: str, time: int, sensor: in
     if not -num <= sensor < num:
         raise ValueError(f"sensor {sensor}: give -1 (any sensor) or 0 to {num - 1}")
     own = from_clip(under(tensors, "touch_model.", NAMES))
-    cls = own[name] if (name := "embeddings.class_embedding") in own else torch.zeros(0)
-    (
-        shape(adapter, own, name, 1),
-        shape(adapter, own, "positions", 2),
-        shape(adapter, tensors, "touch_projection.weight", 2),
-    )
+    width = shape(adapter, own, CLS, 1)[0]
+    shape(adapter, own, "positions", 2)
+    shape(adapter, tensors, "touch_projection.weight", 2)
+    tokens = [own[CLS].reshape(1, width), tensors["sensor_token"][sensor].reshape(-1, width)]
     kept = {name: value for name, value in own.items() if not re.fullmatch(UNUSED, name)}
-    kept |= {
-        "front": torch.cat([cls[None], tensors["sensor_token"][sensor]])[None],
-        "positions": own["positions"][None],
-    }
-    kept |= {"embed.weight": tensors[embed], "head.1.weight": tensors["touch_projection.weight"]}
+    kept |= {"front": torch.cat(tokens)[None], "positions": own["positions"][None], "embed.weight": tensors[embed]}
+    kept["head.1.weight"] = tensors["touch_projection.weight"]
     return tower(adapter, kept, time=time, eps=1e-5, head=projection(kept, 1e-5))

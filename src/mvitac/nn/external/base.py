@@ -28,7 +28,7 @@ from mvitac.system.files import digest_file, parse_json
 
 START = "external:"
 FILES = (".pt", ".ts", ".pth", ".onnx", ".safetensors")
-UNKNOWN = "unknown"
+UNKNOWN, NOTHING, RANDOM = "unknown", "nothing", "none (random weights)"
 STATISTICS = {"imagenet": IMAGENET, "clip": CLIP, "none": PLAIN}
 
 
@@ -48,7 +48,7 @@ class Loaded:
     source: str = UNKNOWN
     """Where they are from."""
     trained_on: str = UNKNOWN
-    """The data it was trained on; "nothing" for random weights."""
+    """The data it was trained on; ``NOTHING`` for random weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class Adapter(Registered, ABC):
     licence: str = ""
     """Licence of the weights, if the adapter does not know it."""
     trained_on: str = ""
-    """What it was trained on; "nothing" for random weights."""
+    """What it was trained on, if the adapter does not know it; no leak is then assumed."""
     seed: int = 0
     """Seed of random weights and of the probes."""
 
@@ -119,7 +119,7 @@ class Adapter(Registered, ABC):
         """Height and width that ``size`` asks for, by default ``usual``."""
         if not self.size:
             return usual
-        found = _numbers(self.size, "size", int, "x")
+        found: list[int] = list(_numbers(self.size, "size", int, "x"))
         if len(found) > 2:
             raise ValueError(f"size {self.size}: give one side or height x width, e.g. 224 or 320x240")
         return found[0], found[-1]
@@ -141,29 +141,15 @@ class OpenEncoder:
     loaded: Loaded
     encoder: ExternalEncoder
 
-    @property
-    def title(self) -> str:
-        return self.adapter.title or self.loaded.title
-
-    @property
-    def licence(self) -> str:
-        return self.adapter.licence or self.loaded.licence
-
-    @property
-    def trained_on(self) -> str:
-        return self.adapter.trained_on or self.loaded.trained_on
-
     def untrained(self) -> OpenEncoder | None:
         """The same network with random weights; None if it has no weights here, or random ones already."""
-        if self.trained_on == "nothing" or not any(p.is_floating_point() for p in self.loaded.network.parameters()):
+        network = self.loaded.network
+        if self.loaded.trained_on == NOTHING or not any(p.is_floating_point() for p in network.parameters()):
             return None
-        encoder = ExternalEncoder(
-            randomised(self.loaded.network, self.adapter.seed), self.encoder.preprocessing, self.adapter.pool
-        )
-        adapter = replace(
-            self.adapter, title=f"{self.title}, untrained", licence="none (random weights)", trained_on="nothing"
-        )
-        return replace(self, adapter=adapter, encoder=encoder)
+        network = randomised(network, self.adapter.seed)
+        loaded = replace(self.loaded, network=network, files=(), licence=RANDOM, trained_on=NOTHING)
+        encoder = ExternalEncoder(network, self.encoder.preprocessing, self.adapter.pool)
+        return OpenEncoder(self.text, self.adapter, loaded, encoder)
 
 
 def randomised(network: nn.Module, seed: int) -> nn.Module:
@@ -198,6 +184,9 @@ def open_encoder(text: str) -> OpenEncoder:
     """
     adapter = parse(text)
     loaded = adapter.load()
+    given = {name: getattr(adapter, name) for name in ("licence", "trained_on") if getattr(loaded, name) == UNKNOWN}
+    given["title"] = adapter.title
+    loaded = replace(loaded, **{name: value for name, value in given.items() if value})
     digests = [digest_file(file) for file in loaded.files]
     try:
         encoder = ExternalEncoder(loaded.network, adapter.changed(loaded.preprocessing), adapter.pool, f"{digests}")
@@ -212,12 +201,12 @@ def parse(text: str) -> Adapter:
     while pairs and "=" not in pairs[0]:  # a comma in a file's name
         head += f",{pairs.pop(0)}"
     name, _, place = head.partition("/" if head.startswith("timm/") else ":")
-    if name not in Adapter.choices and Path(head).suffix in FILES:
+    if name not in Adapter.choices and Path(head).suffix in FILES and (":" not in head or Path(head).exists()):
         name, place = "file", head
     if name not in Adapter.choices or not place:
         known = [f"{START}{choice}{'/' if choice == 'timm' else ':'}..." for choice in Adapter.choices]
         raise unknown("encoder", text, [*known, f"{START}FILE ({', '.join(FILES)})"])
-    kind = find(Adapter, name)
+    kind: Any = find(Adapter, name)
     hints = typing.get_type_hints(kind)
     known = [field.name.replace("_", "-") for field in fields(kind) if field.name != "place"]
     given: dict[str, Any] = {}

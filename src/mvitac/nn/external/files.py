@@ -6,7 +6,7 @@ TorchScript and ONNX files are programs: open only files that you trust.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -35,7 +35,7 @@ class File(Adapter):
     def load(self) -> Loaded:
         file = self.path()
         if self.trunk:
-            given = {name: getattr(self, name) for name in Adapter.__dataclass_fields__}
+            given = {field.name: getattr(self, field.name) for field in fields(Adapter)}
             return Timm(**{**given, "place": self.trunk}, weights=str(file)).load()
         if file.suffix in (".safetensors", ".pth"):
             raise ValueError(f"{file} holds weights only: name their timm model with trunk=NAME, or an adapter")

@@ -15,7 +15,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -24,7 +24,7 @@ from torch import nn
 from mvitac.nn.external.base import Adapter, Loaded, seeded
 from mvitac.nn.external.encoder import Plain
 from mvitac.nn.external.preprocessing import Preprocessing
-from mvitac.registry import unknown
+from mvitac.registry import from_json, to_json
 from mvitac.system.files import brief
 
 ABOUT = ("title", "licence", "source", "trained_on")
@@ -50,16 +50,12 @@ class Python(Adapter):
             raise ValueError(f"{self.place}() returned a {type(made).__name__}: return a torch module and a dict")
         network, given = made[0], dict(made[1])
         about = {name: str(given.pop(name)) for name in ABOUT if name in given}
-        prefix, known = int(given.pop("prefix", 0)), [field.name for field in fields(Preprocessing)]
-        for name in given:
-            if name not in known:
-                raise unknown(f"key of {self.place}()", name, [*known, *ABOUT, "prefix"])
-        whole = hasattr(network, "forward_features") and hasattr(network, "num_features")
-        return Loaded(
-            network=network if whole else Plain(network, prefix),
-            preprocessing=Preprocessing(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}),
-            **{"title": self.place, "source": self.place, **about},
-        )
+        prefix = int(given.pop("prefix", 0))
+        made = from_json(Preprocessing, to_json(given), f"{self.place}()")
+        if not (hasattr(network, "forward_features") and hasattr(network, "num_features")):
+            network = Plain(network, prefix)
+        about = {"title": self.place, "source": self.place, **about}
+        return replace(Loaded(network=network, preprocessing=made, title=""), **about)
 
     def _factory(self) -> Callable[[], Any]:
         module, _, name = self.place.partition(":")

@@ -8,12 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
+from timm.data.config import resolve_data_config
 from torch import nn
 
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
-from mvitac.nn.external.base import UNKNOWN, Adapter, Loaded, seeded
+from mvitac.nn.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
 from mvitac.nn.external.preprocessing import Preprocessing
 
 
@@ -34,34 +35,28 @@ class Timm(Adapter):
             )
         known = {"pretrained": IMAGENET, "random": SCRATCH}
         try:
-            config = EncoderConfig(trunk=self.place).trunk
             network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
         except ValueError as error:  # in the words of this option
-            raise ValueError(
-                str(error).replace("--encoder.weights scratch", "weights=random").replace("--encoder.", "")
-            ) from None
-        cfg = network.pretrained_cfg  # type: ignore[union-attr]
-        height, width = cfg["input_size"][1:]  # type: ignore[index]
+            text = str(error).replace("--encoder.weights ", "weights=").replace("weights=scratch", "weights=random")
+            raise ValueError(text.replace("another --encoder.trunk", "the name of another")) from None
+        cfg: dict[str, Any] = getattr(network, "pretrained_cfg", None) or {}
+        usual = resolve_data_config(pretrained_cfg={"name": self.place, **cfg})
         random, file = self.weights == "random", Path(self.weights)
+        named = self.weights in known
         return Loaded(
             network=network,
-            preprocessing=Preprocessing(size=(height, width), mean=cfg["mean"], std=cfg["std"]),  # type: ignore[index]
-            title=f"{config}, {'random' if random else file.name if self.weights not in known else 'pretrained'}",
-            files=(file,) if self.weights not in known else (),
-            licence="none (random weights)"
-            if random
-            else (cfg.get("license") or UNKNOWN)
-            if self.weights in known
-            else UNKNOWN,  # type: ignore[union-attr]
-            source=f"https://huggingface.co/{cfg.get('hf_hub_id')}" if self.weights == "pretrained" else self.weights,  # type: ignore[union-attr]
-            trained_on="nothing" if random else UNKNOWN,
+            preprocessing=Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
+            title=f"{self.place}, {self.weights if named else file.name}",
+            files=() if named else (file,),
+            licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
+            source=f"https://huggingface.co/{cfg.get('hf_hub_id')}" if named and not random else self.weights,
+            trained_on=NOTHING if random else UNKNOWN,
         )
 
     def _built(self, weights: str) -> nn.Module:
         trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3 * (self.frames or 1))
-        usual = trunk.pretrained_cfg["input_size"][1:]  # type: ignore[index]
         if self.size and hasattr(trunk, "set_input_size"):
-            trunk.set_input_size(img_size=self.sides(usual))  # type: ignore[operator]
+            trunk.set_input_size(img_size=self.sides((224, 224)))  # type: ignore[operator]
         if hasattr(trunk, "patch_embed"):
             trunk.grid = (1, *trunk.patch_embed.grid_size)  # type: ignore[union-attr]
         return trunk

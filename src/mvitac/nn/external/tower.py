@@ -137,7 +137,7 @@ class Tower(nn.Module):
             self.positions = nn.Parameter(torch.zeros(1, placed + math.prod(grid), width))
         else:
             self.register_buffer("positions", fixed, persistent=False)
-        norm = partial(nn.LayerNorm, eps=eps)
+        norm: Any = partial(nn.LayerNorm, eps=eps)
         start = 1.0 if "blocks.0.ls1.gamma" in tensors else None
         usual = partial(Block, width, max(1, width // HEAD), qkv_bias=True, init_values=start, norm_layer=norm)
         self.pre_norm = norm(width) if "pre_norm.weight" in tensors else nn.Identity()
@@ -207,7 +207,7 @@ def resnet(adapter: Adapter, tensors: Tensors) -> nn.Module:
     layers = tuple(depth(tensors, f"layer{i}.") for i in range(1, 5))
     if 0 in layers:
         raise adapter.refuse("it is no ResNet of four stages")
-    kind = Bottleneck if "layer1.0.conv3.weight" in tensors else BasicBlock
+    kind: Any = Bottleneck if "layer1.0.conv3.weight" in tensors else BasicBlock
     channels = tuple(shape(adapter, tensors, f"layer{i}.0.conv1.weight", 4)[0] for i in range(1, 5))
     stem = shape(adapter, tensors, "conv1.weight", 4)
     network = ResNet(kind, layers, num_classes=0, in_chans=stem[1], channels=channels)
