@@ -278,9 +278,9 @@ def test_frames_are_channels_or_images_with_one_mask(name: str) -> None:
 @pytest.mark.parametrize("name", ["mae", "ijepa"])
 def test_other_trunks_and_views_of_one_patch_are_refused(name: str) -> None:
     config, run = recipe_config(name), recipe("smoke")
-    with pytest.raises(ValueError, match=f"method '{name}' needs a ViT, and trunk mvitac_tiny is a ResNet: give"):
+    with pytest.raises(ValueError, match=f"method '{name}' needs a plain ViT, and trunk mvitac_tiny is a ResNet: give"):
         config.build(spec(), TINY)
-    with pytest.raises(ValueError, match="needs a ViT, and trunk mvitac_tiny is a ResNet"):
+    with pytest.raises(ValueError, match="needs a plain ViT, and trunk mvitac_tiny is a ResNet"):
         replace(run, method=config).check(spec(), 100, 72)
     small = replace(run, method=config, encoder=TINY_VIT, augment=replace(run.augment, size=8))
     with pytest.raises(ValueError, match=r"8 px are a single patch .*--augment\.size 16 or more"):

@@ -66,7 +66,7 @@ def test_patches_are_those_that_the_vit_embeds() -> None:
     vit = build_trunk(EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH), 3)
     assert isinstance(vit, VisionTransformer)
     images, kernel = torch.randn(2, 3, 20, 12), vit.patch_embed.proj
-    found = patches(images, 8)
+    found = patches(vit, images)
     assert found.shape == (2, 6, 192)
     embedded = found @ kernel.weight.flatten(1).mT + kernel.bias  # type: ignore[operator]
     torch.testing.assert_close(embedded, vit.patch_embed(images).flatten(1, 2), rtol=1e-4, atol=1e-5)

@@ -6,16 +6,15 @@ predicts, block by block, the tokens that a momentum (teacher) copy has for the 
     L = smooth_L1(predictor(context, positions of a target block), layer_norm(teacher(image) at that block))
 
 averaged over blocks, patches and features. The layer norm has no weights, and smooth L1 turns at 1. The teacher follows with
-a momentum that rises linearly from .996 to 1. Nothing is predicted in pixels.
-With ``senses both`` the predictor of touch also gets vision's context tokens, and that of vision touch's. Each encoder
-still sees its own modality only. Windows: as channels of one image, or frame by frame with one set of blocks.
+a momentum that rises linearly from .996 to 1. With ``senses both`` the predictor of touch also gets vision's context tokens,
+and that of vision touch's; each encoder still sees its own modality only. Windows: as channels of one image, or
+(``--encoder.temporal mean``) frame by frame with one set of blocks.
 
 Block sizes are drawn once per batch (per chunk, with ``--chunk``), places once per image, as in the authors' code. Different
 here, because masks are made on the device without waiting for it:
-- Contexts have a fixed length, the (1 - .15)^4 of the image that 4 blocks leave on average: longer ones are cut at random,
-  the missing patches of shorter ones are hidden from attention. Theirs are cut to the shortest of the batch.
-- Of 8 draws, the first with ``min_context`` patches of context, else that with the most. Theirs draw until it fits, and let
-  context and targets overlap if that takes long.
+- Contexts have a fixed length, the (1 - .15)^4 of the image that 4 blocks leave if they do not overlap much: longer ones are
+  cut at random, missing patches of shorter ones are hidden from attention. Theirs are cut to the shortest of the batch.
+- Of 8 draws, the first with ``min_context`` patches of context, else that with the most. Theirs draw until it fits.
 - A block may touch the last row and column, and cover the whole image. Theirs are drawn one short of both.
 Sources: the paper (section 3, appendix A.1); facts of https://github.com/facebookresearch/ijepa (multiblock.py, train.py,
 in1k_vith14_ep300.yaml). Not implemented: the rising weight decay (here the recipe's, for all methods).
@@ -26,8 +25,8 @@ Shapes: B images, N patches, K of them context, M target blocks of at most S pat
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -37,24 +36,9 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.nn import vit
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.nn.momentum import Momentum
-from mvitac.nn.vit import (
-    Predictor,
-    Senses,
-    Tokens,
-    build_vits,
-    each_frame,
-    encode_visible,
-    frames_of,
-    grid_of,
-    patch_side,
-    predictor_depth,
-    predictor_width,
-    row_uniform,
-    take,
-    vit_of,
-)
 
 TRIES = 8
 
@@ -80,7 +64,7 @@ class IJEPAConfig(MethodConfig):
     """Momentum of the teacher at the start (I-JEPA: .996)."""
     momentum_end: float | None = 1.0
     """Value to which it rises linearly (I-JEPA: 1)."""
-    senses: Senses = "own"
+    senses: vit.Senses = "own"
     """What a predictor sees. own: the context of its modality. both: also that of the other modality."""
     predictor_width: int | None = None
     """Width of the predictor, a multiple of 4. Default: half of the trunk's, at most 384, in whole heads of 32 features
@@ -97,15 +81,7 @@ class IJEPAConfig(MethodConfig):
             low, high = getattr(self, name)
             if not 0 < low <= high <= top:
                 raise ValueError(f"{name} {(low, high)}: give two rising numbers above 0, at most {top:g}")
-        if self.predictor_width is not None and not (
-            4 <= self.predictor_width <= 4096 and self.predictor_width % 4 == 0
-        ):
-            raise ValueError(f"predictor_width {self.predictor_width}: give a multiple of 4, at most 4096")
-        if self.predictor_depth is not None and not 1 <= self.predictor_depth <= 64:
-            raise ValueError(f"predictor_depth {self.predictor_depth}: give 1 to 64")
-
-    def without_idle(self, spec: DataSpec) -> Self:
-        return self if len(spec.modalities) > 1 else replace(self, senses="own")
+        vit.check_predictor("predictor", self.predictor_width, self.predictor_depth)
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> IJEPA:
         return IJEPA(self, spec, encoder)
@@ -145,14 +121,14 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
     device, num = rows.device, height * width
 
     # Sizes, the same for all images: [M + 1, 2], targets before context.
-    draws = row_uniform(seed, torch.full_like(rows[:1], -1), 3, 2 * stream)[0]
+    draws = vit.row_uniform(seed, torch.full_like(rows[:1], -1), 3, 2 * stream)[0]
     ranges = (config.target_scale, config.target_aspect, config.context_scale)
     scale, aspect, context_scale = (low + (high - low) * u for (low, high), u in zip(ranges, draws, strict=True))
     side = block_sides(scale, aspect, grid)
     sides = torch.stack([side] * num_targets + [block_sides(context_scale, torch.ones_like(aspect), grid)])
 
     # Places: corners [B, TRIES, M + 1, 2], and which patches are inside [B, TRIES, M + 1, N].
-    u = row_uniform(seed, rows, TRIES * (num_targets + 1) * 2, 2 * stream).view(-1, TRIES, num_targets + 1, 2)
+    u = vit.row_uniform(seed, rows, TRIES * (num_targets + 1) * 2, 2 * stream).view(-1, TRIES, num_targets + 1, 2)
     last = torch.tensor(grid).to(device) - sides
     corner = (u * (last + 1)).floor().minimum(last)
     patch = torch.arange(num, device=device)
@@ -169,7 +145,7 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
 
     # Patch numbers, in arrays whose size depends on the config only.
     room = max(1, round(num * (1 - config.target_scale[0]) ** num_targets))
-    order = (context + row_uniform(seed, rows, num, 2 * stream + 1)).argsort(dim=1, descending=True)[:, :room]
+    order = (context + vit.row_uniform(seed, rows, num, 2 * stream + 1)).argsort(dim=1, descending=True)[:, :room]
     in_context = torch.arange(room, device=device) < context.sum(1, keepdim=True).clamp(min=1)
     area, (low, high) = math.floor(config.target_scale[1] * num), config.target_aspect
     most_high, most_wide = (min(grid[i], max(1, round(math.sqrt(area * (high, 1 / low)[i])))) for i in (0, 1))
@@ -186,37 +162,30 @@ class IJEPA(Contrastive):
     def __init__(self, config: IJEPAConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.trunks = build_vits(encoder, spec, config.name, config.senses)
-        self.teachers = nn.ModuleDict({m: Momentum(vit_of(trunk)) for m, trunk in self.trunks.items()})
+        self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
+        self.teachers = nn.ModuleDict({m: Momentum(vit.vit_of(trunk)) for m, trunk in self.trunks.items()})
+        shape = (config.predictor_width, config.predictor_depth)
         self.predictors = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
-            vit = vit_of(trunk)
-            self.predictors[modality] = Predictor(
-                vit.embed_dim,
-                config.predictor_width or predictor_width(vit, 1 / 2, 384),
-                config.predictor_depth or predictor_depth(vit, 1 / 2, 12),
-                vit.embed_dim,
-                vit.embed_dim if config.senses == "both" else None,
-            )
+            width = vit.vit_of(trunk).embed_dim
+            self.predictors[modality] = vit.Predictor(trunk, width, config.senses, shape, 1 / 2, (384, 12))
 
     def blocks(self, batch: Views, modality: str) -> tuple[Blocks, tuple[int, int]]:
         """The blocks of each image that the ViT of ``modality`` sees, and the grid of its patches."""
-        trunk = self.trunks[modality]
-        grid = grid_of(batch.images[modality][0], patch_side(vit_of(trunk)))
-        stream = list(self.trunks).index(modality)
-        return multi_block(self.config, batch.seed, batch.rows, stream, grid).each(frames_of(trunk)), grid
+        trunk, stream = self.trunks[modality], list(self.trunks).index(modality)
+        grid = vit.grid_of(trunk, batch.images[modality][0])
+        return multi_block(self.config, batch.seed, batch.rows, stream, grid).each(vit.frames_of(trunk)), grid
 
     def queries(self, batch: Views) -> Embeddings:
         """("predicted", modality) -> [B, M S, D], with the frames of a window one after another."""
-        seen: dict[str, Tokens] = {}
         found = {m: self.blocks(batch, m) for m in self.trunks}
-        for modality, (blocks, _) in found.items():
-            trunk = self.trunks[modality]
-            images = each_frame(trunk, batch.images[modality][0])
-            seen[modality] = encode_visible(vit_of(trunk), images, blocks.context, blocks.in_context)
+        seen = {
+            m: vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
+            for m, (blocks, _) in found.items()
+        }
         result: Embeddings = {}
         for modality, (blocks, grid) in found.items():
-            other = next((seen[m] for m in seen if m != modality), None) if self.config.senses == "both" else None
+            other = next((seen[m] for m in seen if m != modality), None)
             predicted = self.predictors[modality](seen[modality], blocks.targets, grid, blocks.in_target, other)
             result["predicted", modality] = predicted.reshape(len(batch.rows), -1, predicted.shape[-1])
         return result
@@ -227,9 +196,10 @@ class IJEPA(Contrastive):
         result: Embeddings = {}
         for modality, trunk in self.trunks.items():
             blocks, _ = self.blocks(batch, modality)
-            vit: VisionTransformer = self.teachers[modality].module  # type: ignore[assignment]
-            tokens = vit.forward_features(each_frame(trunk, batch.images[modality][0]))[:, vit.num_prefix_tokens :]
-            target = take(F.layer_norm(tokens.float(), tokens.shape[-1:]), blocks.targets.flatten(1))
+            teacher: VisionTransformer = self.teachers[modality].module  # type: ignore[assignment]
+            tokens = teacher.forward_features(vit.each_frame(trunk, batch.images[modality][0]))
+            tokens = tokens[:, teacher.num_prefix_tokens :]
+            target = vit.take(F.layer_norm(tokens.float(), tokens.shape[-1:]), blocks.targets.flatten(1))
             used = blocks.in_target.reshape(len(batch.rows), -1).float()
             result["target", modality] = target.reshape(len(batch.rows), -1, target.shape[-1])
             result["weight", modality] = used / used.sum(1, keepdim=True)
@@ -247,4 +217,4 @@ class IJEPA(Contrastive):
 
     def after_step(self, progress: float) -> None:
         for modality, trunk in self.trunks.items():
-            self.teachers[modality].follow(vit_of(trunk), self.config.momentum_at(progress))  # type: ignore[operator]
+            self.teachers[modality].follow(vit.vit_of(trunk), self.config.momentum_at(progress))  # type: ignore[operator]

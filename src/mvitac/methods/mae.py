@@ -20,8 +20,9 @@ Shapes: B images, N patches of P values (pixels x channels), K of them visible, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+import math
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -29,24 +30,8 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.nn import vit
 from mvitac.nn.encoders import EncoderConfig
-from mvitac.nn.vit import (
-    Predictor,
-    Senses,
-    Tokens,
-    build_vits,
-    each_frame,
-    encode_visible,
-    frames_of,
-    grid_of,
-    patch_side,
-    patches,
-    predictor_depth,
-    predictor_width,
-    row_uniform,
-    take,
-    vit_of,
-)
 
 EPS = 1e-6
 """Added to the variance of a patch, as in the authors' code."""
@@ -63,7 +48,7 @@ class MAEConfig(MethodConfig):
     """Share of the patches that is hidden (MAE, Sparsh: .75; T3: .4)."""
     pixel_norm: bool = True
     """Predict each patch minus its mean and over its standard deviation (MAE, T3). Sparsh and AnyTouch: off."""
-    senses: Senses = "own"
+    senses: vit.Senses = "own"
     """What a decoder sees. own: the visible patches of its modality. both: also those of the other modality."""
     decoder_width: int | None = None
     """Width of the decoder, a multiple of 4. Default: two thirds of the trunk's, at most 512, in whole heads of 32
@@ -74,13 +59,7 @@ class MAEConfig(MethodConfig):
     def __post_init__(self) -> None:
         if not 0 < self.mask_ratio < 1:
             raise ValueError(f"mask_ratio {self.mask_ratio}: give a share between 0 and 1")
-        if self.decoder_width is not None and not (4 <= self.decoder_width <= 4096 and self.decoder_width % 4 == 0):
-            raise ValueError(f"decoder_width {self.decoder_width}: give a multiple of 4, at most 4096")
-        if self.decoder_depth is not None and not 1 <= self.decoder_depth <= 64:
-            raise ValueError(f"decoder_depth {self.decoder_depth}: give 1 to 64")
-
-    def without_idle(self, spec: DataSpec) -> Self:
-        return self if len(spec.modalities) > 1 else replace(self, senses="own")
+        vit.check_predictor("decoder", self.decoder_width, self.decoder_depth)
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MAE:
         return MAE(self, spec, encoder)
@@ -108,40 +87,36 @@ class MAE(Contrastive):
     def __init__(self, config: MAEConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.trunks = build_vits(encoder, spec, config.name, config.senses)
+        self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
+        shape = (config.decoder_width, config.decoder_depth)
         self.decoders = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
-            vit = vit_of(trunk)
-            self.decoders[modality] = Predictor(
-                vit.embed_dim,
-                config.decoder_width or predictor_width(vit, 2 / 3, 512),
-                config.decoder_depth or predictor_depth(vit, 2 / 3, 8),
-                spec.channels(modality) // frames_of(trunk) * patch_side(vit) ** 2,
-                vit.embed_dim if config.senses == "both" else None,
-            )
+            pixels = vit.patches(trunk, torch.zeros(1, spec.channels(modality), 1, 1)).shape[2]
+            self.decoders[modality] = vit.Predictor(trunk, pixels, config.senses, shape, 2 / 3, (512, 8))
 
     def queries(self, batch: Views) -> Embeddings:
         """("loss", modality) -> [B], the loss of each row."""
-        seen: dict[str, Tokens] = {}
-        hidden: dict[str, Tensor] = {}
-        for stream, modality in enumerate(self.trunks):
-            trunk, images = self.trunks[modality], batch.images[modality][0]
-            height, width = grid_of(images, patch_side(vit_of(trunk)))
-            noise = row_uniform(batch.seed, batch.rows, height * width, stream)
+        seen, hidden = {}, {}
+        for stream, (modality, trunk) in enumerate(self.trunks.items()):
+            images = batch.images[modality][0]
+            noise = vit.row_uniform(batch.seed, batch.rows, math.prod(vit.grid_of(trunk, images)), stream)
             visible, hidden[modality] = (
-                at.repeat_interleave(frames_of(trunk), 0) for at in split_patches(noise, self.config.mask_ratio)
+                at.repeat_interleave(vit.frames_of(trunk), 0) for at in split_patches(noise, self.config.mask_ratio)
             )
-            seen[modality] = encode_visible(vit_of(trunk), each_frame(trunk, images), visible)
-        return {("loss", m): self._row_losses(m, batch.images[m][0], seen, hidden[m]) for m in self.trunks}
-
-    def _row_losses(self, modality: str, images: Tensor, seen: dict[str, Tokens], hidden: Tensor) -> Tensor:
-        trunk, side = self.trunks[modality], patch_side(vit_of(self.trunks[modality]))
-        other = next((seen[m] for m in seen if m != modality), None) if self.config.senses == "both" else None
-        predicted = self.decoders[modality](seen[modality], hidden[:, None], grid_of(images, side), other=other)[:, 0]
-        with torch.autocast(images.device.type, enabled=False):
-            target = take(patches(each_frame(trunk, images).float(), side), hidden)
-            error = (predicted.float() - pixel_targets(target, self.config.pixel_norm)) ** 2
-            return error.unflatten(0, (-1, frames_of(trunk))).flatten(1).mean(1)
+            seen[modality] = vit.encode_visible(trunk, images, visible)
+        result: Embeddings = {}
+        for modality, trunk in self.trunks.items():
+            images = batch.images[modality][0]
+            other = next((seen[m] for m in seen if m != modality), None)
+            decoder = self.decoders[modality]
+            predicted = decoder(seen[modality], hidden[modality][:, None], vit.grid_of(trunk, images), other=other)[
+                :, 0
+            ]
+            with torch.autocast(images.device.type, enabled=False):
+                values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
+                error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2
+                result["loss", modality] = error.view(len(batch.rows), -1).mean(1)
+        return result
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         return with_sum({m: z["loss", m].mean() for m in self.trunks})

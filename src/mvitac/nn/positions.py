@@ -11,10 +11,6 @@ def sin_cos_positions(height: int, width: int, features: int, device: torch.devi
 
     The four quarters of the features are sin(row w_i), cos(row w_i), sin(column w_i), cos(column w_i), with
     w_i = 10000^(-4 i / features).
-
-    Example:
-        >>> sin_cos_positions(1, 2, 4).tolist()[0]
-        [0.0, 1.0, 0.0, 1.0]
     """
     assert features % 4 == 0, features
     rates = 10000.0 ** (-torch.arange(0, features, 4, device=device, dtype=torch.float32) / features)

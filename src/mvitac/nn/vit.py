@@ -13,6 +13,7 @@ from typing import Any, Literal
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from timm.layers import PatchEmbed  # pyright: ignore[reportPrivateImportUsage]
 from timm.models.vision_transformer import Block, VisionTransformer
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -23,6 +24,7 @@ from mvitac.nn.positions import sin_cos_positions
 
 Senses = Literal["own", "both"]
 """Whether a predictor sees tokens of its own modality, or of both."""
+Shape = tuple[int | None, int | None]
 _GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
 """The constants of SplitMix64 (Steele et al., OOPSLA 2014) as signed numbers."""
 
@@ -54,9 +56,8 @@ def _hash(x: Tensor) -> Tensor:
 def check_vit(config: EncoderConfig, method: str, size: int) -> None:
     """Raise ValueError unless ``config`` names a plain ViT that cuts views of ``size`` px into 2 x 2 patches or more."""
     with torch.device("meta"):
-        vit = build_trunk(EncoderConfig(trunk=config.trunk, weights=SCRATCH), 3)
-    side = -(-size // patch_side(_plain(vit, config.trunk, method)))
-    if side < 2:
+        vit = _plain(build_trunk(EncoderConfig(trunk=config.trunk, weights=SCRATCH), 3), config.trunk, method)
+    if size <= vit.patch_embed.patch_size[0]:
         raise ValueError(
             f"views of {size} px are a single patch of trunk {config.trunk}, and method {method!r} hides patches from"
             f" others: give --augment.size {size * 2} or more"
@@ -64,10 +65,10 @@ def check_vit(config: EncoderConfig, method: str, size: int) -> None:
 
 
 def _plain(trunk: nn.Module, name: str, method: str) -> VisionTransformer:
-    if not isinstance(trunk, VisionTransformer):
+    if not (isinstance(trunk, VisionTransformer) and isinstance(trunk.patch_embed, PatchEmbed)):
         raise ValueError(
-            f"method {method!r} needs a ViT, and trunk {name} is a {type(trunk).__name__}: give e.g. --encoder.trunk"
-            " mvitac_vit --encoder.weights scratch"
+            f"method {method!r} needs a plain ViT, and trunk {name} is a {type(trunk).__name__}: give e.g."
+            " --encoder.trunk mvitac_vit --encoder.weights scratch"
         )
     return trunk
 
@@ -86,11 +87,12 @@ def build_vits(config: EncoderConfig, spec: DataSpec, method: str, senses: Sense
         )
     trunks = nn.ModuleDict()
     for modality in spec.modalities:
-        if spec.frames(modality) > 1 and config.temporal == "attention":
+        windows = spec.frames(modality) > 1
+        if windows and config.temporal == "attention":
             raise ValueError(
                 f"method {method!r} does not train temporal attention: give --encoder.temporal mean or stack"
             )
-        if spec.frames(modality) > 1 and config.temporal != "stack" and senses == "both":
+        if windows and config.temporal == "mean" and senses == "both":
             raise ValueError("senses both reads the frames of a window together: give --encoder.temporal stack")
         trunks[modality] = build_trunk(config, spec.channels(modality), spec.frames(modality))
         _plain(vit_of(trunks[modality]), config.trunk, method).reset_classifier(0, "avg")
@@ -103,35 +105,26 @@ def vit_of(trunk: nn.Module) -> VisionTransformer:
 
 
 def frames_of(trunk: nn.Module) -> int:
-    """Number of frames that a trunk from ``build_vits`` reads one by one."""
+    """Number of frames that a trunk from ``build_vits`` reads one by one. B images are then rows x frames."""
     return trunk.frames if isinstance(trunk, PerFrame) else 1
 
 
-def each_frame(trunk: nn.Module, images: Float[Tensor, "B C H W"]) -> Float[Tensor, "B2 C2 H W"]:
-    """The images that the ViT of a trunk sees: all frames of the first window, then those of the next one, ..."""
+def each_frame(trunk: nn.Module, images: Tensor) -> Tensor:
+    """The images that the ViT of a trunk sees: [R, F C, H, W] to [R F, C, H, W]."""
     return images.unflatten(1, (frames_of(trunk), -1)).flatten(0, 1)
 
 
-def patch_side(vit: VisionTransformer) -> int:
-    """Side of a patch in pixels."""
-    return int(vit.patch_embed.patch_size[0])
-
-
-def whole_patches(images: Float[Tensor, "B C H W"], side: int) -> Float[Tensor, "B C H2 W2"]:
-    """Pad images with zeros at the bottom and the right to whole patches, as timm's ViT does."""
-    height, width = images.shape[2:]
-    return F.pad(images, (0, -width % side, 0, -height % side))
-
-
-def patches(images: Float[Tensor, "B C H W"], side: int) -> Float[Tensor, "B N P"]:
-    """The pixels of each patch, row by row of the grid; P = C x side x side."""
-    return F.unfold(whole_patches(images, side), side, stride=side).mT
-
-
-def grid_of(images: Float[Tensor, "B C H W"], side: int) -> tuple[int, int]:
+def grid_of(trunk: nn.Module, images: Tensor) -> tuple[int, int]:
     """Rows and columns of the patches of ``images``."""
-    height, width = images.shape[2:]
-    return -(-height // side), -(-width // side)
+    side = vit_of(trunk).patch_embed.patch_size[0]
+    return -(-images.shape[2] // side), -(-images.shape[3] // side)
+
+
+def patches(trunk: nn.Module, images: Tensor) -> Float[Tensor, "B N P"]:
+    """The pixels of each patch, P = C x side x side. Like timm's ViT, images are padded at the bottom and the right."""
+    side = vit_of(trunk).patch_embed.patch_size[0]
+    padding = (0, -images.shape[3] % side, 0, -images.shape[2] % side)
+    return F.unfold(F.pad(each_frame(trunk, images), padding), side, stride=side).mT
 
 
 def take(tokens: Float[Tensor, "B N D"], at: Int[Tensor, "B K"]) -> Float[Tensor, "B K D"]:
@@ -151,16 +144,14 @@ class Tokens:
 
 
 def encode_visible(
-    vit: VisionTransformer,
-    images: Float[Tensor, "B C H W"],
-    at: Int[Tensor, "B K"],
-    live: Bool[Tensor, "B K"] | None = None,
+    trunk: nn.Module, images: Tensor, at: Int[Tensor, "B K"], live: Bool[Tensor, "B K"] | None = None
 ) -> Tokens:
     """The normalised output tokens of a ViT that sees only the patches ``at``, each with its own position.
 
     ``live`` says which of ``at`` count; no token attends to the others.
     """
-    tokens = vit.norm_pre(vit._pos_embed(vit.patch_embed(images)))
+    vit = vit_of(trunk)
+    tokens = vit.norm_pre(vit._pos_embed(vit.patch_embed(each_frame(trunk, images))))
     front = vit.num_prefix_tokens
     tokens = torch.cat([tokens[:, :front], take(tokens[:, front:], at)], dim=1)
     live = None if live is None else F.pad(live, (front, 0), value=True)
@@ -180,14 +171,12 @@ def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None, *, recompu
     return tokens
 
 
-def predictor_width(vit: VisionTransformer, share: float, most: int) -> int:
-    """``share`` of a ViT's width in whole heads of 32 features, at most ``most``."""
-    return min(most, max(1, round(vit.embed_dim * share / 32)) * 32)
-
-
-def predictor_depth(vit: VisionTransformer, share: float, most: int) -> int:
-    """``share`` of a ViT's blocks, from 1 to ``most``."""
-    return min(most, max(1, round(len(vit.blocks) * share)))
+def check_predictor(name: str, width: int | None, depth: int | None) -> None:
+    """Raise ValueError for an impossible width or depth of a ``Predictor`` that the config calls ``name``."""
+    if width is not None and not (4 <= width <= 4096 and width % 4 == 0):
+        raise ValueError(f"{name}_width {width}: give a multiple of 4, at most 4096")
+    if depth is not None and not 1 <= depth <= 64:
+        raise ValueError(f"{name}_depth {depth}: give 1 to 64")
 
 
 class Predictor(nn.Module):
@@ -196,21 +185,25 @@ class Predictor(nn.Module):
     A hidden patch is a learned mask token plus the fixed sine-cosine embedding of its position.
 
     Args:
-        features: Width of the visible tokens.
-        width: Its own width; a head has 32 features.
-        depth: Number of transformer blocks.
+        trunk: The trunk whose tokens it reads.
         out: Width of the predictions.
-        other: Width of the tokens of the other modality, if it sees them too.
+        senses: Whether it also reads tokens of the other modality.
+        shape: Width and number of blocks. None = ``share`` of the trunk's, in whole heads of 32 features, up to ``most``.
     """
 
-    def __init__(self, features: int, width: int, depth: int, out: int, other: int | None = None) -> None:
+    def __init__(
+        self, trunk: nn.Module, out: int, senses: Senses, shape: Shape, share: float, most: tuple[int, int]
+    ) -> None:
         super().__init__()
-        self.embed = nn.Linear(features, width)
-        self.other = None if other is None else nn.Linear(other, width)
+        vit = vit_of(trunk)
+        width = shape[0] or min(most[0], 32 * max(1, round(vit.embed_dim * share / 32)))
+        depth = shape[1] or min(most[1], max(1, round(len(vit.blocks) * share)))
+        self.embed = nn.Linear(vit.embed_dim, width)
+        self.other = nn.Linear(vit.embed_dim, width) if senses == "both" else None
         self.mask_token = nn.Parameter(torch.zeros(1, 1, 1, width))
         norm: Any = partial(nn.LayerNorm, eps=1e-6)
-        blocks = (Block(width, max(1, width // 32), qkv_bias=True, norm_layer=norm) for _ in range(depth))
-        self.blocks = nn.Sequential(*blocks)
+        heads = max(1, width // 32) if width % 32 == 0 else 1
+        self.blocks = nn.Sequential(*(Block(width, heads, qkv_bias=True, norm_layer=norm) for _ in range(depth)))
         self.norm = norm(width)
         self.out = nn.Linear(width, out)
         nn.init.normal_(self.mask_token, std=0.02)
@@ -233,26 +226,22 @@ class Predictor(nn.Module):
             seen: The visible tokens, seen with every set.
             hidden: The patches to predict.
             grid: Rows and columns of the patches.
-            live: Which of ``hidden`` count. None = all. No token attends to the others.
-            other: Visible tokens of the other modality.
+            live: Which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the others.
+            other: Visible tokens of the other modality, if there is one.
         """
         positions = sin_cos_positions(*grid, self.mask_token.shape[3], hidden.device)
-        known = _placed(self.embed(seen.values), seen.at, positions)
-        if other is not None:
-            assert self.other is not None
+        known, known_live = _placed(self.embed(seen.values), seen.at, positions), seen.live
+        if self.other is not None and other is not None:
             known = torch.cat([known, _placed(self.other(other.values), other.at, positions)], dim=1)
+            known_live = None if seen.live is None or other.live is None else torch.cat([seen.live, other.live], dim=1)
         num_sets, length = hidden.shape[1:]
-        tokens = torch.cat(
-            [known[:, None].expand(-1, num_sets, -1, -1), (self.mask_token + positions[hidden]).to(known.dtype)], dim=2
-        )
+        masked = (self.mask_token + positions[hidden]).to(known.dtype)
+        tokens = torch.cat([known[:, None].expand(-1, num_sets, -1, -1), masked], dim=2).flatten(0, 1)
         shown = None
-        if live is not None or seen.live is not None or (other is not None and other.live is not None):
-            found = [
-                t.live if t.live is not None else t.values[:, :, 0] == t.values[:, :, 0] for t in (seen, other) if t
-            ]
-            known_live = torch.cat(found, dim=1)[:, None].expand(-1, num_sets, -1)
-            shown = torch.cat([known_live, hidden >= 0 if live is None else live], dim=2).flatten(0, 1)
-        predicted = _pass(self.blocks, tokens.flatten(0, 1), shown)[:, -length:]
+        if live is not None:
+            assert known_live is not None
+            shown = torch.cat([known_live[:, None].expand(-1, num_sets, -1), live], dim=2).flatten(0, 1)
+        predicted = _pass(self.blocks, tokens, shown)[:, -length:]
         return self.out(self.norm(predicted)).unflatten(0, (-1, num_sets))
 
 
