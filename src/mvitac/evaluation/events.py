@@ -111,7 +111,7 @@ def choose_threshold(highest: Sequence[float], share: float) -> float:
 def pool_events(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Pool the events of cross-validation folds, whose test recordings differ. Each fold has its own threshold."""
     recordings = [recording for part in parts for recording in part["recordings"]]
-    return {**parts[0], "threshold": None, "recordings": recordings}
+    return {**parts[0], "threshold": None, "traces": [], "recordings": recordings}
 
 
 def shares(events: Sequence[dict[str, Any]], *, with_it: bool) -> list[dict[str, Any]]:
