@@ -65,6 +65,7 @@ name = "pack"
 at = {{ path = "elsewhere" }}
 data = {{ name = "pack" }}
 """
+BOARD = Path(__file__).parents[2] / "benchmarks" / "board"
 GOLDEN = {
     "calandra-v1": "b9de4eee4353",
     "real-small-v1": "2f37d58dc5b5",
@@ -392,6 +393,13 @@ def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None
     (tmp_path / "suite.toml").write_text(text)
     with pytest.raises(ValueError, match=expected):
         find_suite(str(tmp_path / "suite.toml"))
+
+
+@pytest.mark.parametrize("path", sorted(BOARD.rglob("*.json")), ids=lambda path: path.stem)
+def test_results_in_the_repository(path: Path) -> None:
+    """What a pull request that adds a result is checked by."""
+    value = read_result(path)
+    assert problems(value) == [] and path.parent.name == value["suite"]["name"] and path.stat().st_size < 200_000
 
 
 def test_r2_in_a_result_is_that_of_its_sums(results: list[Path]) -> None:
