@@ -62,7 +62,19 @@ COMMANDS = {
     "index": "index {base}/pack --model {base}/run --out {out}/i",
     "embed": "embed {base}/pack --model {base}/run --out {out}/e.npz",
     "report": "report {base}/run --out {out}/report --quiet",
+    "bench": "bench {base}/run --suite {base}/suite.toml --data-root {base} --out {out}/b",
 }
+SUITE = f"""
+name = "small"
+title = "Made images"
+probes = ["linear"]
+seed = 0
+untrained = ["external:timm/test_resnet,weights=random,size={SIDE},seed=0"]
+[[sets]]
+name = "table"
+tasks = [{{ name = "kind", modalities = ["touch"] }}]
+forms = [{{ name = "pack", at = {{ path = "pack" }}, data = {{ name = "pack" }} }}]
+"""
 SLOW = ("torch._dynamo", "mvitac.evaluation.evaluate", "mvitac.training.loop")
 """Modules that are imported late."""
 EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link")
@@ -89,6 +101,7 @@ def prepare(base: Path) -> None:
     plan = {"name": "small", "rows": [row], "reference": "MViTac", "recipe": "smoke", "seeds": 1, "probes": ["knn"]}
     data = {"name": "pack", "path": str(base / "pack")}
     (base / "plan.json").write_text(json.dumps({**plan, "data": data}))
+    (base / "suite.toml").write_text(SUITE)
 
 
 def child(work: Callable[[], int | None], said: Path) -> int:
