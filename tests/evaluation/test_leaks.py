@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mvitac
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.joined_pack import JoinedPack
@@ -170,3 +171,17 @@ def test_summaries_and_folds_keep_the_leak() -> None:
     assert pooled["leak"] == "seen" and "leak" not in pool([[record], [record]])[0]
     assert summarise([pooled])["t"]["touch"]["a"]["leak"] == "seen"
     assert unseen_groups("object", [pooled]) == "test objects" and unseen_groups("object", [record]) == "unseen objects"
+
+
+def test_scores_show_themselves_in_a_notebook(run: Path, turned: Pack) -> None:
+    """``mvitac.probe`` scores as the command does, and its result is a table with intervals, groups and leaks."""
+    scores = mvitac.probe(run, tasks=("pattern",), modalities=("touch",))
+    cell = scores["summary"]["pattern"]["touch"]["mvitac"]
+    assert read_json(run / "probe.json", "a probe result")["summary"] == json.loads(json.dumps(scores["summary"]))
+    page = scores._repr_html_()
+    assert f"<td>{with_interval(cell['mean'], cell['low'], cell['high'])}</td>" in page
+    assert "<th>touch</th>" in page and "<td>majority</td>" in page and f"{cell['groups']} test instances" in page
+    with pytest.raises(ValueError, match="allow-leak"):
+        mvitac.probe(run, on=turned)
+    page = mvitac.probe(run, on=turned, allow_leak=True, controls=False)._repr_html_()
+    assert f"retrieval: {ALL}</p>" in page and "LEAK</td>" in page

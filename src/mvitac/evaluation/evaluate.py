@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.datasets.pack import PackConfig
@@ -24,6 +26,7 @@ from mvitac.evaluation.probe import (
     split_rows,
     with_classes,
 )
+from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import Standardise, describe_statistics, sensor_records
 from mvitac.model import Model, load
@@ -70,9 +73,47 @@ class ProbeConfig:
             raise ValueError(f"imagenet {self.imagenet}: give a file that exists")
 
 
+class Scores(dict[str, Any]):
+    """The result of probing runs (see ``probe_runs``). A notebook shows it as one table per task."""
+
+    def _repr_html_(self) -> str:
+        parts = []
+        for name, task in self["summary"].items():
+            columns = columns_of(task)
+            rows = [(source, *(cell_text(task, source, m) for m in columns)) for source in sources_of(task)]
+            caption = f"<b>{escape(name)}</b>, {score_name(task)} %, {escape(tested_on(task, self['group_by']))}"
+            parts.append(f"<p>{caption}</p>{table(rows, ['', *columns])}")
+        lines = [f"95 % intervals: {covered(self['group_by'], self['records'])}."]
+        lines += [*self["notes"], *(f"LEAK: {leak}" for leak in self["leaks"])]
+        return "".join(parts) + "".join(f"<p>{escape(line)}</p>" for line in lines)
+
+
+def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bool = False, **options: Any) -> Scores:
+    """Probe finished runs beside their controls, as `mvitac probe` does. Public as ``mvitac.probe``.
+
+    Args:
+        runs: Folders of runs: seeds of one method, or several methods, trained on one dataset.
+        on: Another pack, or its folder, to probe on. Default: the data the runs were trained on.
+        allow_leak: Score also test rows of ``on`` that a run was trained on.
+        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet.
+
+    Returns:
+        The scores, a dict (see ``probe_runs``).
+
+    Raises:
+        ValueError: As ``probe_runs``.
+
+    Example:
+        >>> scores = mvitac.probe("runs/demo/seed0", probes=("linear", "knn"))  # doctest: +SKIP
+        >>> scores["summary"]["category"]["touch"]["mvitac"]["mean"]  # doctest: +SKIP
+    """
+    pack = PackConfig(path=Path(on)).open() if isinstance(on, (str, Path)) else on
+    return probe_runs([Path(run) for run in runs], ProbeConfig(**options), pack, allow_leak=allow_leak)
+
+
 def probe_runs(
     paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None, *, allow_leak: bool = False
-) -> dict[str, Any]:
+) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
     Example:
@@ -86,9 +127,9 @@ def probe_runs(
         allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
 
     Returns:
-        A dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary", "asked" (the
-        config) and "models" (digests of the weights). A record has a "leak", which is empty unless its test rows, or their
-        groups, were trained on.
+        Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
+        "asked" (the config) and "models" (digests of the weights). A record has a "leak", which is empty unless its test
+        rows, or their groups, were trained on.
 
     Raises:
         ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
@@ -113,20 +154,20 @@ def probe_runs(
         specs = [m.spec for m in models]
         found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
-    result = {
-        "data": pack.spec.name,
-        "pack": pack.digest,
-        "asked": to_json(session),
-        "models": _digests(paths),
-        "group_by": pack.spec.group_by,
-        "notes": list(pack.spec.notes),
-        "leaks": leaks_of([*records, *retrieval]),
-        "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
-        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
-        "records": records,
-        "retrieval": retrieval,
-        "summary": summarise(records, session.probes[0]),
-    }
+    result = Scores(
+        data=pack.spec.name,
+        pack=pack.digest,
+        asked=to_json(session),
+        models=_digests(paths),
+        group_by=pack.spec.group_by,
+        notes=list(pack.spec.notes),
+        leaks=leaks_of([*records, *retrieval]),
+        classes={task.name: list(task.classes) for task in with_classes(tasks)},
+        targets={task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
+        records=records,
+        retrieval=retrieval,
+        summary=summarise(records, session.probes[0]),
+    )
     if session.standardise:
         result["statistics"] = describe_statistics(pack, session.standardise)
     if session.sensors:
