@@ -51,6 +51,7 @@ def test_sign_and_factor_come_from_the_gel() -> None:
     for learned, truth in ((plain, NEAR), (opposite, -NEAR), (bright, NEAR)):
         cosine = (learned.colours * truth).sum() / np.linalg.norm(learned.colours) / np.linalg.norm(truth)
         assert cosine > 0.98
+        np.testing.assert_allclose(learned.mixtures.T @ learned.colours, np.eye(2), atol=1e-6)  # there and back
     assert np.linalg.norm(bright.colours) / np.linalg.norm(plain.colours) == pytest.approx(2, rel=0.1)
     g = (images(NEAR, slopes(), 1) - images(NEAR, slopes() * 0, 1).astype(float)) @ bright.mixtures
     assert np.sqrt((g**2).mean()) == pytest.approx(1, rel=0.15)  # in units of the slopes' spread

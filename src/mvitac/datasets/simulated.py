@@ -146,13 +146,8 @@ class Materials(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         known = self.config._fingerprint(materials.VERSION)
-        later = {
-            "difference": False,
-            "moments": 1,
-            "makes": (),
-            "sensors": 0,
-            "sensors_per_press": 1,
-        }  # omitted at their defaults, to keep old digests valid
+        # omitted at their defaults, to keep old digests valid
+        later = {"difference": False, "moments": 1, "makes": (), "sensors": 0, "sensors_per_press": 1}
         return {k: v for k, v in known.items() if k not in later or v != later[k]}
 
     def samples_per_item(self) -> list[int]:

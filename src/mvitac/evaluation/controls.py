@@ -30,7 +30,7 @@ from mvitac.evaluation.probe import (
     split_rows,
 )
 from mvitac.evaluation.sensors import Standardise
-from mvitac.model import fresh
+from mvitac.model import Model, fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.run import Run
 from mvitac.system.processes import in_threads
@@ -148,13 +148,11 @@ def _untrained_trunks(
 ) -> tuple[Records, Records]:
     # Built one by one: threads would share the random generator.
     models = [fresh(scratch(run), spec, pack.size) for run, spec in starts]
-    scored = in_threads(
-        lambda model: (
-            probe_model(model, pack, tasks, modalities, probes, standardise),
-            cross_modal(model, pack),
-        ),
-        models,
-    )
+
+    def scores(model: Model) -> tuple[Records, Records]:
+        return probe_model(model, pack, tasks, modalities, probes, standardise), cross_modal(model, pack)
+
+    scored = in_threads(scores, models)
     records, retrieval = [], []
     for (run, _), (found, ranked) in zip(starts, scored, strict=True):
         records += _named("untrained", run.seed, found)

@@ -76,12 +76,8 @@ class ProbeConfig:
     """Also say how well touch features tell the sensor, and how often they find the same press through another one."""
 
     def __post_init__(self) -> None:
-        for name, values in (
-            ("probe", self.probes),
-            ("task", self.tasks),
-            ("modality", self.modalities),
-            ("standardise", self.standardise),
-        ):
+        given = {"probe": self.probes, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
+        for name, values in given.items():
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
@@ -213,7 +209,7 @@ def probe_runs(
         "summary": summarise(records, session.probes[0]),
     }
     if session.standardise:
-        result["statistics"] = describe_statistics(pack)
+        result["statistics"] = describe_statistics(pack, session.standardise)
     if session.sensors:
         found_by = zip(names, models, strict=True)
         result["sensors"] = [

@@ -27,6 +27,8 @@ from mvitac.transforms.preprocess import encoder_input
 Standardise = Literal["colours", "batch-norm", "features"]
 NUM_STATISTICS = 256
 """Images of a sensor that statistics are taken from, at most."""
+MIN_GALLERY = 11
+"""Least number of presses for retrieval."""
 MAX_LOOKS = 4
 """Known sensors in whose colours a new one is shown, at most."""
 
@@ -42,14 +44,13 @@ def unlabelled_rows(pack: Pack, sensor: int, num: int = NUM_STATISTICS) -> np.nd
     return sample(own[next((kind for kind in kinds if kind.sum() >= MIN_IMAGES), kinds[-1])], num)
 
 
-def describe_statistics(pack: Pack, new: set[str] | None = None) -> list[str]:
-    """Sentences that say how many images of each sensor (of ``new``: these only) statistics come from."""
+def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> list[str]:
+    """Sentences that say how many images of each sensor ``standardise`` used."""
     found = []
     for number, name in enumerate(pack.sensor_names):
-        if new is None or name in new:
-            rows = unlabelled_rows(pack, number)
-            tested = ", test images among them" if (pack.column("split")[rows] == "test").any() else ""
-            found.append(f"uses {len(rows)} unlabelled images of sensor {name}{tested}")
+        rows = unlabelled_rows(pack, number, NUM_IMAGES if "colours" in standardise else NUM_STATISTICS)
+        tested = ", test images among them" if (pack.column("split")[rows] == "test").any() else ""
+        found.append(f"uses {len(rows)} unlabelled images of sensor {name}{tested}")
     return found
 
 
@@ -70,26 +71,23 @@ def touch_features(
     """
     if modality != "touch" or not standardise:
         return features(model, pack, modality, rows, maps=maps)
-    parts, sensors = {}, pack.sensors[rows]
+    parts, sensors = [], pack.sensors[rows]
     for number in np.unique(sensors):
-        shown = pack.looks if isinstance(pack, RecolouredPack) and number in pack.new else [pack]
         known, own = unlabelled_rows(pack, int(number)), rows[sensors == number]
-        models = [with_statistics(model, look, known) if "batch-norm" in standardise else model for look in shown]
+        looks = pack.looks if isinstance(pack, RecolouredPack) and number in pack.new else [pack]
+        models = [with_statistics(model, look, known) if "batch-norm" in standardise else model for look in looks]
 
         def mean(rows: np.ndarray, each: list[tuple[Model, Pack]]) -> np.ndarray:
             return np.mean([features(m, look, modality, rows, maps=maps) for m, look in each], axis=0, dtype=np.float32)
 
-        each = list(zip(models, shown, strict=True))
-        z = mean(own, each)
+        z = mean(own, each := list(zip(models, looks, strict=True)))
         if "features" in standardise:
             seen = mean(known, each)
             axes = tuple(range(seen.ndim - 1))
             z = (z - seen.mean(axes)) / (seen.std(axes) + 1e-6)
-        parts[number] = z
-    found = np.empty((len(rows), *next(iter(parts.values())).shape[1:]), np.float32)
-    for number, z in parts.items():
-        found[sensors == number] = z
-    return found
+        parts.append(z)
+    order = np.argsort(sensors, kind="stable")  # of the rows in ``parts``
+    return np.concatenate(parts)[np.argsort(order)]
 
 
 @torch.no_grad()
@@ -174,41 +172,30 @@ def _colours_of(pack: Pack, number: int) -> GelColours:
 
 
 def sensor_records(model: Model, pack: Pack) -> list[dict[str, Any]]:
-    """How much touch features tell of the sensor: a probe for it, and retrieval of a press through another sensor.
+    """How much touch features tell of the sensor: "name", "score", "chance" and "num" of up to two measures.
 
-    Returns:
-        Up to two records. "which sensor": accuracy in percent of a logistic regression on test rows, beside the share of
-        the most common sensor. "same spot, other sensor": R@5 of test presses among all other sensors' images, beside
-        chance, for packs with the same press through several sensors.
+    "which sensor": accuracy of a logistic regression on test rows, beside the share of the most common sensor. "same spot,
+    other sensor": ``cross_sensor``.
     """
-    records = []
-    if (found := _which_sensor(model, pack)) is not None:
-        records.append(found)
-    if (found := cross_sensor(model, pack)) is not None:
-        records.append(found)
-    return records
+    return [record for record in (_which_sensor(model, pack), cross_sensor(model, pack)) if record]
+
+
+def _record(name: str, hits: np.ndarray, chance: float) -> dict[str, Any]:
+    return {"name": name, "score": float(np.mean(hits)), "chance": chance, "num": len(hits)}
 
 
 def _which_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
-    """None if the test rows have one sensor only, or one that train lacks."""
-    rows = {split: pack.rows(split, having=("touch",)) for split in ("train", "val", "test")}
-    if not len(rows["val"]):
-        rows["val"] = rows["train"]
-    y = {split: pack.sensors[own] for split, own in rows.items()}
-    kinds = np.unique(y["train"])
-    if len(kinds) < 2 or not len(y["test"]) or not np.isin(y["test"], kinds).all():
+    """None if train has one sensor only, or test one that train lacks."""
+    train, val, test = (pack.rows(split, having=("touch",)) for split in ("train", "val", "test"))
+    val = val if len(val) else train
+    fitted = np.unique(pack.sensors[np.concatenate([train, val])])
+    right = pack.sensors[test]
+    if len(np.unique(pack.sensors[train])) < 2 or not len(test) or not np.isin(right, pack.sensors[train]).all():
         return None
-    z = {split: features(model, pack, "touch", own) for split, own in rows.items()}
-    predict, _ = fit_linear(z["train"], y["train"], z["val"], y["val"])
-    numbers = np.unique(np.concatenate([y["train"], y["val"]]))
-    right = numbers[predict(z["test"]).argmax(1)] == y["test"]
-    common = np.bincount(y["train"]).argmax()
-    return {
-        "name": "which sensor",
-        "score": float(right.mean()),
-        "chance": float((y["test"] == common).mean()),
-        "num": len(right),
-    }
+    z = [features(model, pack, "touch", rows) for rows in (train, val, test)]
+    predict, _ = fit_linear(z[0], pack.sensors[train], z[1], pack.sensors[val])
+    common = np.bincount(pack.sensors[train]).argmax()
+    return _record("which sensor", fitted[predict(z[2]).argmax(1)] == right, float((right == common).mean()))
 
 
 def cross_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
@@ -220,23 +207,14 @@ def cross_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
     if "press" not in pack.table.column_names:
         return None
     rows = pack.rows("test", having=("touch",))
-    presses, sensors = pack.presses[rows], pack.sensors[rows]
-    z = torch.nn.functional.normalize(torch.from_numpy(features(model, pack, "touch", rows)), dim=1)
-    hits, chances = [], []
+    presses, sensors, hits, chances = pack.presses[rows], pack.sensors[rows], [], []
+    z = torch.from_numpy(features(model, pack, "touch", rows))
     for number in np.unique(sensors):
         others = np.flatnonzero(sensors != number)
         others = others[np.unique(presses[others], return_index=True)[1]]  # one image of each press
         queries = np.flatnonzero((sensors == number) & np.isin(presses, presses[others]))
-        if len(queries) and len(others) >= 11:
+        if len(queries) and len(others) >= MIN_GALLERY:
             place = torch.from_numpy(np.searchsorted(presses[others], presses[queries]))
-            ranks = diagnostics.retrieval_ranks(z[queries], z[others], torch.arange(len(others)), place)
-            hits += (ranks < 5).tolist()
+            hits.append(diagnostics.retrieval_ranks(z[queries], z[others], torch.arange(len(others)), place) < 5)
             chances += [5 / len(others)] * len(queries)
-    if not hits:
-        return None
-    return {
-        "name": "same spot, other sensor",
-        "score": float(np.mean(hits)),
-        "chance": float(np.mean(chances)),
-        "num": len(hits),
-    }
+    return _record("same spot, other sensor", np.concatenate(hits), float(np.mean(chances))) if hits else None

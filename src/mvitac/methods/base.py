@@ -220,8 +220,8 @@ class MethodConfig(Registered, ABC):
             pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
         if not (np.bincount(pairs[0]) > 1).any():
             raise ValueError(
-                "lambda_sensor needs presses of one spot through two sensors, rows with the same value in column press"
-                " and another in column sensor, and there are none to train on: simulate with --data.sensors-per-press 2"
+                "lambda_sensor needs rows of one press (column press) and different sensors (column sensor) to train on:"
+                " simulate with --data.sensors-per-press 2"
             )
 
     @property

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -152,30 +153,28 @@ def _random_sensor(seed: int, number: int) -> Sensor:
     rng, known = np.random.default_rng([_TAG, seed, number]), [s for s in SENSORS.values() if not s.held_out]
 
     def within(values: Iterable[float], *size: int) -> np.ndarray:
-        values = list(values)
-        extra = MARGIN * (max(values) - min(values))
-        return rng.uniform(
-            max(min(values) - extra, 0.0) if min(values) >= 0 else min(values) - extra, max(values) + extra, size
-        )
+        low, high = min(values := list(values)), max(values)
+        extra = MARGIN * (high - low)
+        return rng.uniform(max(low - extra, 0.0) if low >= 0 else low - extra, high + extra, size)
 
     base = within((level for s in known for level in s.base), 3)
     spots = np.array([spot for s in known for spot in s.glow])
     # A dark channel has a high spot: the level at the centre varies much less than either.
     height = within((b + spot[0] for s in known for b, spot in zip(s.base, s.glow, strict=True)), 3) - base
     place = [within(column, 3) for column in spots.T[1:]]
-    tilt = [within((pair[axis] for s in known for pair in s.tilt), 3) for axis in (0, 1)]
+    tilt = np.stack([within((pair[axis] for s in known for pair in s.tilt), 3) for axis in (0, 1)], axis=1)
     strength = within((float(np.hypot(*pair)) for s in known for pair in s.response), 3)
-    angle = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * (np.arange(3) * 2 * np.pi / 3 + rng.uniform(-0.4, 0.4, 3))
-    dotted = rng.random() < 0.5
+    spread = np.arange(3) * 2 * np.pi / 3 + rng.uniform(-0.4, 0.4, 3)
+    angle = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * spread
+    dots = [f.name for f in fields(Sensor) if f.name.startswith("marker_")] * int(rng.random() < 0.5)
     plain = ("saturation", "shadow", "dirt", "scratches", "edge", "noise")
-    dots = [field.name for field in fields(Sensor) if field.name.startswith("marker_")]
     values = {name: float(within(getattr(s, name) for s in known)) for name in plain}
-    values |= {name: float(within(getattr(s, name) for s in known if s.marker_pitch_mm)) for name in dots if dotted}
-    return Sensor(
-        name=f"random{number:04d}",
-        base=tuple(base.tolist()),
-        glow=tuple(zip(np.maximum(height, 10.0).tolist(), *(column.tolist() for column in place), strict=True)),
-        tilt=tuple(zip(*(axis.tolist() for axis in tilt), strict=True)),
-        response=tuple(zip((strength * np.cos(angle)).tolist(), (strength * np.sin(angle)).tolist(), strict=True)),
-        **values,
-    )
+    values |= {name: float(within(getattr(s, name) for s in known if s.marker_pitch_mm)) for name in dots}
+    pairs: Any = [
+        np.stack([np.maximum(height, 10.0), *place], 1),
+        tilt,
+        strength[:, None] * np.c_[np.cos(angle), np.sin(angle)],
+    ]
+    glow, tilts, response = (tuple(map(tuple, rows.tolist())) for rows in pairs)
+    base = tuple(base.tolist())
+    return Sensor(name=f"random{number:04d}", base=base, glow=glow, tilt=tilts, response=response, **values)
