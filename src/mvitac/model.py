@@ -13,7 +13,7 @@ import json
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import safetensors.torch
 import torch
@@ -33,6 +33,8 @@ from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, e
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 FORMAT = "mvitac-model"
+BEST = "model.best.safetensors"
+"""Weights of a run that were best on split val, kept with ``Run.eval_every``."""
 EMBED_BATCH = 64
 """Images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px."""
 
@@ -341,20 +343,34 @@ class Model(nn.Module):
         write_atomic(path, lambda file: file.write(data))
 
 
+Which = Literal["last", "best"]
+
+
+def weights_file(folder: Path, which: Which) -> Path:
+    """The file of a run's weights; ValueError if the best ones were not kept."""
+    if which == "best" and not (folder / BEST).is_file():
+        raise ValueError(f"{folder} has no {BEST}: train with --eval-every N to keep the best weights, or use the last")
+    return folder / (BEST if which == "best" else "model.safetensors")
+
+
 def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
     """The model of ``run`` before training, initialised from its seed. Used as a control, and to load weights into."""
     torch.manual_seed(run.seed)
     return Model(run.method.build(spec, run.encoder), run, spec, stored)
 
 
-def load(path: str | Path) -> Model:
+def load(path: str | Path, which: Which = "last") -> Model:
     """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
+
+    Args:
+        path: The folder or the file.
+        which: Weights of a run's folder: those after its last step, or the best on split val (``Run.eval_every``).
 
     Raises:
         ValueError: If there is no such model, or the file is damaged or was changed.
     """
     path = Path(path)
-    file = path / "model.safetensors" if path.is_dir() else path
+    file = weights_file(path, which) if path.is_dir() else path
     if not file.is_file():
         hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
         raise ValueError(f"no trained model at {file}{hint}")

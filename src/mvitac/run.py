@@ -133,8 +133,8 @@ class Run:
     log_every: int = 10
     """Steps between log lines. Each also checks that the loss is finite."""
     eval_every: int = 0
-    """Steps between evaluations (kNN scores, signs of collapse) on held-out groups (split val, never test). 0 = only at the
-    end."""
+    """Steps between evaluations (linear probes, kNN, signs of collapse) on held-out groups (split val, never test). The
+    weights that are best there are kept as model.best.safetensors. 0 = only at the start and the end."""
     checkpoint_every: int = 0
     """Steps between checkpoints. 0 = about every tenth of the run."""
 

@@ -146,9 +146,9 @@ def test_digest_is_that_of_the_content(pack: Pack, smoke_run: Path, artifact: Pa
 
 
 def test_killed_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
-    run = smoke(pack, init=Init(path=smoke_run), checkpoint_every=2, seed=3, steps=6)
+    run = smoke(pack, init=Init(path=smoke_run), checkpoint_every=1, seed=3, steps=4, eval_every=0)
     train(run, tmp_path / "straight", quiet=True)
-    for name, cut in (("early", 1), ("late", 5)):
+    for name, cut in (("early", 1), ("late", 3)):
         with power_cut(cut), pytest.raises(RuntimeError, match="power cut"):
             train(run, tmp_path / name, quiet=True)
         train(run, tmp_path / name, resume=True, quiet=True)
@@ -159,9 +159,11 @@ def test_killed_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_pat
 
 def test_other_weights_are_refused_at_resume(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     source = shutil.copytree(smoke_run, tmp_path / "source")
-    run = smoke(pack, init=Init(path=source), steps=2)
+    run = smoke(pack, init=Init(path=source), steps=1, eval_every=0)
     out = train(run, tmp_path / "r", quiet=True)
-    shutil.copy(train(smoke(pack, seed=9, steps=1), tmp_path / "x", quiet=True) / "model.safetensors", source)
+    shutil.copy(
+        train(smoke(pack, seed=9, steps=1, eval_every=0), tmp_path / "x", quiet=True) / "model.safetensors", source
+    )
     with pytest.raises(ValueError, match="holds a different run"):
         train(run, out, resume=True, quiet=True)
     with pytest.raises(ValueError, match=r"source now holds other weights than this run was recorded with"):
@@ -235,8 +237,8 @@ def test_pretrain_warns_of_seen_test_rows(
 def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.safetensors").write_text("no tensors")
-    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
-        train(smoke(pack, checkpoint_every=1), tmp_path / "unfinished", quiet=True)
+    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
+        train(smoke(pack, checkpoint_every=1, eval_every=0), tmp_path / "unfinished", quiet=True)
     touch = toy_pack(tmp_path / "touch", vision_channels=0)
     only_touch = train(smoke(touch, steps=1, eval_every=0), tmp_path / "only touch", quiet=True)
     capsys.readouterr()

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional
@@ -35,6 +35,8 @@ class _ProbeOptions:
     without labels."""
     allow_leak: bool = False
     """Score a run also on rows or groups of --on that it was trained on. LEAK stands beside every such score."""
+    weights: Literal["last", "best"] = "last"
+    """Weights after the last step, or the best on split val, which training keeps with --eval-every."""
     stress: bool = False
     """Also use 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and report the
     gain of a split that leaks groups."""
@@ -53,7 +55,7 @@ def probe(argv: list[str]) -> None:
             raise ValueError("--learn-on fits the probes: name the pack on which they are scored, --on PACK")
         pack = JoinedPack(Pack(options.learn_on), pack)
     with shown(Console(stderr=True)):
-        result = probe_runs(options.runs, options.config, pack, allow_leak=options.allow_leak)
+        result = probe_runs(options.runs, options.config, pack, allow_leak=options.allow_leak, weights=options.weights)
     say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
     print_summary(result, say, probe=options.config.probes[0])
     for kind in options.config.probes[1:]:
@@ -74,7 +76,7 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
     for i, path in enumerate(options.runs, start=1):
         what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
         with shown(Console(stderr=True)), work(what):
-            model = load(path)
+            model = load(path, options.weights)
             data = pack or model.open_data()
             own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
             leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}

@@ -25,7 +25,7 @@ from mvitac.evaluation.probe import (
     with_classes,
 )
 from mvitac.evaluation.scores import summarise
-from mvitac.model import Model, load
+from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run
@@ -63,7 +63,12 @@ class ProbeConfig:
 
 
 def probe_runs(
-    paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None, *, allow_leak: bool = False
+    paths: Sequence[Path],
+    session: ProbeConfig,
+    pack: Pack | None = None,
+    *,
+    allow_leak: bool = False,
+    weights: Which = "last",
 ) -> dict[str, Any]:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
@@ -76,6 +81,7 @@ def probe_runs(
         session: What to probe.
         pack: Other data to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
+        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
 
     Returns:
         A dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary", "asked" (the
@@ -87,8 +93,8 @@ def probe_runs(
             trained on rows or groups that other data than its own would score.
     """
     _check_paths(paths)
-    models = [load(path) for path in paths]
-    names = names_of(paths, models)
+    models = [load(path, weights) for path in paths]
+    names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
@@ -109,7 +115,7 @@ def probe_runs(
         "data": pack.spec.name,
         "pack": pack.digest,
         "asked": to_json(session),
-        "models": _digests(paths),
+        "models": _digests(paths, weights),
         "group_by": pack.spec.group_by,
         "notes": list(pack.spec.notes),
         "leaks": leaks_of([*records, *retrieval]),
@@ -120,7 +126,7 @@ def probe_runs(
         "summary": summarise(records, session.probes[0]),
     }
     for path in paths:
-        write_json(path / "probe.json", result)
+        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
     return result
 
 
@@ -165,9 +171,9 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
     return result if same and whole and scored == {path.resolve() for path in paths} else None
 
 
-def _digests(paths: Sequence[Path]) -> list[str]:
+def _digests(paths: Sequence[Path], weights: Which = "last") -> list[str]:
     """Digests of the weights of finished runs, sorted."""
-    return sorted(digest_file(path / "model.safetensors") for path in paths)
+    return sorted(digest_file(weights_file(path, weights)) for path in paths)
 
 
 def _check_paths(paths: Sequence[Path]) -> None:

@@ -236,7 +236,7 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
             path = job.folder(percent) / ("scratch" if kind == SCRATCH else "") / f"seed{seed}"
             run = job.run_of(percent, seed, kind, settings[kind])
             job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
-            train(run, path, resume=True, quiet=job.quiet, pack=job.pack)
+            train(run, path, resume=True, quiet=job.quiet, pack=job.pack, validate=False)  # all groups are learned from
             own = own_heads(load(path), job.pack, job.tasks, [job.modality])
             own = job.named(own, kind, percent, seed, read_sources(path, run, job.pack.digest, job.pack))
             own = [{**record, "run": str(path)} for record in own]
@@ -269,7 +269,7 @@ def _held_out_score(job: _Job, percent: float, kind: str, settings: dict[str, An
     run = job.run_of(percent, 0, kind, settings, hold_out=True)
     name = f"{kind}: {', '.join(f'{key} {value}' for key, value in settings.items())} ({run.digest()[:8]})"
     if name not in tried:
-        train(run, work / run.digest()[:8], resume=True, quiet=True, pack=job.pack)
+        train(run, work / run.digest()[:8], resume=True, quiet=True, pack=job.pack, validate=False)
         learned, model = run.method.training_rows(job.pack), load(work / run.digest()[:8])
         held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
         found = own_heads(model, job.pack, job.tasks, [job.modality], held)

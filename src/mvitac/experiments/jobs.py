@@ -321,7 +321,8 @@ def pairs_per_second(run: Run, pack: Pack) -> float:
     """Speed of the first steps of ``run`` after its start-up, trained from random weights in a temporary folder."""
 
     def stop(step: int, values: dict[str, float]) -> None:
-        raise _Measured(values["pairs_per_s"])
+        if "pairs_per_s" in values:
+            raise _Measured(values["pairs_per_s"])
 
     run = replace(run, eval_every=0, encoder=replace(run.encoder, weights=SCRATCH), init=Init())
     with tempfile.TemporaryDirectory() as folder:

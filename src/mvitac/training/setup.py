@@ -55,6 +55,8 @@ class Setup:
     start: int
     """Number of steps that are already done."""
     num_steps: int
+    kept: dict[str, Any]
+    """State of validation (``Validation``)."""
 
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
@@ -84,7 +86,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     method, taken = _build_method(run, pack, rows, device, world, start_weights)
     step = Step(run, method, device, world)
     num_steps = run.num_steps(len(rows))
-    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world)
+    kept: dict[str, Any] = {}
+    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
     if start == 0:
         _before_first_step(run, method, pack, rows, device, world, mirror)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
@@ -102,7 +105,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     if world.writes and not (out / FILE).exists():
         own = source_of(pack, rows)
         write_sources(out, with_ancestors(own, start_weights.sources if start_weights else []))
-    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps)
+    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept)
 
 
 def check_out(out: Path, resume: bool) -> None:
