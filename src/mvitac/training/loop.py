@@ -129,9 +129,9 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
                 _check_weights(method, done, run)
 
             # Evaluate on held-out groups (split val).
-            if log and validation:
+            if log:
                 log.advance(done)
-                if evaluate:
+                if evaluate and validation:
                     validation(done, last=last)
 
             # Save a checkpoint. All processes take part, because memory banks are sharded.
