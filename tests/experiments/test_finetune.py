@@ -150,8 +150,8 @@ def test_bad_input_is_refused_before_anything_is_written(
 
     refuse(capsys, ["finetune", run, "--out", str(out)], "name the data: --data")
     refuse(capsys, command(pack.path)[:1] + command(pack.path)[2:], "name the model")
-    refuse(capsys, command(pack.path, "--labels", "x"), "task with classes of 'toy' 'x'", "pattern, bright")
-    refuse(capsys, command(pack.path, "--values", "force"), "task with values of 'toy' 'force'")
+    refuse(capsys, command(pack.path, "--labels", "x"), "unknown task 'x': choose from pattern, bright")
+    refuse(capsys, command(pack.path, "--values", "force"), "unknown task 'force'")
     refuse(capsys, command(pack.path, "--lr", "1e-3", "1e-3"), "at least one number, and none twice")
     refuse(capsys, command(pack.path, "--fractions", "0"), "in percent, above 0")
     refuse(capsys, command(pack.path, "--rank", "0"), "rank 0: give 1 to 65536")

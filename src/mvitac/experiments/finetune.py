@@ -33,7 +33,6 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, load
 from mvitac.nn.finetuning import Part
 from mvitac.nn.initial import Init
-from mvitac.registry import unknown
 from mvitac.run import Optim, Run
 from mvitac.system.files import check_place, read_json, write_json
 from mvitac.training.loop import train
@@ -115,7 +114,8 @@ def finetune(
     if out.exists() and any(out.iterdir()) and not resume:
         raise ValueError(f"{out} is not empty: continue it with --resume, or choose another --out")
     model, pack = load(ancestor), data.open(quiet=quiet)
-    tasks = _tasks(asked, pack)
+    names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
+    tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
     method = _method(asked, tasks, ancestor, model, pack)
     modality = "both" if len(method.modalities) == 2 else method.modalities[0]
     job = _Job(asked, model, pack, _run_of(model, ancestor, data, pack, method), tasks, modality, out, say, quiet)
@@ -135,16 +135,6 @@ def finetune(
     }
     write_json(out / "scores.json", result)
     return result
-
-
-def _tasks(asked: Finetuning, pack: Pack) -> tuple[AnyTask, ...]:
-    known = {"task with classes": pack.spec.tasks, "task with values": pack.spec.values}
-    for (what, tasks), names in zip(known.items(), (asked.labels, asked.values), strict=True):
-        for name in names:
-            if name not in (have := [task.name for task in tasks]):
-                raise unknown(f"{what} of {pack.spec.name!r}", name, have or ["none"])
-    default = tuple(task.name for task in pack.spec.tasks or pack.spec.values)
-    return tuple(chosen(pack, ProbeConfig(tasks=(*asked.labels, *asked.values) or default))[0])
 
 
 def _method(
@@ -181,7 +171,7 @@ class _Job:
     quiet: bool
 
     def method(self, percent: float, seed: int, **changes: Any) -> SupervisedConfig:
-        return replace(self.run.method, share=percent / 100, share_seed=seed, **changes)  # type: ignore[call-arg]
+        return replace(self.run.method, share=percent / 100, draw=seed + 1, **changes)  # type: ignore[call-arg]
 
     def run_of(self, percent: float, seed: int, kind: str, settings: dict[str, Any], *, hold_out: bool = False) -> Run:
         """The run of ``kind`` on this share of the labels with these lr, steps and start of the heads."""
