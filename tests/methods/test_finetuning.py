@@ -32,7 +32,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 
 def test_older_records_and_digests_stay() -> None:
     plain = to_json(SupervisedConfig())
-    assert not {"train", "rank", "share", "share_seed", "hold_out", "heads_from"} & set(plain)
+    assert not {"train", "rank", "share", "draw", "hold_out", "heads_from"} & set(plain)
     changed = SupervisedConfig(train="lora", share=0.1, hold_out=True)
     assert from_json(SupervisedConfig, to_json(changed)) == changed
     with pytest.raises(ValueError, match=r"share 0: give a share of the groups, above 0, at most 1"):
@@ -89,7 +89,7 @@ def test_shares_are_nested_have_every_class_and_leave_test_alone(pack: Pack) -> 
         assert set(pack.labels("pattern")[rows]) == {0, 1, 2}
         assert set(rows) == {r for r in whole.training_rows(pack) if pack.column("group")[r] in found}  # whole groups
         before = found
-    draws = [replace(whole, share=0.3, share_seed=seed).training_rows(pack).tolist() for seed in range(3)]
+    draws = [replace(whole, share=0.3, draw=seed).training_rows(pack).tolist() for seed in (1, 2, 3)]
     assert draws[0] != draws[1] and draws[1] != draws[2]
 
 

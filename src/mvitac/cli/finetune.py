@@ -49,7 +49,7 @@ def _parsed(kind: type[Any], argv: list[str], name: str, description: str) -> An
     if "--data" not in chosen and not asks_help(rest):
         raise ValueError(f"name the data: --data {names}")
     data = default(DatasetConfig, chosen.get("--data", "pack"))
-    usual = kind(model=Path("MODEL"), data=data, out=Path("runs") / f"{name}ed")
+    usual = kind(model=Path("MODEL"), data=data, out=Path("runs") / f"{name.removesuffix('e')}ed")
     options = parse(kind, rest, name, default=usual, description=f"{description}\n\n  --data {names}  (required)")
     if options.model == usual.model:
         raise ValueError(f"name the model: the folder of a run or an artifact (see mvitac {name} --help)")
@@ -58,8 +58,10 @@ def _parsed(kind: type[Any], argv: list[str], name: str, description: str) -> An
 
 def finetune(argv: list[str]) -> None:
     """mvitac finetune MODEL --data D [--labels TASK...] [--values TASK...] [--train PART] --out DIR"""
-    about = """Train a model's encoders with labels. Settings are chosen on held-out groups of train. Training from random
-    weights and a linear probe on the frozen encoders get the same labels."""
+    about = (
+        "Train a model's encoders with labels. Settings are chosen on held-out groups of train. Training from random weights"
+        " and a linear probe on the frozen encoders get the same labels."
+    )
     options = _parsed(_FinetuneOptions, argv, "finetune", about)
     console = Console(markup=False, highlight=False)
     say = partial(console.print, soft_wrap=True)
@@ -71,8 +73,10 @@ def finetune(argv: list[str]) -> None:
 
 def adapt(argv: list[str]) -> None:
     """mvitac adapt MODEL --data D [--steps N] [--old PACK] --out DIR"""
-    about = """Adapt a model to data of a new sensor without labels: new statistics of BatchNorm, then a few steps of the
-    run's own method. Prints what it gains on the new data and what it forgets of the old."""
+    about = (
+        "Adapt a model to data of a new sensor without labels: new statistics of BatchNorm, then a few steps of its own"
+        " method. Prints what it gains on the new data and what it forgets of the old."
+    )
     options = _parsed(_AdaptOptions, argv, "adapt", about)
     console = Console(markup=False, highlight=False)
     say = partial(console.print, soft_wrap=True)

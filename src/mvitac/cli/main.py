@@ -28,7 +28,7 @@ how good the features are.
   data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
   data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
-  finetune MODEL       train its encoders with labels, next to frozen and scratch
+  finetune MODEL       train its encoders with labels, next to controls
   adapt MODEL          go on without labels on the data of a new sensor
   probe RUN...         linear probes next to their controls
   compare              many runs into the paper's tables (--plan NAME or FILE)

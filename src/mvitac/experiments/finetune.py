@@ -33,7 +33,6 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model, load
 from mvitac.nn.finetuning import Part
 from mvitac.nn.initial import Init
-from mvitac.registry import unknown
 from mvitac.run import Optim, Run
 from mvitac.system.files import check_place, read_json, write_json
 from mvitac.training.loop import train
@@ -115,7 +114,8 @@ def finetune(
     if out.exists() and any(out.iterdir()) and not resume:
         raise ValueError(f"{out} is not empty: continue it with --resume, or choose another --out")
     model, pack = load(ancestor), data.open(quiet=quiet)
-    tasks = _tasks(asked, pack)
+    names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
+    tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
     method = _method(asked, tasks, ancestor, model, pack)
     modality = "both" if len(method.modalities) == 2 else method.modalities[0]
     job = _Job(asked, model, pack, _run_of(model, ancestor, data, pack, method), tasks, modality, out, say, quiet)
@@ -135,16 +135,6 @@ def finetune(
     }
     write_json(out / "scores.json", result)
     return result
-
-
-def _tasks(asked: Finetuning, pack: Pack) -> tuple[AnyTask, ...]:
-    known = {"task with classes": pack.spec.tasks, "task with values": pack.spec.values}
-    for (what, tasks), names in zip(known.items(), (asked.labels, asked.values), strict=True):
-        for name in names:
-            if name not in (have := [task.name for task in tasks]):
-                raise unknown(f"{what} of {pack.spec.name!r}", name, have or ["none"])
-    default = tuple(task.name for task in pack.spec.tasks or pack.spec.values)
-    return tuple(chosen(pack, ProbeConfig(tasks=(*asked.labels, *asked.values) or default))[0])
 
 
 def _method(
@@ -181,7 +171,7 @@ class _Job:
     quiet: bool
 
     def method(self, percent: float, seed: int, **changes: Any) -> SupervisedConfig:
-        return replace(self.run.method, share=percent / 100, share_seed=seed, **changes)  # type: ignore[call-arg]
+        return replace(self.run.method, share=percent / 100, draw=seed + 1, **changes)  # type: ignore[call-arg]
 
     def run_of(self, percent: float, seed: int, kind: str, settings: dict[str, Any], *, hold_out: bool = False) -> Run:
         """The run of ``kind`` on this share of the labels with these lr, steps and start of the heads."""
@@ -236,7 +226,7 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
             path = job.folder(percent) / ("scratch" if kind == SCRATCH else "") / f"seed{seed}"
             run = job.run_of(percent, seed, kind, settings[kind])
             job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
-            train(run, path, resume=True, quiet=job.quiet, pack=job.pack)
+            train(run, path, resume=True, quiet=job.quiet, pack=job.pack, validate=False)  # all groups are learned from
             own = own_heads(load(path), job.pack, job.tasks, [job.modality])
             own = job.named(own, kind, percent, seed, read_sources(path, run, job.pack.digest, job.pack))
             own = [{**record, "run": str(path)} for record in own]
@@ -269,7 +259,7 @@ def _held_out_score(job: _Job, percent: float, kind: str, settings: dict[str, An
     run = job.run_of(percent, 0, kind, settings, hold_out=True)
     name = f"{kind}: {', '.join(f'{key} {value}' for key, value in settings.items())} ({run.digest()[:8]})"
     if name not in tried:
-        train(run, work / run.digest()[:8], resume=True, quiet=True, pack=job.pack)
+        train(run, work / run.digest()[:8], resume=True, quiet=True, pack=job.pack, validate=False)
         learned, model = run.method.training_rows(job.pack), load(work / run.digest()[:8])
         held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
         found = own_heads(model, job.pack, job.tasks, [job.modality], held)

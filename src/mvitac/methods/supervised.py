@@ -134,13 +134,13 @@ class SupervisedConfig(LabelledConfig):
     arXiv:2202.10054)."""
     share: float = field(default=1.0, metadata=LATER)
     """Share of the labelled groups to learn from, drawn at random; at least one group of each class."""
-    share_seed: int = field(default=0, metadata=LATER)
-    """Random seed of the draw."""
+    draw: int = field(default=1, metadata=LATER)
+    """Which random draw: 1, 2, ..."""
     hold_out: bool = field(default=False, metadata=LATER)
     """Leave out some of these groups, on which settings are chosen: those of split val, else a fifth."""
 
     def __post_init__(self) -> None:
-        self.check_fields(width=("rank",))
+        self.check_fields(width=("rank", "draw"))
         if not 0 < self.share <= 1:
             raise ValueError(f"share {self.share}: give a share of the groups, above 0, at most 1")
 
@@ -158,7 +158,7 @@ class SupervisedConfig(LabelledConfig):
             ValueError: If groups are to be held out, and there are too few.
         """
         groups = pack.column("group")[rows].astype(str)
-        order = np.random.default_rng(self.share_seed).permutation(np.unique(groups))
+        order = np.random.default_rng(self.draw).permutation(np.unique(groups))
         tasks = self.tasks_of(pack.spec)
         needed: dict[str, None] = {}
         for task in tasks:

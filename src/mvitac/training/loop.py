@@ -46,6 +46,7 @@ def train(
     quiet: bool = False,
     loggers: tuple[Logger, ...] = (),
     pack: Pack | None = None,
+    validate: bool = True,
 ) -> Path:
     """Pre-train and write the result into a folder.
 
@@ -60,6 +61,7 @@ def train(
         quiet: Print nothing.
         loggers: Functions ``(step, values)`` that receive all logged values.
         pack: The data, if it is already open. Default: open it from ``run.data``.
+        validate: Evaluate on held-out groups. It changes no weights.
 
     Returns:
         ``out``.
@@ -81,11 +83,11 @@ def train(
     with hold_lock(out, busy, wait=False) if world.writes else nullcontext():
         setup = set_up(run, out, world, quiet=quiet, pack=pack)
         if setup is not None:  # else the run is already finished
-            _loop(setup, out, quiet=quiet, loggers=loggers)
+            _loop(setup, out, quiet=quiet, loggers=loggers, validate=validate)
     return out
 
 
-def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) -> None:
+def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], validate: bool) -> None:
     run, pack, world, method, step = setup.run, setup.pack, setup.world, setup.method, setup.step
     start, num_steps = setup.start, setup.num_steps
     steps_per_epoch = run.steps_per_epoch(len(setup.rows))
@@ -97,7 +99,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) 
     with log_or_none or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
             log.say(describe_precision(setup.asked.precision, run.precision, setup.device))
-        validation = Validation(out, run, method, pack, log, setup.kept) if log else None
+        validation = Validation(out, run, method, pack, log, setup.kept) if log and validate else None
         if validation and start == 0:
             validation(0)
         method.train()
@@ -127,9 +129,9 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) 
                 _check_weights(method, done, run)
 
             # Evaluate on held-out groups (split val).
-            if log and validation:
+            if log:
                 log.advance(done)
-                if evaluate:
+                if evaluate and validation:
                     validation(done, last=last)
 
             # Save a checkpoint. All processes take part, because memory banks are sharded.
