@@ -113,7 +113,7 @@ def _validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cel
     if held_out:
         bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in z}
         values |= _knn(pack, train_rows, rows, bank, z)
-        cells = _linear(pack, train_rows, rows, bank, z)
+        cells = _linear(pack, train_rows, rows, _with_both(bank), _with_both(z))
         values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
     if len(model.projectors) == len(z) == 2:
         values |= _shared_space(model, pack, run, rows, z)
@@ -142,10 +142,15 @@ def _knn(
     return values
 
 
+def _with_both(z: dict[str, Tensor]) -> dict[str, Tensor]:
+    """``z``, and the features of two modalities side by side as "both"."""
+    return z | {"both": torch.cat(list(z.values()), dim=1)} if len(z) > 1 else z
+
+
 def _linear(
     pack: Pack, train_rows: np.ndarray, rows: np.ndarray, bank: dict[str, Tensor], z: dict[str, Tensor]
 ) -> Cells:
-    """Errors by group of a linear probe of each task and modality, as for ``_knn``."""
+    """Errors by group of a linear probe of each task and modality, and of both together, as for ``_knn``."""
     names = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
     groups = torch.from_numpy(names[train_rows])
     by_group = torch.from_numpy(np.unique(names[rows], return_inverse=True)[1])
