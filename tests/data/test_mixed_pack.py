@@ -250,7 +250,7 @@ def test_names_folders_and_weights() -> None:
 def test_a_mix_is_described_shown_and_checked(
     pack: Pack, gel: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parts = ["--data", "mix", "--parts", f"toy={pack.path}", f"gel={gel.path}"]
+    parts = [f"toy={pack.path}", f"gel={gel.path}"]
     assert main(["data", "info", *parts, "--json", str(tmp_path / "info.json")]) == 0
     found = json.loads((tmp_path / "info.json").read_text())
     assert (found["rows"], found["rows_without"]) == (
