@@ -157,7 +157,7 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("pack-nothing", "data pack", ["--data", "materials"]),
     ("pack-unknown", "data pack --data materails --out {out}", ["'materails'", "did you mean 'materials'"]),
     ("pack-a-pack", "data pack --data pack --out {out}", ["is a pack already"]),
-    ("info-nothing", "data info", ["PATH", "Folder of the pack"]),
+    ("info-nothing", "data info", ["PACK", "Folder of the pack"]),
     ("info-nowhere", "data info {tmp}/nowhere", ["no pack at {tmp}/nowhere", "mvitac data"]),
     ("info-two", "data info {pack} other", ["other", "--help"]),
     ("method", PRETRAIN + "--method mvitca", ["'mvitca'", "did you mean 'mvitac'"]),

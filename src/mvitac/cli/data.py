@@ -294,7 +294,7 @@ class _ShowOptions:
 def show(argv: list[str]) -> None:
     """mvitac data show PACK [PACK ...] [--by TASK|COLUMN] [--out FILE.png|FILE.html]"""
     options = parse(_ShowOptions, argv, "data show")
-    out = options.out or Path(f"{'-'.join(Path(one).resolve().name for one in options.pack)}.png")
+    out = options.out or Path(f"{'-'.join(Path(one).resolve().name for one in options.pack) or 'pack'}.png")
     if out.suffix.lower() not in (".png", ".html"):
         raise ValueError(f"--out {out}: give a name that ends in .png or .html")
     if not 16 <= options.side <= 1024:

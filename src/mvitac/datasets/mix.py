@@ -93,7 +93,7 @@ class MixConfig(DatasetConfig):
 def open_packs(folders: Sequence[str]) -> Pack:
     """The pack in one folder, or those in several (FOLDER or NAME=FOLDER) as one."""
     if not folders:
-        raise ValueError("name the folder of a pack, or several")
+        raise ValueError("missing PACK: Folder of the pack, or of several")
     return Pack(folders[0]) if len(folders) == 1 else MixConfig(parts=tuple(folders)).open()
 
 
