@@ -159,7 +159,7 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("pack-a-pack", "data pack --data pack --out {out}", ["is a pack already"]),
     ("info-nothing", "data info", ["PACK", "Folder of the pack"]),
     ("info-nowhere", "data info {tmp}/nowhere", ["no pack at {tmp}/nowhere", "mvitac data"]),
-    ("info-two", "data info {pack} other", ["other", "--help"]),
+    ("info-two", "data info {pack} other", ["part other: no pack at other"]),
     ("method", PRETRAIN + "--method mvitca", ["'mvitca'", "did you mean 'mvitac'"]),
     ("dataset", "pretrain --data graps --out {out}", ["'graps'", "did you mean 'grasps'"]),
     ("recipe", "pretrain --recipe pape --out {out}", ["'pape'", "did you mean 'paper'"]),
