@@ -75,7 +75,7 @@ def memory(data: DatasetConfig, run: Run) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--num", type=int, default=2000, help="number of pairs in all")
     parser.add_argument("--size", type=int, default=72, help="image side in pixels")
     parser.add_argument("--batch", type=int, default=64, help="pairs per step")

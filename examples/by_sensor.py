@@ -36,7 +36,8 @@ class Rows(Source):
         row = int(self.rows[item])
         cells = self.pack.table.slice(row, 1).to_pylist()[0]
         columns = {name: cell for name, cell in cells.items() if not name.startswith(("crc_", "bytes_"))}
-        return [Sample(columns=columns, **{m: np.array(images[row]) for m, images in self.pack.images.items()})]
+        images = {m: np.array(images[row]) for m, images in self.pack.images.items()}
+        return [Sample(vision=images.get("vision"), touch=images.get("touch"), columns=columns)]
 
 
 if __name__ == "__main__":

@@ -119,23 +119,25 @@ def test_values_keep_their_unit_rows_and_split(gel: Pack, tmp_path: Path, other:
         ]
 
 
-def test_a_row_hidden_in_its_part_stays_hidden(pack: Pack, tmp_path: Path) -> None:
+def test_rows_are_hidden_as_in_their_part(pack: Pack, tmp_path: Path) -> None:
+    """A part whose tasks all have splits of their own hides no row, though the other part has tasks of the common split."""
+
     @dataclass
-    class Listed(Toy):
+    class Listed(Slice):
+        prefix: str = "listed "
+
         def spec(self) -> DataSpec:
-            pattern, bright = super().spec().tasks
-            return replace(super().spec(), tasks=(pattern, replace(bright, split="split_bright")))
+            return replace(super().spec(), tasks=(replace(super().spec().tasks[1], split="split_bright"),))
 
         def read(self, item: int) -> list[Sample]:
             (sample,) = super().read(item)
-            columns = {**sample.columns, "split_bright": "test", "group": f"listed {item}"}
-            return [replace(sample, columns=columns | ({"label_pattern": -1} if item % 5 == 0 else {}))]
+            return [replace(sample, columns={**sample.columns, "split_bright": sample.columns["split"]})]
 
-    listed = built(Listed(num=60), tmp_path / "p")
-    mix = MixedPack({"toy": pack, "listed": listed}, allow_leak=True)
-    assert listed.hidden.any()
-    np.testing.assert_array_equal(mix.hidden, [*pack.hidden, *listed.hidden])
+    listed = built(Listed(num=60), tmp_path / "p", size=16)
+    mix = MixedPack({"toy": pack, "listed": listed})
     assert [task.name for task in mix.spec.tasks] == ["pattern", "toy/bright", "listed/bright"]
+    assert not mix.hidden.any() and not listed.hidden.any()
+    assert len(mix.rows("test")) == len(pack.rows("test")) + len(listed.rows("test"))
 
 
 def test_windows_of_a_mix_stay_within_a_touch_of_a_part(measured: Pack, tmp_path: Path) -> None:
@@ -250,7 +252,7 @@ def test_names_folders_and_weights() -> None:
 def test_a_mix_is_described_shown_and_checked(
     pack: Pack, gel: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parts = ["--data", "mix", "--parts", f"toy={pack.path}", f"gel={gel.path}"]
+    parts = [f"toy={pack.path}", f"gel={gel.path}"]
     assert main(["data", "info", *parts, "--json", str(tmp_path / "info.json")]) == 0
     found = json.loads((tmp_path / "info.json").read_text())
     assert (found["rows"], found["rows_without"]) == (

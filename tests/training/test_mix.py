@@ -224,7 +224,8 @@ def test_rows_without_a_loss_are_not_drawn(parts: dict[str, str], tmp_path: Path
     run = mix_run(parts["a"], parts["gel"])
     pack = run.data.open()
     assert isinstance(pack, MixedPack)
-    for losses, num in ((("vv",), 1), (("tt",), 2), (("vt", "tv"), 1), (("vv", "tt"), 2)):
+    cases: Any = ((("vv",), 1), (("tt",), 2), (("vt", "tv"), 1), (("vv", "tt"), 2))
+    for losses, num in cases:
         rows = MViTacConfig(losses=losses).training_rows(pack)
         assert set(pack.part_of[rows]) == set(range(num))
     with pytest.raises(

@@ -30,8 +30,6 @@ class DatasetConfig(Registered, ABC):
     """Options that do not affect the result."""
     names_a_place: ClassVar[bool] = True
     """Whether opening the data reads a path or a URL that the config names. That of an artifact is not believed."""
-    is_pack: ClassVar[bool] = False
-    """Whether the config names packs, so that there is nothing to pack."""
     phased: ClassVar[bool | None] = None
     """``Pack.phased`` where it is known before the data is opened. None: the opened pack decides."""
 

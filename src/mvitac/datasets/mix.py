@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -21,7 +22,6 @@ class MixConfig(DatasetConfig):
     """Several packs as one training set: other datasets, sensors, image sizes, and parts without a camera or touch."""
 
     name: ClassVar[str] = "mix"
-    is_pack: ClassVar[bool] = True
 
     parts: tuple[str, ...] = ()
     """The packs, each as NAME=FOLDER:WEIGHT, such as tag=packs/tag:2 mine=packs/mine:1. NAME is by default the folder's.
@@ -88,6 +88,13 @@ class MixConfig(DatasetConfig):
         pack.one_part, pack.temperature = self.batches == "one-part", self.temperature
         pack.weights = tuple(weight for _, _, weight in given if weight is not None)
         return pack
+
+
+def open_packs(folders: Sequence[str]) -> Pack:
+    """The pack in one folder, or those in several (FOLDER or NAME=FOLDER) as one."""
+    if not folders:
+        raise ValueError("missing PACK: Folder of the pack, or of several")
+    return Pack(folders[0]) if len(folders) == 1 else MixConfig(parts=tuple(folders)).open()
 
 
 def _weight(text: str, part: str) -> float:

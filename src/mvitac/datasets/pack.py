@@ -19,7 +19,6 @@ class PackConfig(DatasetConfig):
     """A folder written by ``mvitac data simulate`` or ``mvitac data pack``."""
 
     name: ClassVar[str] = "pack"
-    is_pack: ClassVar[bool] = True
 
     path: Path = Path("pack")
     """The pack's folder."""
@@ -47,7 +46,6 @@ class StreamConfig(DatasetConfig):
     """Shards written by ``mvitac data shard``, which are fetched when needed."""
 
     name: ClassVar[str] = "stream"
-    is_pack: ClassVar[bool] = True
     local: ClassVar[tuple[str, ...]] = (*DatasetConfig.local, "cache", "cache_gb")
 
     url: str = "shards"

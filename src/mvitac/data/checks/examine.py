@@ -99,12 +99,12 @@ def examine(
     ]
 
 
-def examine_pack(path: Path, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
+def examine_pack(path: str | Path, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
     """Check the pack at ``path``; return the findings and the blocks of the contact sheet."""
     try:
         pack = Pack(path)
     except ValueError as error:
-        if not (path / "pack.json").is_file():
+        if not (Path(path) / "pack.json").is_file():
             raise
         found = Finding(
             item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it, too"
