@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -29,6 +31,7 @@ from mvitac.experiments.table_formats import markdown
 from mvitac.external import ExternalModel, is_noncommercial, load_external
 from mvitac.model import fresh
 from mvitac.recipes import recipe
+from support.owners import OWNERS
 from support.small_plans import ROWS, small
 from support.toy import toy_pack
 
@@ -127,6 +130,26 @@ def test_one_encoder_for_each_sense(pack: Pack) -> None:
     for text in (f"{TINY}+{TINY}", f"{TINY},reads=touch+{TINY},reads=touch"):
         with pytest.raises(ValueError, match="one encoder"):
             load_external(text)
+
+
+@pytest.mark.parametrize("owner", OWNERS)
+def test_every_owners_checkpoint_gives_features_of_a_pack(
+    owner: Callable[..., Any], pack: Pack, tmp_path: Path
+) -> None:
+    text, _ = owner(tmp_path)
+    model, own = load_external(text).on(pack)
+    found = features(model, own, "touch", rows(pack))
+    assert (
+        found.shape == (6, model.encoders["touch"].num_features) and np.isfinite(found).all() and found.std(0).max() > 0
+    )
+    assert (
+        features(model, own, "touch", rows(pack), maps=True).shape[2]
+        == model.parts["touch"].loaded.network.num_features
+    )
+    about = model.describe()["encoders"]["touch"]
+    assert about["files"] and about["frames_given"] == 1 and about["trained_on"] == "unknown"
+    wanted = model.parts["touch"].encoder.preprocessing
+    assert len(model.notes) == (wanted.frames > 1 and not wanted.still) + (wanted.offset is not None)
 
 
 def onnx_mean(path: Path, side: int | str = 16) -> Path:

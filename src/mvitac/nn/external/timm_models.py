@@ -16,6 +16,7 @@ from torch import nn
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
 from mvitac.nn.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
 from mvitac.nn.external.preprocessing import Preprocessing
+from mvitac.system.files import brief
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,10 @@ class Timm(Adapter):
     def _built(self, weights: str) -> nn.Module:
         trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3 * (self.frames or 1))
         if self.size and hasattr(trunk, "set_input_size"):
-            trunk.set_input_size(img_size=self.sides((224, 224)))  # type: ignore[operator]
-        if hasattr(trunk, "patch_embed"):
-            trunk.grid = (1, *trunk.patch_embed.grid_size)  # type: ignore[union-attr]
+            try:
+                trunk.set_input_size(img_size=self.sides((224, 224)))  # type: ignore[operator]
+            except Exception as error:  # each model has its own rules
+                raise ValueError(f"{self.place} cannot take size {self.size} ({brief(error)})") from None
+        if grid := getattr(getattr(trunk, "patch_embed", None), "grid_size", None):
+            trunk.grid = (1, *grid)  # type: ignore[assignment]
         return trunk

@@ -211,6 +211,4 @@ def resnet(adapter: Adapter, tensors: Tensors) -> nn.Module:
     channels = tuple(shape(adapter, tensors, f"layer{i}.0.conv1.weight", 4)[0] for i in range(1, 5))
     stem = shape(adapter, tensors, "conv1.weight", 4)
     network = ResNet(kind, layers, num_classes=0, in_chans=stem[1], channels=channels)
-    if stem[0] != 64:  # narrower than any that is published
-        network.conv1, network.bn1 = nn.Conv2d(stem[1], stem[0], 7, 2, 3, bias=False), nn.BatchNorm2d(stem[0])
     return fill(adapter, network, tensors)
