@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Window
 from mvitac.methods.base import Method, Views
 from mvitac.methods.ijepa import IJEPA, Blocks, IJEPAConfig, multi_block
@@ -19,8 +20,11 @@ from mvitac.nn.encoders import PerFrame
 from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.vit import Predictor, row_uniform
 from mvitac.recipes import recipe
+from mvitac.system.distributed import World
+from mvitac.training.views import load_chunks
 from support.small_methods import TINY, TINY_VIT, build, outcome, views
 from support.toy import Toy
+from support.training_runs import smoke
 
 GRID, SIDE = (4, 4), 8
 
@@ -287,3 +291,16 @@ def test_other_trunks_and_views_of_one_patch_are_refused(name: str) -> None:
         small.check(spec(), 100, 72)
     with pytest.raises(ValueError, match="senses both: dataset 'toy' has touch only"):
         replace(config, senses="both").build(Toy(vision_channels=0).spec(), TINY_VIT)
+
+
+def test_each_step_has_its_seed_and_a_resumed_run_the_same(pack: Pack) -> None:
+    run = smoke(pack)
+
+    def seeds(start: int, chunk: int = 0) -> list[list[int]]:
+        rows = run.method.training_rows(pack)
+        made = load_chunks(replace(run, chunk=chunk), pack, rows, 1, torch.device("cpu"), World(), start, 4)
+        return [[int(view().seed) for view in chunks] for chunks in made]
+
+    straight = seeds(0)
+    assert len({seed for step in straight for seed in step}) == 4 and seeds(2) == straight[2:]
+    assert all(len(set(step)) == 2 for step in seeds(0, chunk=8))

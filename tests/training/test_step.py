@@ -18,7 +18,7 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.encoders import draws_random_numbers
 from mvitac.recipes import recipe
-from mvitac.registry import to_json
+from mvitac.registry import default, to_json
 from mvitac.run import Optim, Run
 from mvitac.system import processes
 from mvitac.training.loop import train
@@ -196,10 +196,12 @@ def test_networks_with_dropout_are_not_side_by_side() -> None:
     assert not draws_random_numbers(build(replace(RUN, method=MViTacConfig())))
 
 
-def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["mvitac", *[pytest.param(name, marks=pytest.mark.slow) for name in ("mae", "ijepa")]])
+def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """As ``--compile`` asks torch for it; without machine code, which takes a minute."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
-    run = replace(RUN, method=MViTacConfig())
+    method = default(MethodConfig, name)
+    run = replace(RUN, method=method, encoder=TINY_VIT if method.needs_vit else RUN.encoder)
     plain, compiled = (take(replace(run, compile=c), build(run).train(), [views])["loss"] for c in (False, True))
     assert torch.equal(plain, compiled)
 
