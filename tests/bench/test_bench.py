@@ -369,6 +369,10 @@ def test_data_is_compared_with_the_pins(root: Path) -> None:
     assert pinned().pinned == "same" and pinned(touch="0").pinned == "other pixels"
     with pytest.raises(ValueError, match="other rows, labels or splits than the suite"):
         pinned(rows="0")
+    form = one.forms[0]  # made here: another processor may give other rows, which are another row of the board
+    made = replace(form, at={}, data={**form.data, "path": str(root / "stripes")}, pins={**opened.digests, "rows": "0"})
+    found = open_set(replace(one, forms=(made,)), None)
+    assert not isinstance(found, str) and found.pinned == "other rows"
 
 
 def test_shipped_suites_keep_their_definitions() -> None:

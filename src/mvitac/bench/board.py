@@ -167,7 +167,7 @@ that this order is not resolved. Differences are in points, not corrected for th
 LEAKS = """Leaks compare the rows and groups that an encoder was trained on with the test rows, where a list of them came
 with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
 DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.
-'other pixels': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
+'other pixels', 'other rows': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
 FOOT = "<p>Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it.</p>"
 
 

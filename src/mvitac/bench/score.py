@@ -38,7 +38,8 @@ class _Channels(Lazy):
     """Some channels of images: one of several sensors that are stacked."""
 
     def __init__(self, images: Images, kept: slice) -> None:
-        super().__init__((*images.shape[:3], kept.stop - kept.start))
+        num, height, width, _ = images.shape
+        super().__init__((num, height, width, kept.stop - kept.start))
         self.images, self.kept = images, kept
 
     def _made(self, rows: np.ndarray) -> np.ndarray:
