@@ -20,10 +20,11 @@ from mvitac.bench.score import Reader, misfit
 from mvitac.bench.suite import find_suite, open_set, shipped
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
+from mvitac.deploy.artifact import load
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.evaluation.value_scores import r_squared
-from mvitac.model import fresh, load
+from mvitac.model import fresh
 from mvitac.system.files import digest
 from support.toy import toy_pack
 
@@ -352,6 +353,10 @@ def test_stacked_sensors_are_read_one_by_one(tmp_path: Path, smoke_run: Path, ro
     assert np.allclose(found, expected.numpy(), atol=1e-5)
     left, right = (features(model, view, "touch", rows) for view in score.sensors(pack, "touch", 3))
     assert not np.allclose(left, right)
+    (note,) = Reader(
+        load(f"{RANDOM.format(0)},frames=2"), opened, "x"
+    ).notes  # of an encoder of others: it is in the result
+    assert "the current frame is repeated" in note and Reader(model, opened, "x").notes == []
 
 
 def test_data_is_compared_with_the_pins(root: Path) -> None:
