@@ -20,10 +20,11 @@ from mvitac.bench.score import Reader, misfit
 from mvitac.bench.suite import find_suite, open_set, shipped
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
+from mvitac.deploy.artifact import load
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.evaluation.value_scores import r_squared
-from mvitac.model import fresh, load
+from mvitac.model import fresh
 from mvitac.system.files import digest
 from support.toy import toy_pack
 
@@ -352,6 +353,10 @@ def test_stacked_sensors_are_read_one_by_one(tmp_path: Path, smoke_run: Path, ro
     assert np.allclose(found, expected.numpy(), atol=1e-5)
     left, right = (features(model, view, "touch", rows) for view in score.sensors(pack, "touch", 3))
     assert not np.allclose(left, right)
+    (note,) = Reader(
+        load(f"{RANDOM.format(0)},frames=2"), opened, "x"
+    ).notes  # of an encoder of others: it is in the result
+    assert "the current frame is repeated" in note and Reader(model, opened, "x").notes == []
 
 
 def test_data_is_compared_with_the_pins(root: Path) -> None:
@@ -369,6 +374,10 @@ def test_data_is_compared_with_the_pins(root: Path) -> None:
     assert pinned().pinned == "same" and pinned(touch="0").pinned == "other pixels"
     with pytest.raises(ValueError, match="other rows, labels or splits than the suite"):
         pinned(rows="0")
+    form = one.forms[0]  # made here: another processor may give other rows, which are another row of the board
+    made = replace(form, at={}, data={**form.data, "path": str(root / "stripes")}, pins={**opened.digests, "rows": "0"})
+    found = open_set(replace(one, forms=(made,)), None)
+    assert not isinstance(found, str) and found.pinned == "other rows"
 
 
 def test_shipped_suites_keep_their_definitions() -> None:

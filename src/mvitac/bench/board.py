@@ -167,7 +167,7 @@ that this order is not resolved. Differences are in points, not corrected for th
 LEAKS = """Leaks compare the rows and groups that an encoder was trained on with the test rows, where a list of them came
 with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
 DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.
-'other pixels': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
+'other pixels', 'other rows': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
 FOOT = "<p>Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it.</p>"
 
 
@@ -213,13 +213,25 @@ def _scores(board: Board) -> str:
 
 
 def _encoders(board: Board) -> str:
-    columns = ["", "leak", "parameters", "images seen", "licence", "trained on", "seeds, input", "weights", "versions"]
+    columns = [
+        "",
+        "leak",
+        "parameters",
+        "images seen",
+        "licence",
+        "trained on",
+        "notes",
+        "seeds, input",
+        "weights",
+        "versions",
+    ]
     rows = []
     for name in board.encoders:
         result, encoder = board.results[name], board.results[name]["encoder"]
         sizes = ", ".join(f"{m} {num / 1e6:.1f} M" for m, num in encoder["parameters"].items())
         seen = "not known" if encoder["images_seen"] is None else f"{encoder['images_seen']:,}"
-        known = [encoder[key] or "not given" for key in ("licence", "trained_on")]
+        notes = dict.fromkeys(note for block in result["blocks"] for note in block.get("notes", ()))
+        known = [*(encoder[key] or "not given" for key in ("licence", "trained_on")), "; ".join(notes)]
         read = f"{', '.join(map(str, encoder['seeds']))}; {encoder['size']} px"
         versions = ", ".join(f"{library} {result['versions'].get(library, '')}" for library in ("mvitac", "torch"))
         weights = ", ".join(one[:12] for one in encoder["weights"])

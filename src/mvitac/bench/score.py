@@ -38,7 +38,8 @@ class _Channels(Lazy):
     """Some channels of images: one of several sensors that are stacked."""
 
     def __init__(self, images: Images, kept: slice) -> None:
-        super().__init__((*images.shape[:3], kept.stop - kept.start))
+        num, height, width, _ = images.shape
+        super().__init__((num, height, width, kept.stop - kept.start))
         self.images, self.kept = images, kept
 
     def _made(self, rows: np.ndarray) -> np.ndarray:
@@ -82,8 +83,14 @@ class Reader:
 
     @cached_property
     def bound(self) -> tuple[Model, Pack]:
+        """The model and the data, for each other (``ExternalModel.on``)."""
         pack = self.opened.packs[0]
         return self.model.on(pack) if isinstance(self.model, ExternalModel) else (self.model, pack)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the data lacks that the encoder's owner wants."""
+        return list(self.bound[0].notes) if isinstance(self.bound[0], ExternalModel) else []
 
     def read(self, modality: str, rows: np.ndarray, maps: bool = False) -> np.ndarray:
         """Features [len(rows), D], or maps [len(rows), P, D]."""
@@ -189,7 +196,8 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
                 about_all = (opened, suite, ask, task)
                 controls = _kept(parts, "controls", about, lambda r=beside, a=about_all: _controls(r, *a))
                 scored = _kept(parts, key, about, lambda r=own, a=about_all: _scores(r, *a))
-                yield _block(entry, one, opened, ask, task, scored, controls)
+                block = _block(entry, one, opened, ask, task, scored, controls)
+                yield {**block, "notes": own[0].notes} if scored else block
                 advance()
 
 
@@ -210,7 +218,7 @@ def _block(
     """The scores of one task and what they were made on."""
     pack = opened.packs[0]
     if not own:
-        why = [misfit(entry.models[0], pack, one) for m in ask.modalities for one in names_in(m, pack)]
+        why = [misfit(entry.models[0], pack, each) for m in ask.modalities for each in names_in(m, pack)]
         return {"set": one.name, "task": task.name, "not_run": next(filter(None, why))}
     names = [np.unique(v.column("group")[split_rows(v, task).test].astype(str)).tolist() for v in opened.packs]
     return {

@@ -26,6 +26,8 @@ from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief, digest
 
 SUITES = Path(__file__).parent / "suites"
+Pinned = Literal["same", "other pixels", "other rows", "not pinned"]
+"""Data beside the pins of its suite. Only simulated data may have other rows: those of another processor's arithmetic."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,14 +134,14 @@ class Opened:
         packs: One pack per fold, which differ in the column split only.
         tasks: The tasks as the data defines them, beside what the suite asks.
         digests: Digests of the data.
-        pinned: Whether the data is what the suite was measured on: "same", "other pixels" or "not pinned".
+        pinned: Whether the data is what the suite was measured on.
     """
 
     form: str
     packs: tuple[Pack, ...]
     tasks: tuple[tuple[SuiteTask, AnyTask], ...]
     digests: dict[str, str]
-    pinned: Literal["same", "other pixels", "not pinned"]
+    pinned: Pinned
 
 
 def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
@@ -169,10 +171,12 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
     return f"{places} is not there" if root else f"no --data-root was given, where {places} would be"
 
 
-def _compared(one: SuiteSet, form: Form, found: dict[str, str]) -> Literal["same", "other pixels", "not pinned"]:
-    """Compare digests with the pins of ``form``; ValueError if rows, labels or splits differ."""
+def _compared(one: SuiteSet, form: Form, found: dict[str, str]) -> Pinned:
+    """Compare digests with the pins of ``form``; ValueError if rows, labels or splits of real data differ."""
     if not form.pins:
         return "not pinned"
+    if found["rows"] != form.pins["rows"] and not form.at:
+        return "other rows"
     if found["rows"] != form.pins["rows"]:
         raise ValueError(
             f"the data of {one.name} ({form.name}) has other rows, labels or splits than the suite: digest"
@@ -215,8 +219,11 @@ def _rows_digest(packs: Sequence[Pack], tasks: Sequence[AnyTask]) -> str:
     """Digest of ids, groups, splits and answers. Unlike ``Pack.digest`` it does not depend on how the table was written."""
     pack, columns = packs[0], sorted({task.split for task in tasks})
     splits = [view.column(column).astype(str).tolist() for view in packs for column in columns]
-    answers = [
-        pack.labels(task.name).tolist() if isinstance(task, Task) else _numbers(pack.values(task)) for task in tasks
+    answers = [  # values in six digits: the last bits of a sum do not matter
+        pack.labels(task.name).tolist()
+        if isinstance(task, Task)
+        else [f"{value:.6g}" for value in pack.values(task).ravel().tolist()]
+        for task in tasks
     ]
     return digest([pack.own_ids.tolist(), pack.column("group").astype(str).tolist(), splits, answers])
 
@@ -227,8 +234,3 @@ def _image_digests(packs: Sequence[Pack]) -> dict[str, str]:
         (prefix, *item) for prefix, pack in zip(("", "scored "), packs, strict=False) for item in pack.digests.items()
     ]
     return {prefix + name.partition(".")[0]: found for prefix, name, found in files if name != "samples.parquet"}
-
-
-def _numbers(values: np.ndarray) -> list[str]:
-    """Values as text of six digits, so that the last bits of a sum do not matter."""
-    return [f"{value:.6g}" for value in values.ravel().tolist()]
