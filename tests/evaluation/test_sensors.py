@@ -197,6 +197,8 @@ def test_cross_sensor_retrieval_counts_presses(others: Pack, model: Model, monke
     monkeypatch.setattr(module, "features", same)
     found = cross_sensor(model, pressed)
     assert found == {"name": "same spot, other sensor", "score": 1.0, "chance": pytest.approx(5 / 60), "num": 120}
+    monkeypatch.setattr(module, "features", lambda *args: z[args[3] // 6])  # three presses alike: third, not first
+    assert cross_sensor(model, pressed)["score"] == 1  # type: ignore[index]
     monkeypatch.setattr(module, "features", lambda *args: np.ones((len(args[3]), 4), np.float32))
     assert cross_sensor(model, pressed)["score"] == 0  # type: ignore[index]  # ties count against it
     monkeypatch.setattr(module, "features", lambda *args: z[np.random.default_rng(1).permutation(120)[args[3]] // 2])

@@ -16,7 +16,7 @@ FAR = np.array([[-55.0, 10.0], [25.0, 60.0], [35.0, -50.0]])
 def slopes(num: int = 48, size: int = 40, seed: int = 0) -> np.ndarray:
     """Slopes [num, size, size, 2] of heights with sharp ridges and smooth valleys, as a membrane shows them."""
     noise = np.random.default_rng(seed).normal(size=(num, size, size))
-    height = -np.abs(gaussian_filter(noise, (0, 3, 3)))
+    height = -np.abs(gaussian_filter(noise, (0, 5, 5)))
     g = np.stack([np.gradient(height, axis=2), np.gradient(height, axis=1)], axis=-1)
     return g / g.std() / 4
 
@@ -60,6 +60,10 @@ def test_sign_and_factor_come_from_the_gel() -> None:
 def test_what_cannot_be_learned_is_an_error() -> None:
     with pytest.raises(ValueError, match="needs 32"):
         learn_colours(images(NEAR, slopes(8), 1))
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(48, 40, 40)), (0, 3, 3))  # peaks are like pits
+    both = np.stack([np.gradient(noise, axis=2), np.gradient(noise, axis=1)], axis=-1)
+    with pytest.raises(ValueError, match="do not tell peaks from pits"):
+        learn_colours(images(NEAR, both / both.std() / 4, 1))
     gray = images(NEAR, slopes(), 1).mean(-1, keepdims=True).repeat(3, -1)
     with pytest.raises(ValueError, match="do not follow slopes"):
         learn_colours(gray)
