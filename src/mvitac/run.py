@@ -145,8 +145,8 @@ class Run:
             raise ValueError(f"epochs {self.epochs}: give a positive number")
         if self.chunk and not (2 <= self.chunk <= self.batch_size and self.batch_size % self.chunk == 0):
             raise ValueError(f"chunk {self.chunk}: give a divisor of batch_size {self.batch_size}, at least 2, or 0")
-        if self.renew_norms < 0:
-            raise ValueError(f"renew_norms {self.renew_norms}: give a number of batches >= 0")
+        if not 0 <= self.renew_norms <= 1000:
+            raise ValueError(f"renew_norms {self.renew_norms}: give 0 to 1000 batches")
         if self.steps is not None and self.steps < (0 if self.renew_norms else 1):
             raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
         if not 0 <= self.seed < 1 << 63:
