@@ -91,7 +91,8 @@ class Log:
         shown = []
         for name, value in values.items():
             if "/linear " in name or "/knn " in name or name.endswith("R@5"):
-                gain = f" ({value - self.first[name]:+.3f})" if step and name in self.first else ""
+                beside = step and name in self.first and not name.startswith("chance")
+                gain = f" ({value - self.first[name]:+.3f})" if beside else ""
                 shown.append(f"{name} {value:.3f}{gain}")
         self.say(f"{'start, the line to beat' if step == 0 else f'step {step}'}: {', '.join(shown)}")
         if verdict:

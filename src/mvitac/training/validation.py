@@ -99,9 +99,12 @@ def validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cell
     if held_out:
         bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in model.encoders}
         values |= _knn(pack, train_rows, rows, bank, z)
+        if len(z) > 1:
+            bank, z = (each | {"both": torch.cat(list(each.values()), dim=1)} for each in (bank, z))
         cells = _linear(pack, train_rows, rows, bank, z)
         values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
     if len(model.projectors) == 2:
+        z.pop("both", None)
         values |= _shared_space(model, pack, run, rows, z)
     return values, cells
 
@@ -131,7 +134,7 @@ def _knn(
 def _linear(
     pack: Pack, train_rows: np.ndarray, rows: np.ndarray, bank: dict[str, Tensor], z: dict[str, Tensor]
 ) -> Cells:
-    """Errors by group of a linear probe of each task and modality, as for ``_knn``."""
+    """Errors by group of a linear probe of each task and modality, and of both together, as for ``_knn``."""
     names = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
     groups = torch.from_numpy(names[train_rows])
     by_group = torch.from_numpy(np.unique(names[rows], return_inverse=True)[1])
