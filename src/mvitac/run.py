@@ -160,8 +160,8 @@ class Run:
             raise ValueError(
                 "positives_within has no effect on same-image positives: choose --positives same-touch, or same-press"
             )
-        if self.renew_norms < 0:
-            raise ValueError(f"renew_norms {self.renew_norms}: give a number of batches >= 0")
+        if not 0 <= self.renew_norms <= 1000:
+            raise ValueError(f"renew_norms {self.renew_norms}: give 0 to 1000 batches")
         if self.steps is not None and self.steps < (0 if self.renew_norms else 1):
             raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
         if not 0 <= self.seed < 1 << 63:

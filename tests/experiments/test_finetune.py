@@ -58,6 +58,26 @@ def test_the_result_is_a_model_like_any_other(ancestor: Path, pack: Pack, tuned:
     assert not (tuned / "choice").exists()  # what was only tried takes no room
 
 
+def test_the_command_continues_a_finished_one_and_prints_one_table(
+    ancestor: Path, pack: Pack, tuned: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    before = (tuned / "scores.json").read_text()
+    words = (
+        f"--labels pattern --lr 1e-3 3e-3 --steps 3 --batch-size 16 --fractions 40 100 --out {tuned} --resume --quiet"
+    )
+    with power_cut(0):  # nothing is trained again
+        assert main(["finetune", str(ancestor), "--data", "pack", "--data.path", str(pack.path), *words.split()]) == 0
+    assert (tuned / "scores.json").read_text() == before
+    said = capsys.readouterr().out
+    rows = {line.split("│")[1].strip(): line.split("│")[2:4] for line in said.splitlines() if line.count("│") == 4}
+    gains = [f"gain over {SCRATCH}", f"gain over {FROZEN}"]
+    assert list(rows) == ["fine-tuned, all", SCRATCH, FROZEN, *gains]
+    assert "40 % of instances" in said and "100 % of instances" in said and f"mvitac publish {tuned / 'seed0'}" in said
+    numbers = {name: float(cells[1].split()[0]) for name, cells in rows.items()}
+    assert numbers[gains[0]] == pytest.approx(numbers["fine-tuned, all"] - numbers[SCRATCH], abs=0.11)
+
+
 def tried_in(folder: Path) -> dict[str, float]:
     """Score by settings, without the digest of the run."""
     return {name.split(" (")[0]: score for name, score in json.loads((folder / "choice.json").read_text()).items()}

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, PerFrame, build_trunk, last_map
 from mvitac.nn.finetuning import AttentivePool, Lora, freeze_statistics, merged, renew_norms, train_part
+from mvitac.nn.initial import load_trunk
 
 
 def tiny(trunk: str = "mvitac_tiny") -> nn.Module:
@@ -124,3 +125,16 @@ def test_statistics_anew_are_those_of_the_batches() -> None:
     torch.testing.assert_close(
         z, F.relu((network[0](torch.cat(batches)) - mean[:, None, None]) / (variance + 1e-5).sqrt()[:, None, None])
     )
+
+
+def test_a_learned_pooling_starts_from_plain_weights_and_gives_them() -> None:
+    plain, images = tiny().eval(), torch.randn(2, 3, 64, 64)
+    nn.init.constant_(plain.get_parameter("conv1.0.weight"), 0.3)
+    pooled = AttentivePool(tiny()).eval()
+    load_trunk(pooled, plain.state_dict())
+    assert torch.equal(pooled(images), plain(images))
+    nn.init.normal_(pooled.attention.out_proj.weight)
+    other, again = tiny().eval(), AttentivePool(tiny()).eval()
+    load_trunk(other, pooled.state_dict())
+    load_trunk(again, pooled.state_dict())
+    assert torch.equal(other(images), plain(images)) and torch.equal(again(images), plain(images))
