@@ -331,7 +331,8 @@ def test_rows_that_were_trained_on_are_not_scored_as_held_out(pack: Pack) -> Non
         run = smoke(pack, method=SupervisedConfig(labels=labels))  # type: ignore[arg-type]
         values[labels] = set(evaluate(fresh(run, pack.spec, pack.size), pack, run))
     assert values["train"] - values["train-and-val"] == {
-        f"{m}/knn {task}" for m in ("touch", "vision") for task in ("pattern", "bright")
+        *(f"{m}/knn {task}" for m in ("touch", "vision") for task in ("pattern", "bright")),
+        *(f"{m}/linear {task}" for m in ("touch", "vision", "both") for task in ("pattern", "bright")),
     }
 
 
