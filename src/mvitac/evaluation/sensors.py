@@ -168,7 +168,7 @@ def _colours_of(pack: Pack, number: int) -> GelColours:
     try:
         return learn_colours(pack.images["touch"][unlabelled_rows(pack, number, NUM_IMAGES)])
     except ValueError as error:
-        raise ValueError(f"sensor {pack.sensor_names[number]!r}: {error}: leave --standardise colours out") from None
+        raise ValueError(f"sensor {pack.sensor_names[number]!r}: {error}; or leave --standardise colours out") from None
 
 
 def sensor_records(model: Model, pack: Pack) -> list[dict[str, Any]]:
