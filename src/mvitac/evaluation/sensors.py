@@ -78,7 +78,8 @@ def touch_features(
         models = [with_statistics(model, look, known) if "batch-norm" in standardise else model for look in looks]
 
         def mean(rows: np.ndarray, each: list[tuple[Model, Pack]]) -> np.ndarray:
-            return np.mean([features(m, look, modality, rows, maps=maps) for m, look in each], axis=0, dtype=np.float32)
+            each_look = [features(m, look, modality, rows, maps=maps) for m, look in each]
+            return np.asarray(np.mean(each_look, axis=0, dtype=np.float32))
 
         z = mean(own, each := list(zip(models, looks, strict=True)))
         if "features" in standardise:

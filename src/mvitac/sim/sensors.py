@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -168,13 +168,13 @@ def _random_sensor(seed: int, number: int) -> Sensor:
     angle = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * spread
     dots = [f.name for f in fields(Sensor) if f.name.startswith("marker_")] * int(rng.random() < 0.5)
     plain = ("saturation", "shadow", "dirt", "scratches", "edge", "noise")
-    values = {name: float(within(getattr(s, name) for s in known)) for name in plain}
+    values: dict[str, Any] = {name: float(within(getattr(s, name) for s in known)) for name in plain}
     values |= {name: float(within(getattr(s, name) for s in known if s.marker_pitch_mm)) for name in dots}
     pairs: Any = [
         np.stack([np.maximum(height, 10.0), *place], 1),
         tilt,
         strength[:, None] * np.c_[np.cos(angle), np.sin(angle)],
     ]
-    glow, tilts, response = (tuple(map(tuple, rows.tolist())) for rows in pairs)
+    glow, tilts, response = (cast(Any, tuple(map(tuple, rows.tolist()))) for rows in pairs)
     base = tuple(base.tolist())
     return Sensor(name=f"random{number:04d}", base=base, glow=glow, tilt=tilts, response=response, **values)
