@@ -203,7 +203,7 @@ def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch, name: str
     method = default(MethodConfig, name)
     run = replace(RUN, method=method, encoder=TINY_VIT if method.needs_vit else RUN.encoder)
     plain, compiled = (take(replace(run, compile=c), build(run).train(), [views])["loss"] for c in (False, True))
-    assert torch.equal(plain, compiled)
+    torch.testing.assert_close(plain, compiled)  # not equal: on some CPUs the last digits differ
 
 
 def test_norms_and_biases_are_not_decayed_unless_asked() -> None:

@@ -60,9 +60,9 @@ class IJEPAConfig(MethodConfig):
     """Area of the context block, before the targets are taken out (I-JEPA: .85 to 1)."""
     min_context: int = 10
     """Patches of context that an image should keep (I-JEPA: 10)."""
-    momentum: float = 0.996
+    ema: float = 0.996
     """Momentum of the teacher at the start (I-JEPA: .996)."""
-    momentum_end: float | None = 1.0
+    ema_end: float | None = 1.0
     """Value to which it rises linearly (I-JEPA: 1)."""
     senses: vit.Senses = "own"
     """What a predictor sees. own: the context of its modality. both: also that of the other modality."""
@@ -73,7 +73,7 @@ class IJEPAConfig(MethodConfig):
     """Blocks of the predictor. Default: half of the trunk's, at most 12 (I-JEPA: 6 for ViT-B, 12 for ViT-H)."""
 
     def __post_init__(self) -> None:
-        self.check_fields(share=("momentum", "momentum_end"))
+        self.check_fields(share=("ema", "ema_end"))
         for name, most in (("num_targets", 64), ("min_context", 65536)):
             if not 1 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} {getattr(self, name)}: give 1 to {most}")
@@ -86,10 +86,10 @@ class IJEPAConfig(MethodConfig):
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> IJEPA:
         return IJEPA(self, spec, encoder)
 
-    def momentum_at(self, progress: float) -> float:
+    def ema_at(self, progress: float) -> float:
         """Momentum of the teacher at ``progress`` (0 to 1) of the run."""
-        end = self.momentum if self.momentum_end is None else self.momentum_end
-        return self.momentum + (end - self.momentum) * progress
+        end = self.ema if self.ema_end is None else self.ema_end
+        return self.ema + (end - self.ema) * progress
 
 
 @dataclass(frozen=True)
@@ -217,4 +217,4 @@ class IJEPA(Contrastive):
 
     def after_step(self, progress: float) -> None:
         for modality, trunk in self.trunks.items():
-            self.teachers[modality].follow(vit.vit_of(trunk), self.config.momentum_at(progress))  # type: ignore[operator]
+            self.teachers[modality].follow(vit.vit_of(trunk), self.config.ema_at(progress))  # type: ignore[operator]
