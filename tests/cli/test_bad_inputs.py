@@ -169,7 +169,7 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("trunk", PRETRAIN + "--encoder.trunk resnet81", ["'resnet81'", "did you mean", "resnet18"]),
     ("trunk-empty", PRETRAIN + "--encoder.trunk=", ["trunk ''", "timm"]),
     ("trunk-tag", PRETRAIN + "--encoder.trunk resnet18.nobody_in1k", ["resnet18.nobody_in1k", "tag"]),
-    ("trunk-fixed-size", PRETRAIN + "--encoder.trunk vit_tiny_patch16_224", ["vit_tiny_patch16_224", "32", "224"]),
+    ("trunk-fixed-size", PRETRAIN + "--encoder.trunk mixer_s32_224", ["mixer_s32_224", "32", "224"]),
     ("weights-nowhere", PRETRAIN + "--encoder.weights {tmp}/none.pth", ["{tmp}/none.pth", "imagenet, scratch"]),
     ("weights-tiny", PRETRAIN + "--encoder.weights imagenet", ["mvitac_tiny", "scratch"]),
     ("weights-folder", PRETRAIN + "--encoder.weights {tmp}", ["{tmp}", "a file that exists"]),
@@ -348,6 +348,8 @@ FIELDS = [
     *impossible(replace(recipe("smoke", PackConfig(), phased=False), method=MViTacConfig()), PRETRAIN.strip()),
     *impossible(MaterialsConfig(), "data simulate materials --out {out}"),
 ]
+_SUPERVISED = replace(recipe("smoke", PackConfig(), phased=False), method=SupervisedConfig())
+FIELDS += [row for row in impossible(_SUPERVISED, PRETRAIN + "--method supervised") if " --method." in row[1]]
 FIELDS += [(f"grasps {row[0]}", *row[1:]) for row in impossible(GraspsConfig(), "data simulate grasps --out {out}")]
 
 
@@ -360,7 +362,7 @@ def test_impossible_numbers(refused: Callable[..., str], command: str, says: lis
 def test_reflection_finds_the_fields() -> None:
     options = {row[1].split("{out} ")[1].split()[0] for row in FIELDS}
     assert {"--optim.betas", "--augment.vision.scale", "--method.momentum-end", "--steps", "--touches"} <= options
-    assert not [f.name for f in dataclasses.fields(SupervisedConfig) if f.type in ("int", "float")], "add it above"
+    assert any("--method.rank" in row[1] for row in FIELDS)
 
 
 # -- --from -----------------------------------------------------------------------------------------------------------

@@ -99,7 +99,8 @@ class MaterialsConfig(SimulatedConfig):
             raise ValueError("makes, sensors and held_out_sensor each say which sensors press: give one of them")
         if not 0 <= self.sensors <= 10_000:
             raise ValueError(f"sensors {self.sensors}: give how many to draw, at most 10000, or 0 for the known makes")
-        if not 1 <= self.sensors_per_press <= (num := len(self.choice())):
+        num = len(self.choice())
+        if not 1 <= self.sensors_per_press <= num:
             raise ValueError(f"sensors_per_press {self.sensors_per_press}: give 1 to {num}, the number of sensors")
         if self.sensors_per_press > 1 and self.moments > 1:
             raise ValueError("a press has either several moments or several sensors: leave moments at 1")
