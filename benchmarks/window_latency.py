@@ -45,7 +45,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        config = MaterialsConfig(num=320, touches=4, size=options.size, workers=1)
+        config = MaterialsConfig(num=480, touches=4, size=options.size, workers=1)
         pack = build(config.source(), folder / "pack", size=options.size, quiet=True)
         frame = np.concatenate([np.arange((pack.touch_groups == g).sum()) for g in range(pack.touch_groups.max() + 1)])
         order = np.argsort(np.argsort(pack.touch_groups, kind="stable"))
