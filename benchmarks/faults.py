@@ -56,13 +56,28 @@ COMMANDS = {
     "data shard": "data shard {base}/pack {out}/s --shard-mb 0.02 --quiet",
     "data export-lerobot": "data export-lerobot {base}/pack --out {out}/l",
     "pretrain": f"pretrain {TRAIN} --checkpoint-every 1 --log-every 1 --resume --quiet --out {{out}}/r",
+    "finetune": "finetune {base}/run --data pack --data.path {base}/pack --lr 1e-3 --steps 2 --batch-size 8 --quiet --resume"
+    " --no-from-scratch --out {out}/f",
+    "adapt": "adapt {base}/run --data pack --data.path {base}/pack --steps 2 --batches 1 --quiet --resume --out {out}/r",
     "probe": "probe {base}/run --probes knn --no-controls --json {out}/scores.json",
     "compare": "compare --plan {base}/plan.json --out {out}/c",
     "publish": "publish {base}/run {out}/a",
     "index": "index {base}/pack --model {base}/run --out {out}/i",
     "embed": "embed {base}/pack --model {base}/run --out {out}/e.npz",
     "report": "report {base}/run --out {out}/report --quiet",
+    "bench": "bench {base}/run --suite {base}/suite.toml --data-root {base} --out {out}/b",
 }
+SUITE = f"""
+name = "small"
+title = "Made images"
+probes = ["linear"]
+seed = 0
+untrained = ["external:timm/test_resnet,weights=random,size={SIDE},seed=0"]
+[[sets]]
+name = "table"
+tasks = [{{ name = "kind", modalities = ["touch"] }}]
+forms = [{{ name = "pack", at = {{ path = "pack" }}, data = {{ name = "pack" }} }}]
+"""
 SLOW = ("torch._dynamo", "mvitac.evaluation.evaluate", "mvitac.training.loop")
 """Modules that are imported late."""
 EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link")
@@ -89,6 +104,7 @@ def prepare(base: Path) -> None:
     plan = {"name": "small", "rows": [row], "reference": "MViTac", "recipe": "smoke", "seeds": 1, "probes": ["knn"]}
     data = {"name": "pack", "path": str(base / "pack")}
     (base / "plan.json").write_text(json.dumps({**plan, "data": data}))
+    (base / "suite.toml").write_text(SUITE)
 
 
 def child(work: Callable[[], int | None], said: Path) -> int:

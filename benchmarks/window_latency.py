@@ -16,7 +16,6 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -54,14 +53,7 @@ def main() -> None:
         base = recipe("paper", config)
         base = replace(base, augment=replace(base.augment, size=options.size))
         engines, images = {}, {}
-        variants: list[tuple[int, Literal["stack", "mean"]]] = [
-            (1, "stack"),
-            (2, "stack"),
-            (4, "stack"),
-            (2, "mean"),
-            (4, "mean"),
-        ]
-        for frames, temporal in variants:
+        for frames, temporal in ((1, "stack"), (2, "stack"), (4, "stack"), (2, "mean"), (4, "mean")):
             encoder = EncoderConfig(trunk=options.trunk, weights="scratch", temporal=temporal)
             shown = windowed(pack, Window(frames=frames))
             model = fresh(replace(base, encoder=encoder), shown.spec, options.size)

@@ -115,10 +115,24 @@ def vt60(folder: Path, out: Path) -> None:
     write(rows, out / "vt60.csv", folder, ("vision", "touch"))
 
 
+def wedge_force(folder: Path, out: Path) -> None:
+    """Leave one object out. Mark every third frame (``frame_kept``): neighbours of a video are nearly the same."""
+    rows = read(folder / "manifest.csv")
+    for row in rows:
+        row["frame_kept"] = str(int(int(row["frame"]) % 3 == 0))
+    add_folds(rows, len({row["object"] for row in rows}), by="object", stratum="object", val_every=1)
+    write(rows, out / "wedge_force.csv", folder, ("touch",))
+
+
+def tactip_shear(folder: Path, out: Path) -> None:
+    """Nothing is added."""
+    write(read(folder / "manifest.csv"), out / "tactip_shear.csv", folder, ("touch",))
+
+
 if __name__ == "__main__":
     if len(sys.argv) != 3 or not Path(sys.argv[1]).is_dir():
         sys.exit(f"usage: python {sys.argv[0]} DATA_FOLDER OUT_FOLDER")
-    for make in (slip_grasp, slip_gsmini, physiclear, vt60):
+    for make in (slip_grasp, slip_gsmini, physiclear, vt60, wedge_force, tactip_shear):
         source = Path(sys.argv[1]) / make.__name__
         if (source / "manifest.csv").is_file():
             make(source, Path(sys.argv[2]))

@@ -77,7 +77,7 @@ def test_encoders_page_runs(artifact: Path, pack: Pack, tmp_path: Path, monkeypa
     names: dict[str, Any] = {"__name__": "encoders"}
     page = Path(__file__).parents[1] / "docs/encoders.md"
     code = [source for kind, source in cells(page) if kind == "code"]
-    assert len(code) == 4  # one of each section
+    assert len(code) == 5  # one of each section
     for source in code:
         exec(compile(source, page.name, "exec"), names)
     assert names["features"]["touch"].shape == (72, 64) and names["scores"].mean() > 0.75  # chance is .5

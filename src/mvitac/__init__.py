@@ -17,15 +17,16 @@ if TYPE_CHECKING:
     from mvitac.deploy.scikit_learn import ImageFeatures
     from mvitac.evaluation.evaluate import probe
     from mvitac.model import Model
+    from mvitac.nn.initial import Init
     from mvitac.recipes import recipe
     from mvitac.run import Run
     from mvitac.training.loop import train
 
 __version__ = "0.1.0"
-__all__ = ["ImageFeatures", "Model", "Pack", "PublishedModel", "Run", "load", "probe", "recipe", "train"]
+__all__ = ["ImageFeatures", "Init", "Model", "Pack", "PublishedModel", "Run", "load", "probe", "recipe", "train"]
 
 _HOME = {"Model": "model", "Pack": "data.pack", "Run": "run", "recipe": "recipes", "train": "training.loop"}
-_HOME |= {"probe": "evaluation.evaluate"}
+_HOME |= {"Init": "nn.initial", "probe": "evaluation.evaluate"}
 _HOME |= {"load": "deploy.artifact", "PublishedModel": "deploy.artifact", "ImageFeatures": "deploy.scikit_learn"}
 
 

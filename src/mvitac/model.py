@@ -13,7 +13,7 @@ import json
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import safetensors.torch
 import torch
@@ -23,7 +23,7 @@ from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Target
 from mvitac.methods.base import Method
-from mvitac.nn.encoders import SCRATCH, num_features, timm_trunk
+from mvitac.nn.encoders import SCRATCH, last_map, num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
 from mvitac.registry import from_json, to_json, unknown
@@ -33,6 +33,8 @@ from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, e
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 FORMAT = "mvitac-model"
+BEST = "model.best.safetensors"
+"""Weights of a run that were best on split val, kept with ``Run.eval_every``."""
 EMBED_BATCH = 64
 """Images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px."""
 
@@ -71,6 +73,21 @@ class Model(nn.Module):
         # Not in the state dict: the weights of a run are the same with and without published probes.
         self.readouts: dict[str, LinearProbe] = {}
         self.eval()
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.run.seed
+
+    @property
+    def title(self) -> str:
+        """Name of the method."""
+        return self.run.method.name
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Sides in pixels of the images that probes, and heads trained along, see."""
+        return self.run.augment.eval_size, self.run.augment.size
 
     def __repr__(self) -> str:
         widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())
@@ -128,8 +145,7 @@ class Model(nn.Module):
             raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
 
     def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
-        view = encoder_input(images, self.run.augment.size if for_heads else self.run.augment.eval_size)
-        return self.encoders[modality](view).float()
+        return self.encoders[modality](encoder_input(images, self.sides[for_heads])).float()
 
     def _project(self, modality: str, features: Tensor) -> Tensor:
         if modality not in self.projectors:
@@ -185,6 +201,11 @@ class Model(nn.Module):
         check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
             return self._encode(modality, images, for_heads)
+
+    @torch.no_grad()
+    def last_map(self, modality: str, images: Tensor) -> Tensor:
+        """Places [B, P, D] of the trunk's last map (``nn.encoders.last_map``), of images as in ``features``."""
+        return last_map(self.encoders[modality], encoder_input(images, self.sides[0]))
 
     @torch.no_grad()
     def project(self, modality: str, features: Tensor) -> Tensor:
@@ -324,7 +345,7 @@ class Model(nn.Module):
     def weights_digest(self) -> str:
         """Content address of the weights and of the image size they expect, for caches."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
-        return digest([safetensors_digest(tensors), self.run.augment.eval_size])
+        return digest([safetensors_digest(tensors), self.sides[0]])
 
     def save(self, path: Path) -> None:
         """Write a .safetensors file with the run and the description of the data in its header."""
@@ -341,20 +362,34 @@ class Model(nn.Module):
         write_atomic(path, lambda file: file.write(data))
 
 
+Which = Literal["last", "best"]
+
+
+def weights_file(folder: Path, which: Which) -> Path:
+    """The file of a run's weights; ValueError if the best ones were not kept."""
+    if which == "best" and not (folder / BEST).is_file():
+        raise ValueError(f"{folder} has no {BEST}: train with --eval-every N to keep the best weights, or use the last")
+    return folder / (BEST if which == "best" else "model.safetensors")
+
+
 def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
     """The model of ``run`` before training, initialised from its seed. Used as a control, and to load weights into."""
     torch.manual_seed(run.seed)
     return Model(run.method.build(spec, run.encoder), run, spec, stored)
 
 
-def load(path: str | Path) -> Model:
+def load(path: str | Path, which: Which = "last") -> Model:
     """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
+
+    Args:
+        path: The folder or the file.
+        which: Weights of a run's folder: those after its last step, or the best on split val (``Run.eval_every``).
 
     Raises:
         ValueError: If there is no such model, or the file is damaged or was changed.
     """
     path = Path(path)
-    file = path / "model.safetensors" if path.is_dir() else path
+    file = weights_file(path, which) if path.is_dir() else path
     if not file.is_file():
         hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
         raise ValueError(f"no trained model at {file}{hint}")

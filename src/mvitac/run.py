@@ -14,6 +14,8 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.initial import Init
+from mvitac.nn.vit import check_vit
 from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -40,6 +42,9 @@ class Optim:
     """L2 penalty (adam, sgd) or decoupled weight decay (adamw). The paper gives none."""
     decay_norms: bool = field(default=True, metadata=LATER_IN_DIGEST)
     """Also decay biases and the parameters of BatchNorm. Current practice is not to."""
+    layer_decay: float = field(default=1.0, metadata=LATER_IN_DIGEST)
+    """Learning rate of each layer of a trunk relative to that of the next one, e.g. .65 to train a pretrained ViT further
+    (BEiT, MAE). 1 = the same for all. Heads have the full rate."""
     schedule: Literal["constant", "cosine", "step", "late-step"] = "constant"
     """constant; cosine, to zero; step, x0.9 every 10 epochs from epoch 10 on; or late-step, the same from epoch 20 on (the
     authors' StepLR, which is stepped from epoch 10 on). The paper gives none."""
@@ -55,6 +60,8 @@ class Optim:
             raise ValueError(f"optim eps {self.eps}: give a positive number")
         if not (self.weight_decay >= 0 and math.isfinite(self.weight_decay)):
             raise ValueError(f"optim weight_decay {self.weight_decay}: give a number >= 0")
+        if not 0 < self.layer_decay <= 1:
+            raise ValueError(f"optim layer_decay {self.layer_decay}: give a factor above 0, at most 1")
         if not 0 <= self.warmup < 1:
             raise ValueError(f"optim warmup {self.warmup}: give a fraction of the steps in [0, 1)")
 
@@ -91,6 +98,10 @@ class Run:
     method: MethodConfig = MViTacConfig()
     data: DatasetConfig
     encoder: EncoderConfig = EncoderConfig()
+    init: Init = field(default=Init(), metadata=LATER_IN_DIGEST)
+    renew_norms: int = field(default=0, metadata=LATER_IN_DIGEST)
+    """Batches on which the running statistics of BatchNorm are estimated anew before the first step, for data of another
+    sensor than that of --init. 0 = keep them."""
     augment: Augment = Augment()
     optim: Optim = Optim()
     batch_size: int = 256
@@ -98,7 +109,7 @@ class Run:
     epochs: float = 240.0
     """Passes over the training rows (paper: 240)."""
     steps: int | None = None
-    """Number of steps. If given, epochs is ignored."""
+    """Number of steps. If given, epochs is ignored. 0 is for renew_norms alone."""
     sampler: Literal["shuffle", "one-per-touch", "spread"] = "shuffle"
     """Order of the rows. shuffle: random permutation (paper). The others keep near-duplicates from being negatives of each
     other: spread distributes the rows of a touch group over the whole epoch. one-per-touch takes one row of each group,
@@ -131,8 +142,8 @@ class Run:
     log_every: int = 10
     """Steps between log lines. Each also checks that the loss is finite."""
     eval_every: int = 0
-    """Steps between evaluations (kNN scores, signs of collapse) on held-out groups (split val, never test). 0 = only at the
-    end."""
+    """Steps between evaluations (linear probes, kNN, signs of collapse) on held-out groups (split val, never test). The
+    weights that are best there are kept as model.best.safetensors. 0 = only at the start and the end."""
     checkpoint_every: int = 0
     """Steps between checkpoints. 0 = about every tenth of the run."""
 
@@ -149,7 +160,9 @@ class Run:
             raise ValueError(
                 "positives_within has no effect on same-image positives: choose --positives same-touch, or same-press"
             )
-        if self.steps is not None and self.steps < 1:
+        if not 0 <= self.renew_norms <= 1000:
+            raise ValueError(f"renew_norms {self.renew_norms}: give 0 to 1000 batches")
+        if self.steps is not None and self.steps < (0 if self.renew_norms else 1):
             raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
         if not 0 <= self.seed < 1 << 63:
             raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
@@ -161,7 +174,7 @@ class Run:
 
     def num_steps(self, num_rows: int) -> int:
         """Number of optimiser steps of the whole run on ``num_rows`` training rows."""
-        return self.steps or max(1, round(self.epochs * self.steps_per_epoch(num_rows)))
+        return max(1, round(self.epochs * self.steps_per_epoch(num_rows))) if self.steps is None else self.steps
 
     def steps_per_epoch(self, num_rows: int) -> int:
         """Number of full batches in one epoch. The last short batch is dropped: its queries would have fewer negatives."""
@@ -207,6 +220,8 @@ class Run:
             raise ValueError(
                 "independent_sensors would move the frames of a window apart: leave it out, or give frames 1"
             )
+        if self.method.needs_vit:
+            check_vit(self.encoder, self.method.name, self.augment.size)
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 
@@ -225,8 +240,9 @@ class Run:
         return replace(self, recipe="", method=self.method.without_idle(spec), augment=replace(self.augment, **unseen))
 
     def digest(self) -> str:
-        """Content address of all settings that decide the outcome."""
-        value = to_json(self, for_digest=True)
+        """Content address of all settings that decide the outcome. Start weights count by content, not by path."""
+        init = self.init if self.init.digest else self.init.resolved()
+        value = to_json(replace(self, init=replace(init, path=None)), for_digest=True)
         for name in NOT_IN_DIGEST:
             del value[name]
         for name in self.data.without_effect:

@@ -76,7 +76,7 @@ def test_rows_without_an_image_stay_without(pack: Pack, tmp_path: Path) -> None:
     np.testing.assert_array_equal(both.has("touch"), np.concatenate([pack.has("touch"), holes.has("touch")]))
 
 
-@pytest.mark.parametrize("column", ["sensor", "phase"])
+@pytest.mark.parametrize("column", ["sensor", "lamp", "phase"])
 def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
     """A name here, a number there: of no matter in a column beside, an error in one that says what a task is about."""
 
@@ -97,8 +97,10 @@ def test_columns_matter_that_probes_read(tmp_path: Path, column: str) -> None:
         source = Marked()
         source.mark = mark
         packs.append(build(source, tmp_path / name, size=32, quiet=True))
-    if column == "sensor":
-        assert "sensor" not in JoinedPack(*packs).table.column_names
+    if column == "sensor":  # text on both sides
+        assert JoinedPack(*packs).sensor_names == ("3", "during")
+    elif column == "lamp":
+        assert "lamp" not in JoinedPack(*packs).table.column_names
     else:
         with pytest.raises(ValueError, match=r"columns differ in kind .*phase"):
             JoinedPack(*packs)

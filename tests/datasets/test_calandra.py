@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from mvitac.bench.suite import find_suite, open_set
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
@@ -440,3 +441,13 @@ def test_the_doctor_compares_with_the_published_lists(
     assert told["published: grasps that can be read"]["evidence"] == "25 found, 9296 published"
     assert "calandra_corl2017_000.h5 i3: attribute is_gripping" in told["unreadable items"]["evidence"]
     assert "touch_size: 32 x 24" in told["sensors and resolutions"]["evidence"]
+
+
+def test_the_suite_of_the_bench_tests_every_object_in_one_fold(forty_four: Path, tmp_path: Path) -> None:
+    (tmp_path / "calandra").symlink_to(forty_four)
+    (one,) = find_suite("calandra-v1").sets
+    opened = open_set(replace(one, forms=(replace(one.forms[0], data={**one.forms[0].data, "size": 16}),)), tmp_path)
+    assert not isinstance(opened, str) and len(opened.packs) == 10
+    tested = [view.column("group")[view.rows("test")].tolist() for view in opened.packs]
+    assert sorted(name for fold in tested for name in fold) == sorted(set(opened.packs[0].column("group").tolist()))
+    assert set(opened.packs[0].column("phase")) == {"during"} and opened.packs[0].spec.touch_channels == 6

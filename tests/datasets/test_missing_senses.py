@@ -18,7 +18,7 @@ from mvitac.deploy import search
 from mvitac.deploy.export import ExportConfig, _examples, export
 from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.publish import fit_readouts
-from mvitac.evaluation import probe as probe_module
+from mvitac.evaluation import sensors
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.model import Model, load
@@ -93,13 +93,13 @@ def test_probes_see_only_what_is_there(holes: Pack, tmp_path: Path, monkeypatch:
     run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=1, eval_every=0)
     train(run, tmp_path / "run", quiet=True)
     asked: dict[str, set[int]] = {"vision": set(), "touch": set()}
-    real = probe_module.features
+    real = sensors.features
 
     def features(model: object, pack: Pack, modality: str, rows: np.ndarray, **options: bool) -> np.ndarray:
         asked[modality] |= set(rows.tolist())
         return real(model, pack, modality, rows, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(probe_module, "features", features)
+    monkeypatch.setattr(sensors, "features", features)
     result = probe_runs([tmp_path / "run"], ProbeConfig(tasks=("pattern",)), holes)
     for modality, rows in asked.items():
         assert rows and holes.has(modality)[sorted(rows)].all()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mvitac.bench.suite import find_suite, open_set
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.images import decode, shrink
@@ -392,3 +394,17 @@ def test_genuine_vt60(tmp_path: Path) -> None:
     row = touches[int(sample.columns["seq"])]
     assert [sample.columns[axis] for axis in "xyz"] == [row[axis] for axis in "xyz"]
     assert (sample.touch == shrink(decode(REAL / "vt60" / row["image"]), 32)).all()
+
+
+def test_the_suite_of_the_bench_reads_the_clones(clones: Path, tmp_path: Path) -> None:
+    """By their readers, each group tested once; manifests of copies are the other form."""
+    found = {one.name: one for one in find_suite("real-small-v1").sets}
+    for name in SETS:
+        clone, manifest = found[name].forms
+        (tmp_path / clone.at["path"]).symlink_to(clones / name)
+        small = replace(clone, data={**clone.data, "size": 16})
+        opened = open_set(replace(found[name], folds=2, forms=(small, manifest)), tmp_path)
+        assert not isinstance(opened, str) and opened.form == "clone", name
+        tested = [set(view.column("group")[view.rows("test")].tolist()) for view in opened.packs]
+        assert all(tested) and not tested[0] & tested[1], name
+    assert open_set(found["wedge_force"], tmp_path) == f"{tmp_path / 'wedge_force.csv'} is not there"

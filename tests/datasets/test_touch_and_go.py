@@ -7,6 +7,7 @@ import os
 import resource
 import shutil
 from collections import Counter, defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pyarrow as pa
 import pytest
 from PIL import Image
 
+from mvitac.bench.suite import find_suite, open_set
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
@@ -540,3 +542,25 @@ def test_a_real_recording_without_its_camera_video(tmp_path: Path) -> None:
     assert pack.num == 76 and set(pack.column("label_category")) == {15}  # the folder's name ends in _rock
     shown = dict(frames(SAMPLE / "20220319_002026_rock" / "gelsight.mp4", pack.column("frame"), 32))
     assert all(np.array_equal(shown[n], pack.images["touch"][i]) for i, n in enumerate(pack.column("frame")))
+
+
+def test_the_suite_of_the_bench_reads_both_splits(tree: Path, tmp_path: Path) -> None:
+    (tmp_path / "touch_and_go").symlink_to(tree)
+    small = [
+        replace(one, forms=(replace(f := one.forms[0], data={**f.data, "size": 16}),))
+        for one in find_suite("tag-v1").sets
+    ]
+    by_recording, official = (open_set(one, tmp_path) for one in small)
+    assert not isinstance(by_recording, str) and not isinstance(official, str)
+    shared = []
+    for opened in (by_recording, official):
+        (pack,) = opened.packs
+        assert [task.name for _, task in opened.tasks] == [
+            "category",
+            "soft",
+            "rough",
+        ] and opened.pinned == "not pinned"
+        sides = [set(pack.column("group")[pack.rows(side)].tolist()) for side in ("train", "test")]
+        shared.append(len(sides[0] & sides[1]))
+    assert shared[0] == 0 < shared[1]  # the owners' lists test recordings that are also in train
+    assert by_recording.digests["rows"] != official.digests["rows"]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from sklearn.linear_model import Ridge
 
 from mvitac.evaluation import diagnostics as d
 
@@ -58,3 +60,22 @@ def test_retrieval_by_group() -> None:
 def test_group_means_are_means_of_directions() -> None:
     means = d.group_means(torch.tensor([[2.0, 0.0], [0.0, 5.0]]), torch.tensor([0, 0]))
     assert means[0].tolist() == pytest.approx([math.sqrt(0.5)] * 2)
+
+
+@pytest.mark.parametrize(("rows", "width"), [(60, 8), (40, 64)])
+def test_linear_probe_is_ridge_regression_with_a_chosen_strength(rows: int, width: int) -> None:
+    """Equal to scikit-learn's at one of the strengths, in both forms; a value that half the features carry is found."""
+    rng = torch.Generator().manual_seed(0)
+    x, new = (3 * torch.randn(n, width, generator=rng) + 5 for n in (rows, 30))
+    weight = torch.randn(width, 2, generator=rng)
+    groups = torch.arange(rows) // 4
+    guess = d.linear_probe(x, x @ weight, groups, new)
+    scaled = ((x - x.mean(0)) / (x.std(0) + 1e-6)).double(), ((new - x.mean(0)) / (x.std(0) + 1e-6)).double()
+    expected = [Ridge(alpha=a).fit(scaled[0], (x @ weight).double()).predict(scaled[1]) for a in d.ALPHAS]
+    distances = [np.abs(guess.numpy() - each).max() for each in expected]
+    assert min(distances) < 1e-3 < sorted(distances)[1]
+    assert int(np.argmin(distances)) == 0  # without noise the weakest is best
+    noise = torch.randn(rows, 1, generator=rng)
+    assert float(d.linear_probe(x, noise, groups, new).std()) < 0.5 * float(noise.std())  # and here a strong one
+    broken = torch.cat([x, torch.full((rows, 1), torch.inf)], 1), torch.cat([new, torch.ones(30, 1)], 1)
+    assert torch.isfinite(d.linear_probe(broken[0], x @ weight, groups, broken[1])).all()

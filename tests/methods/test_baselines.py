@@ -366,6 +366,7 @@ def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, conf
     """Also of a task with a split of its own, as rough of Touch and Go's lists, and of rows without the other sense."""
     other = copy.copy(pack)
     other._answers = {}  # type: ignore[misc]
+    other.__dict__.pop("whole", None)  # cached, too
     first, second = pack.spec.tasks
     other.spec = replace(pack.spec, tasks=(first, replace(second, split="split_bright")))
     turned = {"test": "train", "train": "test"}

@@ -229,3 +229,35 @@ def test_running_norm_makes_a_key_independent_of_its_batch() -> None:
         method = build(replace(CONFIG, key_norm=kind)).train()
         whole, part = (method.keys(b)["k", "touch", 1, "intra"][:3] for b in (batch, first))
         assert torch.allclose(whole, part, atol=1e-5) == (kind == "running")
+
+
+@pytest.mark.parametrize("keys", ["momentum", "end-to-end"])
+def test_the_loss_between_sensors_written_out(keys: str) -> None:
+    """One more term beside eq. 14: touch view 0 and view 2, the same press through another sensor, by the intra heads."""
+    plain, method = (build(replace(CONFIG, keys=keys, lambda_sensor=weight)) for weight in (0.0, 0.3))
+    batch = views()
+    torch.manual_seed(8)
+    batch.images["touch"].append(torch.randn(6, 3, 32, 32))
+    query = method.query["touch"]
+    key = query if keys == "end-to-end" else method.key["touch"].module
+    with torch.no_grad():
+        for p in method.key.parameters():  # or confusing keys with queries would go unseen
+            p.add_(0.05 * torch.randn_like(p))
+        expected = slow_info_nce(
+            query.intra(query.trunk(batch.images["touch"][0])), key.intra(key.trunk(batch.images["touch"][2])), 0.07
+        )
+        plain.load_state_dict(method.state_dict())
+        out, without = method(batch), plain(views())
+    assert float(out["sensor"]) == pytest.approx(expected, rel=1e-4)
+    assert float(out["loss"]) == pytest.approx(float(without["loss"]) + 0.3 * expected, rel=1e-4)
+    assert "sensor" not in without
+
+
+def test_the_loss_between_sensors_needs_touch() -> None:
+    vision_only = replace(Toy().spec(), touch_channels=0)
+    config = replace(CONFIG, lambda_sensor=1.0)
+    with pytest.raises(ValueError, match="has no touch"):
+        config.build(vision_only, TINY)
+    assert config.without_idle(vision_only).lambda_sensor == 0 and config.without_idle(Toy().spec()) == config
+    with pytest.raises(ValueError, match="lambda_sensor -1"):
+        replace(CONFIG, lambda_sensor=-1.0)

@@ -18,7 +18,7 @@ from mvitac.sim.contact import contact
 from mvitac.sim.gel import GEL_STIFFNESS, area_resize, background, press, pressure, relax, render
 from mvitac.sim.materials import CLASSES, draw_instance, touch
 from mvitac.sim.relief import KINDS, Relief, draw_tables, noise
-from mvitac.sim.sensors import SENSORS
+from mvitac.sim.sensors import SENSORS, random_sensors
 
 LIST = "import sys; from mvitac.sim.materials import touch; import hashlib; p = touch(3, 7, 2, 1, size=32); "
 PRINT = "print(hashlib.sha256(p['vision'].tobytes() + p['touch'].tobytes()).hexdigest())"
@@ -285,3 +285,75 @@ def test_halving_is_the_area_average_bit_for_bit():
     rows, columns = gel._area_weights(48, 24), gel._area_weights(64, 32)
     general = np.einsum("hH,HWc->hWc", rows, picture).transpose(0, 2, 1).dot(columns.T).transpose(0, 2, 1)
     assert (area_resize(picture, 24, 32) == general).all()
+
+
+def test_random_sensors_lie_round_the_known_ones_and_not_on_the_held_out_one():
+    drawn = random_sensors(0, 300)
+    assert random_sensors(0, 2) == drawn[:2] != random_sensors(1, 2)  # a function of (seed, number)
+    assert len({s.base for s in drawn}) == 300 and not any(s.held_out for s in drawn)
+    known = [s for s in SENSORS.values() if not s.held_out]
+    for name in ("saturation", "shadow", "dirt", "scratches", "edge", "noise"):
+        values, theirs = ([getattr(s, name) for s in some] for some in (known, drawn))
+        margin = 0.25 * (max(values) - min(values))
+        assert min(values) - margin <= min(theirs) < max(theirs) <= max(values) + margin
+    assert 0.4 < np.mean([s.marker_pitch_mm > 0 for s in drawn]) < 0.6
+    angles = np.array([[np.arctan2(y, x) for x, y in s.response] for s in drawn])
+    apart = np.sort(np.mod(angles - angles[:, :1], 2 * np.pi)[:, 1:], axis=1)
+    assert (np.abs(apart - [2 * np.pi / 3, 4 * np.pi / 3]) <= 0.8).all()  # LEDs from three sides, in either order
+    order = np.mod(angles[:, 1] - angles[:, 0], 2 * np.pi) < np.pi
+    assert 0.4 < order.mean() < 0.6
+    slim = np.array(SENSORS["slim"].response)
+    nearest = min(np.linalg.norm(np.array(s.response) - slim) / np.linalg.norm(slim) for s in drawn)
+    assert nearest > 0.05  # no copy of it among the first 300
+
+
+def test_one_press_through_two_sensors_shares_the_imprint_alone():
+    """The same forces and place; another sensor, copy, camera picture."""
+    known = [s for s in SENSORS.values() if not s.held_out]
+    first, second = (touch(0, 4, 1, 0, size=48, sensors=known, through=number) for number in (0, 1))
+    assert digest(first) == digest(touch(0, 4, 1, 0, size=48))  # the first is the press as always
+    assert first["force_n"] == second["force_n"] and first["angle_rad"] == second["angle_rad"]
+    assert len({touch(0, 4, 1, 0, size=16, through=number)["sensor"] for number in range(4)}) == 4
+    one = [replace(known[0], name=name) for name in ("a", "b")]  # alike, so what differs is copy, gain and noise
+
+    def shape(made: dict) -> np.ndarray:
+        levels = made["touch"].astype(float) - made["background"]
+        return (levels - levels.mean((0, 1))).ravel()
+
+    options = {"size": 48, "sensors": one, "background": True}
+    here, again = (shape(touch(0, 4, 1, 0, through=number, **options)) for number in (0, 1))
+    other = shape(touch(0, 4, 1, 1, **options))
+    assert np.corrcoef(here, again)[0, 1] > 0.8 > 0.4 > np.corrcoef(here, other)[0, 1]
+    with pytest.raises(ValueError, match="there are 4 sensors"):
+        touch(0, 4, 1, 0, size=48, through=4)
+
+
+def test_packs_say_which_sensor_pressed_and_old_ones_keep_their_digests():
+    plain = MaterialsConfig(num=40, size=16)
+    assert not {"makes", "sensors", "sensors_per_press"} & set(plain.source().fingerprint())
+    for options in ({"makes": ("digit",)}, {"sensors": 7}, {"sensors_per_press": 2}):
+        assert replace(plain, **options).place() != plain.place()
+    two = replace(plain, makes=("mini", "digit"), sensors_per_press=2).source()
+    rows = [sample.columns for item in range(4) for sample in two.read(item)]
+    assert [{row["sensor"] for row in rows if row["press"] == press} for press in {row["press"] for row in rows}] == [
+        {"mini", "digit"}
+    ] * 4
+    assert len({row["id"] for row in rows}) == 8 == sum(two.samples_per_item()[:4])
+    assert replace(plain, sensors=7).source().read(0)[0].columns["sensor"].startswith("random000")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"makes": ("mimi",)}, "unknown sensor 'mimi'.*did you mean 'mini'"),
+        ({"makes": ("mini",), "sensors": 3}, "give one of them"),
+        ({"sensors": 5, "held_out_sensor": True}, "give one of them"),
+        ({"sensors": -1}, "at most 10000"),
+        ({"sensors_per_press": 5}, "give 1 to 4"),
+        ({"held_out_sensor": True, "sensors_per_press": 2}, "give 1 to 1"),
+        ({"sensors_per_press": 2, "moments": 2}, "leave moments at 1"),
+    ],
+)
+def test_impossible_sensors_are_errors(options: dict, says: str):
+    with pytest.raises(ValueError, match=says):
+        MaterialsConfig(num=40, **options)

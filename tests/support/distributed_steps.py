@@ -10,31 +10,37 @@ from typing import Any
 from torch import Tensor
 
 from mvitac.datasets.base import DatasetConfig
-from mvitac.methods.base import Method
+from mvitac.methods.base import Method, MethodConfig
 from mvitac.methods.cmc import CMCConfig
+from mvitac.methods.ijepa import IJEPAConfig
+from mvitac.methods.mae import MAEConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.recipes import recipe, with_method
 from mvitac.run import Optim, Run
 from mvitac.system.distributed import World
 from mvitac.training import checkpoint
 from mvitac.training.step import Chunk, Step
+from support.small_methods import TINY_VIT
 from support.small_steps import build as build_from
 from support.small_steps import gradients
 
 RUN = replace(
     recipe("smoke"), optim=Optim(name="sgd"), method=MViTacConfig(hidden=24, out=12, head_norm=True), batch_size=12
 )
-METHODS = {
+METHODS: dict[str, MethodConfig] = {
     "mvitac": RUN.method,
     "cmc": CMCConfig(out=12, num_negatives=1500),
     "cmc softmax": CMCConfig(out=12, num_negatives=1500, softmax=True),
     "cmc softmax, 2 negatives": CMCConfig(out=12, num_negatives=2, softmax=True),  # often a process holds neither
+    "mae": MAEConfig(),
+    "ijepa": IJEPAConfig(),
 }
 NUM_ROWS = 601  # of which two processes hold 301 and 300
 
 
 def run_of(method: str) -> Run:
-    return replace(RUN, method=METHODS[method])
+    config = METHODS[method]
+    return replace(RUN, method=config, encoder=TINY_VIT if config.needs_vit else RUN.encoder)
 
 
 def build(method: str = "mvitac") -> Method:

@@ -13,6 +13,7 @@ from mvitac.registry import default
 from support.toy import Toy
 
 TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
+TINY_VIT = EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH)
 ROWS = torch.arange(3, 83)
 
 
@@ -25,7 +26,8 @@ def small(name: str) -> MethodConfig:
 
 def build(name: str, spec: DataSpec | None = None, config: MethodConfig | None = None) -> Method:
     torch.manual_seed(0)
-    method = (config or small(name)).build(spec or Toy().spec(), TINY)
+    config = config or small(name)
+    method = config.build(spec or Toy().spec(), TINY_VIT if config.needs_vit else TINY)
     method.prepare(ROWS)
     return method
 

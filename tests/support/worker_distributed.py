@@ -1,4 +1,4 @@
-"""What one process of test_distributed.py does: main("step", DIR), main("train", PACK, OUT, DIE_AFTER, METHOD)."""
+"""What one process of test_distributed.py does: main("step", DIR), main("train", DATA, OUT, DIE_AFTER, METHOD)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
+from mvitac.datasets.mix import MixConfig
 from mvitac.datasets.pack import PackConfig, StreamConfig
 from mvitac.methods.base import Method
 from mvitac.nn.memory_bank import shard_banks
@@ -37,10 +38,16 @@ def step(folder: Path) -> None:
         torch.save({**made, "resumed": resumed}, here / f"rank{world.rank}.pt")
 
 
-def train(pack: Path, out: Path, die_after: int, name: str) -> None:
-    """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw."""
+def train(place: str, out: Path, die_after: int, name: str) -> None:
+    """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw.
+
+    ``place`` is a pack, a folder "shards", or the parts of a mix with batches of one part.
+    """
+    pack = Path(place)
     shards = StreamConfig(url=str(pack), cache=pack.with_name("cache"), cache_gb=1e-3, window=2)
     data = shards if pack.name == "shards" else PackConfig(path=pack)
+    if "=" in place:
+        data = MixConfig(parts=tuple(place.split()), batches="one-part")
     real, seen = batches.make_views, []
 
     def watched(*args: object) -> object:
@@ -55,5 +62,5 @@ def train(pack: Path, out: Path, die_after: int, name: str) -> None:
 
 
 def main(kind: str, *given: str) -> None:
-    step(Path(given[0])) if kind == "step" else train(Path(given[0]), Path(given[1]), int(given[2]), given[3])
+    step(Path(given[0])) if kind == "step" else train(given[0], Path(given[1]), int(given[2]), given[3])
     dist.destroy_process_group()

@@ -15,6 +15,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.sharding import write_shards
+from mvitac.datasets.mix import MixConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
 from mvitac.recipes import recipe
@@ -23,6 +24,7 @@ from mvitac.training.loop import train
 from mvitac.training.sampler import batches
 from mvitac.training.step import Step
 from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
+from support.mixes import Gel, built
 from support.processes import begin
 from support.small_steps import assert_close, views
 from support.training_runs import power_cut
@@ -114,6 +116,27 @@ def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tm
     first, second = (torch.load(tmp_path / f"straight-rows{r}.pt") for r in (0, 1))
     epoch = [[*chain(*rows)] for rows in (first[:3], second[:3])]  # 60 training rows: three batches of 16 per epoch
     assert len(set(epoch[0])) == len(set(epoch[1])) == 24 and not set(epoch[0]) & set(epoch[1])
+
+
+@pytest.mark.slow
+def test_a_mix_with_parts_that_lack_a_camera_resumes_bit_for_bit(pack: Pack, tmp_path: Path) -> None:
+    built(Gel(num=60), tmp_path / "gel", size=24)
+    parts, straight, cut = f"toy={pack.path}:1 gel={tmp_path / 'gel'}:3", tmp_path / "straight", tmp_path / "cut"
+    together(tmp_path, "train", parts, str(straight), "99", "mvitac")
+    together(tmp_path, "train", parts, str(cut), "3", "mvitac", fails=True)
+    together(tmp_path, "train", parts, str(cut), "99", "mvitac")
+    a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
+    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+    run = loop_run(MixConfig(parts=tuple(parts.split()), batches="one-part"), "mvitac")
+    mix = run.data.open()
+    expected = list(batches(run, mix, run.method.training_rows(mix), 0, 4))
+    seen = [torch.load(tmp_path / f"straight-rows{rank}.pt") for rank in (0, 1)]
+    assert [first + second for first, second in zip(*seen, strict=True)] == [rows.tolist() for rows in expected]
+    assert (
+        {(rows < pack.num).all() for rows in expected}
+        == {(rows < pack.num).any() for rows in expected}
+        == {True, False}
+    )
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
+from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import fresh
 from mvitac.recipes import recipe
@@ -33,6 +34,7 @@ from mvitac.training.loop import Diverged, train
 from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order
 from mvitac.training.validation import evaluate
 from mvitac.training.views import make_views
+from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
 from support.toy import toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
@@ -45,11 +47,12 @@ def straight(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_leaves_the_promised_files(straight: Path) -> None:
     assert {p.name for p in straight.iterdir()} == {
-        *("run.json", "trained_on.safetensors", "log.jsonl", "checkpoint.pt", "model.safetensors")
+        *("run.json", "trained_on.safetensors", "log.jsonl", "checkpoint.pt", "model.safetensors"),
+        "model.best.safetensors",
     }
     lines = [json.loads(line) for line in (straight / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [2, 4, 6, 8]
-    assert [line["step"] for line in lines if "eval" in line] == [4, 8]
+    assert [line["step"] for line in lines if "eval" in line] == [0, 4, 8]
     for line in lines:
         if "loss" in line:
             assert line["loss"] == pytest.approx(sum(line[k] for k in ("vv", "tt", "vt", "tv")), rel=1e-5)
@@ -309,7 +312,7 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
     for modality in ("touch", "vision"):
         assert after[f"{modality}/knn pattern"] > before[f"{modality}/knn pattern"] + 0.1, (before, after)
     for part in ("vv", "tt", "vt", "tv"):
-        assert lines[-2][part] < 0.9 * lines[0][part], part
+        assert lines[-2][part] < 0.9 * lines[1][part], part
 
 
 def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
@@ -328,7 +331,8 @@ def test_rows_that_were_trained_on_are_not_scored_as_held_out(pack: Pack) -> Non
         run = smoke(pack, method=SupervisedConfig(labels=labels))  # type: ignore[arg-type]
         values[labels] = set(evaluate(fresh(run, pack.spec, pack.size), pack, run))
     assert values["train"] - values["train-and-val"] == {
-        f"{m}/knn {task}" for m in ("touch", "vision") for task in ("pattern", "bright")
+        *(f"{m}/knn {task}" for m in ("touch", "vision") for task in ("pattern", "bright")),
+        *(f"{m}/linear {task}" for m in ("touch", "vision", "both") for task in ("pattern", "bright")),
     }
 
 
@@ -500,3 +504,46 @@ def test_last_line_is_the_last_one_about_losses(tmp_path: Path) -> None:
     lines = [{**told, "step": 10}, told, {"step": 20, "eval": {}}, {"step": 21, "eval": {}}, {"step": 22, "eval": {}}]
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"step": 30, "lo')
     assert last_line(tmp_path) == told
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """Simulated presses, each through two sensors."""
+    config = MaterialsConfig(num=40, touches=2, sensors_per_press=2, size=16)
+    return build(config.source(), tmp_path_factory.mktemp("twice") / "p", size=16, quiet=True)
+
+
+def test_the_other_sensors_view_is_of_the_same_press(twice: Pack) -> None:
+    rows = twice.rows("train")
+    run = replace(recipe("smoke", PackConfig(path=twice.path)), augment=Augment(size=16))
+    asked: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
+
+    class Spy(Feed):
+        def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
+            asked[modality].append(rows)
+            return super().__call__(modality, rows)
+
+    def made(run: Run) -> dict[str, list[torch.Tensor]]:
+        cpu = torch.device("cpu")
+        return make_views(run, twice, rows, 2, torch.Generator().manual_seed(0), cpu, Spy(twice, cpu)).images
+
+    plain = made(run)
+    one_more = made(replace(run, method=MViTacConfig(hidden=32, out=16, lambda_sensor=0.5)))
+    assert [len(plain[m]) for m in plain] == [2, 2] and [len(one_more[m]) for m in one_more] == [2, 3]
+    found = asked["touch"][-1]
+    assert np.array_equal(twice.presses[found], twice.presses[rows])
+    assert (twice.sensors[found] != twice.sensors[rows]).all()
+    alone = partners(twice, rows, torch.Generator(), "presses")
+    assert np.array_equal(alone, found)  # two rows a press: the only other one
+
+
+def test_other_sensors_train_and_resume(twice: Pack, pack: Pack, tmp_path: Path) -> None:
+    run = replace(recipe("smoke", PackConfig(path=twice.path)), augment=Augment(size=16), steps=4, eval_every=0)
+    for number, keys in enumerate(("momentum", "end-to-end")):
+        with_loss = replace(run, method=MViTacConfig(hidden=32, out=16, keys=keys, lambda_sensor=0.5))  # type: ignore
+        out = train(with_loss, tmp_path / f"{number}", quiet=True)
+        values = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+        assert all(v["sensor"] > 0 for v in values if "vv" in v) and any("vv" in v for v in values)
+    with pytest.raises(ValueError, match=r"simulate with --data\.sensors-per-press 2"):
+        train(smoke(pack, method=MViTacConfig(lambda_sensor=1.0)), tmp_path / "none", quiet=True)
+    assert not (tmp_path / "none" / "run.json").exists()

@@ -18,11 +18,12 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.encoders import draws_random_numbers
 from mvitac.recipes import recipe
+from mvitac.registry import default, to_json
 from mvitac.run import Optim, Run
 from mvitac.system import processes
 from mvitac.training.loop import train
 from mvitac.training.step import Step, build_optimiser
-from support.small_methods import small
+from support.small_methods import TINY_VIT, small
 from support.small_steps import RUN, assert_close, build, gradients, split, views
 
 CPU = torch.device("cpu")
@@ -68,13 +69,14 @@ CHUNKED = [
     *[(small("mvitac"), size) for size in (2, 4, 6)],
     (replace(small("mvitac"), losses=("vv", "vt")), 4),
     *[(small(name), 4) for name in ("cmc", "ssvtp", "simclr", "moco", "mct", "byol", "dino", "vicreg")],
+    *[(small(name), 4) for name in ("mae", "ijepa")],
 ]
 
 
 @pytest.mark.parametrize(("config", "size"), CHUNKED, ids=lambda value: getattr(value, "name", value))
 def test_gradient_caching_is_exact_without_batchnorm_statistics(config: MethodConfig, size: int) -> None:
     """With BatchNorm in eval mode no pair sees another: cached in any chunks = direct, losses, gradients and memory."""
-    run = replace(RUN, method=config)
+    run = replace(RUN, method=config, encoder=TINY_VIT if config.needs_vit else RUN.encoder)
     direct, cached = build(run, norm=False), build(run, norm=False)
     a = take(run, direct, [lambda: views()])
     b = take(run, cached, split(views(), size))
@@ -194,12 +196,14 @@ def test_networks_with_dropout_are_not_side_by_side() -> None:
     assert not draws_random_numbers(build(replace(RUN, method=MViTacConfig())))
 
 
-def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["mvitac", *[pytest.param(name, marks=pytest.mark.slow) for name in ("mae", "ijepa")]])
+def test_a_compiled_step_is_one_graph(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """As ``--compile`` asks torch for it; without machine code, which takes a minute."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
-    run = replace(RUN, method=MViTacConfig())
+    method = default(MethodConfig, name)
+    run = replace(RUN, method=method, encoder=TINY_VIT if method.needs_vit else RUN.encoder)
     plain, compiled = (take(replace(run, compile=c), build(run).train(), [views])["loss"] for c in (False, True))
-    assert torch.equal(plain, compiled)
+    torch.testing.assert_close(plain, compiled)  # not equal: on some CPUs the last digits differ
 
 
 def test_norms_and_biases_are_not_decayed_unless_asked() -> None:
@@ -213,3 +217,30 @@ def test_norms_and_biases_are_not_decayed_unless_asked() -> None:
         build_optimiser(optim, network).step()  # type: ignore[arg-type]
         kept = {name for name, p in network.named_parameters() if bool((p == 1).all())}
         assert kept == (set() if decay_norms else {"0.bias", "1.weight", "1.bias", "3.bias"})
+
+
+@pytest.mark.parametrize("decay_norms", [True, False])
+def test_layers_nearer_the_images_learn_more_slowly(decay_norms: bool) -> None:
+    """layer_decay .5: decoders at full rate, the last block and its norm at half of it, the one before at half of that."""
+    run = replace(RUN, method=small("mae"), encoder=TINY_VIT)
+    optim = Optim(name="sgd", betas=(0.0, 0.9), layer_decay=0.5, weight_decay=0.1, decay_norms=decay_norms)
+    method = build(run)
+    before = {name: p.clone() for name, p in method.named_parameters()}
+    step = Step(replace(run, optim=optim), method, CPU)
+    step([views], lr=1e-2, seed=0, progress=0.5)
+    shares = {"norm.": 0.5, "blocks.1.": 0.5, "blocks.0.": 0.25, "patch_embed.": 0.125, "pos_embed": 0.125}
+    for name, p in method.named_parameters():
+        layer = name.removeprefix("trunks.vision.").removeprefix("trunks.touch.")
+        share = 1.0 if "decoders" in name else next(s for start, s in shares.items() if layer.startswith(start))
+        decay = 0.1 if p.ndim > 1 or decay_norms else 0.0
+        assert p.grad is not None
+        expected = before[name] - 1e-2 * share * (p.grad + decay * before[name])
+        torch.testing.assert_close(p.detach(), expected, rtol=1e-5, atol=1e-7, msg=name)
+    with pytest.raises(ValueError, match=r"layer_decay 1\.5: give a factor above 0, at most 1"):
+        Optim(layer_decay=1.5)
+
+
+def test_a_layer_decay_of_one_is_not_part_of_the_record() -> None:
+    assert replace(RUN, optim=Optim(layer_decay=1.0)).digest() == replace(RUN, optim=Optim()).digest()
+    assert replace(RUN, optim=Optim(layer_decay=0.9)).digest() != replace(RUN, optim=Optim()).digest()
+    assert "layer_decay" not in str(to_json(RUN, for_digest=True))

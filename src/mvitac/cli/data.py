@@ -19,6 +19,7 @@ from mvitac.data.sharding import write_shards
 from mvitac.data.spec import Task, Window
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.lerobot.writer import write_lerobot
+from mvitac.datasets.mix import open_packs
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.registry import default, unknown
 from mvitac.system.files import check_place, write_atomic
@@ -185,17 +186,17 @@ def shard(argv: list[str]) -> None:
 class _InfoOptions:
     """The splits of a pack: rows, groups and the most frequent class of each task."""
 
-    pack: Positional[Path]
-    """Folder of the pack."""
+    pack: Positional[tuple[str, ...]]
+    """Folder of the pack. Several, each FOLDER or NAME=FOLDER, are taken as one (--data mix)."""
     json: Path | None = None
     """Also write what is printed to this file; - = stdout, and the table to stderr."""
 
 
 def info(argv: list[str]) -> None:
-    """mvitac data info PACK [--json FILE]"""
+    """mvitac data info PACK [PACK ...] [--json FILE]"""
     options = parse(_InfoOptions, argv, "data info")
     check_json(options.json)
-    pack = Pack(options.pack)
+    pack = open_packs(options.pack)
     found, say = _describe(pack), console(options.json)
     stored = "" if pack.store == "raw" else f", JPEG of quality {pack.meta['quality']}"
     title = f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px{stored}"
@@ -272,8 +273,8 @@ def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:
 class _ShowOptions:
     """A few pairs of every class or object, to check by eye."""
 
-    pack: Positional[Path]
-    """Folder of the pack."""
+    pack: Positional[tuple[str, ...]]
+    """Folder of the pack. Several, each FOLDER or NAME=FOLDER, are taken as one (--data mix)."""
     by: str = ""
     """Task or table column, one strip per value (default: the first task, else the group)."""
     split: str = ""
@@ -291,9 +292,9 @@ class _ShowOptions:
 
 
 def show(argv: list[str]) -> None:
-    """mvitac data show PACK [--by TASK|COLUMN] [--out FILE.png|FILE.html]"""
+    """mvitac data show PACK [PACK ...] [--by TASK|COLUMN] [--out FILE.png|FILE.html]"""
     options = parse(_ShowOptions, argv, "data show")
-    out = options.out or Path(f"{options.pack.resolve().name}.png")
+    out = options.out or Path(f"{'-'.join(Path(one).resolve().name for one in options.pack) or 'pack'}.png")
     if out.suffix.lower() not in (".png", ".html"):
         raise ValueError(f"--out {out}: give a name that ends in .png or .html")
     if not 16 <= options.side <= 1024:
@@ -303,7 +304,7 @@ def show(argv: list[str]) -> None:
     from mvitac.report import contact_sheet
 
     check_place(out)
-    pack = Pack(options.pack)
+    pack = open_packs(options.pack)
     found, num_all = contact_sheet.strips(
         pack, options.by, split=options.split, num=options.num, limit=options.limit, seed=options.seed
     )

@@ -12,11 +12,12 @@ from rich.text import Text
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, console, parse, save_json, selectors, short
-from mvitac.data.checks.examine import examine_pack, examine_source
+from mvitac.data.checks.examine import examine_open, examine_pack, examine_source
 from mvitac.data.checks.finding import exit_code
 from mvitac.data.image_grid import Block, draw
 from mvitac.data.spec import Window
 from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.mix import open_packs
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
 from mvitac.system.files import check_place, write_atomic
@@ -40,8 +41,9 @@ class _Options:
 
 @dataclass(frozen=True, kw_only=True)
 class _PackOptions(_Options):
-    pack: Positional[Path]
-    """Folder of the pack; for a source that is not packed yet: mvitac data check --data NAME ..."""
+    pack: Positional[tuple[str, ...]]
+    """Folder of the pack, or of several (FOLDER or NAME=FOLDER) as one; for a source that is not packed yet: mvitac data
+    check --data NAME ..."""
     num_frames: int = 1
     """Also check that the pack has windows of so many frames: their rate, gaps and length."""
     stride: float = 1.0
@@ -62,13 +64,15 @@ class _SourceOptions(_Options):
 
 
 def check(argv: list[str]) -> int:
-    """mvitac data check PACK | --data NAME ... [--json FILE] [--sheet FILE.png]"""
+    """mvitac data check PACK [PACK ...] | --data NAME ... [--json FILE] [--sheet FILE.png]"""
     chosen, rest = selectors(argv, ("--data",))
     if "--data" not in chosen:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         _check_places(options)
         window = Window(frames=options.num_frames, stride=options.stride, order=options.order)
-        return _report(str(options.pack), *examine_pack(options.pack, window), options)
+        if len(options.pack) == 1:
+            return _report(options.pack[0], *examine_pack(options.pack[0], window), options)
+        return _report(" + ".join(options.pack), *examine_open(open_packs(options.pack), window), options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
     rest = short(rest)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional
@@ -11,11 +11,13 @@ from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, chosen, probe_runs
+from mvitac.evaluation.external_encoders import about_lines
 from mvitac.evaluation.robustness import STRESSES, stress
 from mvitac.evaluation.scores import summarise, summarise_again
+from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.model import load
 from mvitac.report.report import write_report
-from mvitac.report.tables import print_retrieval, print_summary
+from mvitac.report.tables import print_retrieval, print_sensors, print_summary
 from mvitac.system.console import Console
 from mvitac.system.files import read_json
 from mvitac.system.progress import shown, work
@@ -25,8 +27,11 @@ from mvitac.system.progress import shown, work
 class _ProbeOptions:
     """Score frozen features by linear probes, kNN and retrieval, each next to its controls."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Positional[tuple[Path, ...]] = ()
     """Folder of each finished run: seeds of one method, or several methods, on the same data."""
+    encoder: tuple[str, ...] = ()
+    """Other people's encoders to probe on --on, e.g. external:timm/NAME, external:sparsh:FILE or external:FILE.onnx
+    (docs/encoders.md)."""
     config: Annotated[ProbeConfig, tyro.conf.arg(name="")] = ProbeConfig()
     on: Path | None = None
     """Probe on this pack instead of the data the runs were trained on."""
@@ -35,6 +40,8 @@ class _ProbeOptions:
     without labels."""
     allow_leak: bool = False
     """Score a run also on rows or groups of --on that it was trained on. LEAK stands beside every such score."""
+    weights: Literal["last", "best"] = "last"
+    """Weights after the last step, or the best on split val, which training keeps with --eval-every."""
     stress: bool = False
     """Also use 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and report the
     gain of a split that leaks groups."""
@@ -44,16 +51,20 @@ class _ProbeOptions:
 
 
 def probe(argv: list[str]) -> None:
-    """mvitac probe RUN... [--on PACK] [--learn-on PACK] [--json FILE]"""
+    """mvitac probe RUN... [--encoder external:...] [--on PACK] [--learn-on PACK] [--json FILE]"""
     options = parse(_ProbeOptions, argv, "probe")
     check_json(options.json)
     pack = Pack(options.on) if options.on else None
     if options.learn_on:
         if not pack:
             raise ValueError("--learn-on fits the probes: name the pack on which they are scored, --on PACK")
-        pack = JoinedPack(Pack(options.learn_on), pack)
+        join = RecolouredPack if "colours" in options.config.standardise else JoinedPack
+        pack = join(Pack(options.learn_on), pack)
+    elif "colours" in options.config.standardise:
+        raise ValueError("--standardise colours shows a new sensor as one of --learn-on: name that pack as well")
     with shown(Console(stderr=True)):
-        result = probe_runs(options.runs, options.config, pack, allow_leak=options.allow_leak)
+        more = {"allow_leak": options.allow_leak, "weights": options.weights, "encoders": options.encoder}
+        result = probe_runs(options.runs, options.config, pack, **more)
     say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
     print_summary(result, say, probe=options.config.probes[0])
     for kind in options.config.probes[1:]:
@@ -62,7 +73,10 @@ def probe(argv: list[str]) -> None:
     for kind in STRESSES:
         if mine := [r for r in stressed if r["probe"] == kind]:
             print_summary({**result, "summary": summarise(mine + majority, kind)}, say, probe=kind)
+    for line in about_lines(result["encoders"]):
+        say.print(f"encoder: {line}")
     print_retrieval(result, say)
+    print_sensors(result, say)
     result["records"] += stressed
     save_json(options.json, result)
 
@@ -74,9 +88,9 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
     for i, path in enumerate(options.runs, start=1):
         what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
         with shown(Console(stderr=True)), work(what):
-            model = load(path)
+            model = load(path, options.weights)
             data = pack or model.open_data()
-            own = {"source": names.get(str(path), ""), "seed": model.run.seed, "run": str(path)}
+            own = {"source": names.get(str(path), ""), "seed": model.seed, "run": str(path)}
             leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
             records += [
                 {**own, **r, "leak": leaks[r["task"]]}

@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from mvitac.system.terminal import plain_output
 
@@ -27,8 +28,13 @@ how good the features are.
   data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
   data export-lerobot  write a PACK as a LeRobotDataset v3
   pretrain             pre-train encoders (--method, --data, --recipe)
+  finetune MODEL       train its encoders with labels, next to controls
+  adapt MODEL          go on without labels on the data of a new sensor
   probe RUN...         linear probes next to their controls
   compare              many runs into the paper's tables (--plan NAME or FILE)
+  bench MODEL          any encoder on a fixed suite of tasks, as one JSON file
+  bench board FILE...  a page that compares such results
+  bench check FILE...  check their digests and sums
   report RUN...        one HTML page with curves, tables and pictures
   publish RUN OUT      weights, probes, model card: one folder, or on the Hub
   export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
@@ -57,8 +63,13 @@ COMMANDS = {
     "data show": "data:show",
     "data export-lerobot": "data:export_lerobot",
     "pretrain": "pretrain:pretrain",
+    "finetune": "finetune:finetune",
+    "adapt": "finetune:adapt",
     "probe": "evaluate:probe",
     "compare": "compare:compare",
+    "bench": "bench:bench",
+    "bench board": "bench:board",
+    "bench check": "bench:check",
     "report": "evaluate:report",
     "publish": "deploy:publish",
     "export": "deploy:export",
@@ -133,15 +144,27 @@ def _run(arguments: list[str]) -> int:
         return 0
     name, rest = arguments[0], arguments[1:]
     _check_once(rest)
-    if name == "data":
-        name, rest = f"data {rest[0]}", rest[1:]
+    if name == "data" or (rest and f"{name} {rest[0]}" in COMMANDS):
+        name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in COMMANDS:
         from mvitac.registry import unknown
 
         raise unknown("command", name, COMMANDS)
+    text = help_file(name)
+    if rest in (["--help"], ["-h"]) and text.exists():
+        print(text.read_text(encoding="utf-8"), end="")
+        return 0
     module, function = COMMANDS[name].split(":")
     _check_memory()
     return getattr(importlib.import_module(f"mvitac.cli.{module}"), function)(rest) or 0
+
+
+def help_file(command: str) -> Path:
+    """The stored help of ``command``, 80 columns wide: it is printed at once, without importing torch.
+
+    The files are what each command says of itself (``tests/cli/test_help.py`` compares and writes them).
+    """
+    return Path(__file__).parent / "help" / f"{command.replace(' ', '-')}.txt"
 
 
 def _reader_left() -> bool:

@@ -1,5 +1,6 @@
 """``mvitac pretrain``."""
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -30,10 +31,11 @@ class _Options:
 
 
 def pretrain(argv: list[str]) -> None:
-    """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [fields] --out DIR [--resume]"""
+    """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [--init RUN] [fields] --out DIR [--resume]"""
     chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger", "--sink"))
     if "--sink" in chosen:  # the name of --logger in 0.1.0
         chosen.setdefault("--logger", chosen["--sink"])
+    rest = [re.sub(r"^--init(?==|$)", "--init.path", word) for word in rest]
     base = _chosen_run(chosen, phased=False)
     if not asks_help(rest):
         _check_data_is_named(chosen)
@@ -44,6 +46,7 @@ def pretrain(argv: list[str]) -> None:
       --data {"|".join(DatasetConfig.choices)}  (required)
       --method {"|".join(MethodConfig.choices)}  (default mvitac)
       --from RUN.JSON   repeat a recorded run instead
+      --init RUN        start from its weights (also an artifact, or a .safetensors file)
       --logger {"|".join(LOGGERS)}   also log there (extras; none by default)
     """
     usual = _Options(run=base, out=Path("runs") / f"{base.data.name}-{base.method.name}-{base.recipe}")

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pyarrow as pa
 
-from mvitac.data.jpeg import Lazy
+from mvitac.data.mixed_pack import MixedImages
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.registry import unknown
@@ -46,7 +46,10 @@ class JoinedPack(Pack):
             controls={name: given for name, given in learn.spec.controls.items() if theirs.get(name) == given},
             notes=tuple(dict.fromkeys((*learn.spec.notes, *score.spec.notes))),
         )
-        self.images: dict[str, Images] = {m: _Both(learn.images[m], score.images[m]) for m in self.spec.modalities}
+        self.images: dict[str, Images] = {
+            m: MixedImages([learn.images[m], score.images[m]], self.size, self.spec.channels(m))
+            for m in self.spec.modalities
+        }
         group = self.column("group").astype(str)
         for task in self.spec.all_tasks:
             seen = np.isin(self.column(task.split), ["train", "val"])
@@ -96,21 +99,6 @@ def _targets(task: AnyTask) -> str:
     return ", ".join(f"{target.name} in {target.unit}" for target in task.targets)
 
 
-class _Both(Lazy):
-    """The images of one pack followed by those of another."""
-
-    def __init__(self, first: Images, second: Images) -> None:
-        _, height, width, channels = first.shape
-        super().__init__((len(first) + len(second), height, width, channels))
-        self.first, self.second = first, second
-
-    def _made(self, rows: np.ndarray) -> np.ndarray:
-        images = np.empty((len(rows), *self.shape[1:]), np.uint8)
-        early = rows < len(self.first)
-        images[early], images[~early] = self.first[rows[early]], self.second[rows[~early] - len(self.first)]
-        return images
-
-
 def _side(pack: Pack, tasks: list[tuple[AnyTask, AnyTask]], splits: set[str], name: str, keep: set[str]) -> pa.Table:
     """Return the columns of ``pack`` that probes read.
 
@@ -128,6 +116,7 @@ def _side(pack: Pack, tasks: list[tuple[AnyTask, AnyTask]], splits: set[str], na
     columns["id"] = pa.array([f"{name}/{one}" for one in columns["id"].to_pylist()])
     for column in splits:
         columns[column] = pa.array([s if s in keep else "hidden" for s in pack.table.column(column).to_pylist()])
+    columns["sensor"] = pa.array(np.array(pack.sensor_names)[pack.sensors])
     for modality in pack.spec.modalities:
         columns[f"has_{modality}"] = pa.array(pack.has(modality))
     own = {task.name: task for task in pack.spec.tasks}

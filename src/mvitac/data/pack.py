@@ -15,8 +15,9 @@ from __future__ import annotations
 import functools
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -56,6 +57,8 @@ class Pack:
     format: ClassVar[str] = FORMAT
     window: int = 0
     """Number of shards whose rows training mixes at a time; 0 = all rows (shards: ``data/streaming.py``)."""
+    parts: Mapping[str, Pack] = MappingProxyType({})
+    """Name -> pack, for several packs that are opened as one (``data/mixed_pack.py``)."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
         """Open and check the pack at ``path``; ``verify`` also recomputes the image digests (about 1 s per GB)."""
@@ -175,6 +178,11 @@ class Pack:
         name = f"has_{modality}"
         return self.column(name) if name in self.table.column_names else np.ones(self.num, bool)
 
+    @functools.cached_property
+    def whole(self) -> np.ndarray:
+        """bool [N], rows with an image of every modality of their dataset."""
+        return np.logical_and.reduce([self.has(modality) for modality in self.spec.modalities])
+
     def rows(
         self, *splits: str, only: dict[str, str] | None = None, having: Sequence[str] = (), by: str = "split"
     ) -> np.ndarray:
@@ -240,6 +248,20 @@ class Pack:
                 " with --data.moments 2, or use same-touch where a touch group is the frames of one press"
             )
         return np.unique(self.column("press").astype(str), return_inverse=True)[1]
+
+    @functools.cached_property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the touch sensors (column sensor), sorted. Without the column, all rows are of one sensor."""
+        if "sensor" not in self.table.column_names:
+            return (self.spec.name,)
+        return tuple(np.unique(self.column("sensor").astype(str)).tolist())
+
+    @functools.cached_property
+    def sensors(self) -> np.ndarray:
+        """int64 [N], number of each row's touch sensor in ``sensor_names``."""
+        if "sensor" not in self.table.column_names:
+            return np.zeros(self.num, np.int64)
+        return np.searchsorted(self.sensor_names, self.column("sensor").astype(str))
 
     @functools.cached_property
     def _rows_by(self) -> dict[str, list[np.ndarray]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -16,8 +17,9 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import LATER, LATER_IN_DIGEST
+from mvitac.registry import LATER, LATER_IN_DIGEST, unknown
 from mvitac.sim import grasps, materials
+from mvitac.sim.sensors import SENSORS, Sensor, random_sensors
 
 LICENCE = "Apache-2.0 (made by this package)"
 CONTACT = {"depth": ["depth_mm"], "position": ["contact_x_mm", "contact_y_mm"], "patch": ["patch_mm2"]}
@@ -74,13 +76,41 @@ class MaterialsConfig(SimulatedConfig):
     """Rows per touch: moments of one press, which differ in a little movement, force and noise (for same-press)."""
     difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
     """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
+    makes: tuple[str, ...] = field(default=(), metadata=LATER_IN_DIGEST)
+    """Names of the sensors to press with (mvitac.sim.sensors). Default: all that are not held out."""
+    sensors: int = field(default=0, metadata=LATER_IN_DIGEST)
+    """Press with this many sensors drawn at random instead (palette, LED directions, dots, response). 0 = known makes."""
+    sensors_per_press: int = field(default=1, metadata=LATER_IN_DIGEST)
+    """Rows per touch: the same spot pressed with so many different sensors (for lambda_sensor)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check_sensors()
         if self.touches < 1:
             raise ValueError(f"touches {self.touches}: give touches per instance, at least 1")
         if not 1 <= self.moments <= 1000:
             raise ValueError(f"moments {self.moments}: give moments per touch, 1 to 1000")
+
+    def _check_sensors(self) -> None:
+        for name in self.makes:
+            if name not in SENSORS:
+                raise unknown("sensor", name, SENSORS)
+        if bool(self.makes) + bool(self.sensors) + self.held_out_sensor > 1:
+            raise ValueError("makes, sensors and held_out_sensor each say which sensors press: give one of them")
+        if not 0 <= self.sensors <= 10_000:
+            raise ValueError(f"sensors {self.sensors}: give how many to draw, at most 10000, or 0 for the known makes")
+        num = len(self.choice())
+        if not 1 <= self.sensors_per_press <= num:
+            raise ValueError(f"sensors_per_press {self.sensors_per_press}: give 1 to {num}, the number of sensors")
+        if self.sensors_per_press > 1 and self.moments > 1:
+            raise ValueError("a press has either several moments or several sensors: leave moments at 1")
+
+    def choice(self) -> tuple[Sensor, ...]:
+        """The sensors that a touch chooses from."""
+        if self.sensors:
+            return random_sensors(self.seed, self.sensors)
+        named = self.makes or [s.name for s in SENSORS.values() if s.held_out == self.held_out_sensor]
+        return tuple(SENSORS[name] for name in named)
 
     def source(self) -> Source:
         return Materials(self)
@@ -117,30 +147,33 @@ class Materials(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         known = self.config._fingerprint(materials.VERSION)
-        later = {"difference": False, "moments": 1}  # omitted at their defaults, to keep old digests valid
+        # omitted at their defaults, to keep old digests valid
+        later = {"difference": False, "moments": 1, "makes": (), "sensors": 0, "sensors_per_press": 1}
         return {k: v for k, v in known.items() if k not in later or v != later[k]}
 
     def samples_per_item(self) -> list[int]:
-        return [self.config.moments] * self.config.num
+        return [self.config.moments * self.config.sensors_per_press] * self.config.num
 
     def _address(self, item: int) -> tuple[int, int, int]:
         num_classes, touches = len(materials.CLASSES), self.config.touches
         return item % num_classes, item // num_classes // touches, item // num_classes % touches
 
     def read(self, item: int) -> list[Sample]:
-        return [self._moment(*self._address(item), moment) for moment in range(self.config.moments)]
+        numbers = product(range(self.config.moments), range(self.config.sensors_per_press))
+        return [self._moment(*self._address(item), moment, through) for moment, through in numbers]
 
-    def _moment(self, category: int, instance: int, touch: int, moment: int) -> Sample:
+    def _moment(self, category: int, instance: int, touch: int, moment: int, through: int) -> Sample:
         made = materials.touch(
             self.config.seed,
             category,
             instance,
             touch,
             size=self.config.size,
-            held_out_sensor=self.config.held_out_sensor,
             background=self.config.difference,
             moment=moment,
             measured=self.config.contact,
+            sensors=self.config.choice(),
+            through=through,
         )
         labels = {f"label_{task}": int(made.pop(task)) for task in ("category", "soft", "rough")}
         vision, pressed = made.pop("vision"), made.pop("touch")
@@ -148,8 +181,8 @@ class Materials(Source):
             pressed = difference(pressed, made.pop("background"))
         group = f"{category:02d}-{instance:04d}"
         name, press = f"{group}-{touch:02d}", {}
-        if self.config.moments > 1:
-            name, press = f"{name}-{moment:02d}", {"press": name}
+        if self.config.moments > 1 or self.config.sensors_per_press > 1:
+            name, press = f"{name}-{moment + through:02d}", {"press": name}
         # Of 20 instances of a class, 4 are in test and 3 in val. Instances are independent, so any fixed rule is fair.
         split = "test" if instance % 20 in (2, 7, 12, 17) else "val" if instance % 20 in (5, 10, 15) else "train"
         columns = {"id": name, "group": group, "touch_group": group, **press, "split": split, **labels, **made}

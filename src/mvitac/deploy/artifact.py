@@ -81,12 +81,13 @@ class PublishedModel(Model, ModelHubMixin):
             shutil.copyfile(self.folder / name, save_directory / name)
 
 
-def load(path: str | Path) -> Model:
+def load(path: str | Path, which: models.Which = "last") -> Model:
     """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
     Args:
-        path: folder of a run or an artifact, or "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is
-            no folder here is looked up on the Hub.
+        path: folder of a run or an artifact, "external:..." for an encoder of other people (``mvitac.external``), or
+            "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is no folder here is looked up there.
+        which: weights of a run: "last", or "best" on split val (kept with ``--eval-every``).
 
     Raises:
         ValueError: nothing is there, or it is damaged.
@@ -95,12 +96,16 @@ def load(path: str | Path) -> Model:
         model = mvitac.load("artifacts/first")
         probabilities = model.predict(vision=photo, touch=press)
     """
+    if isinstance(path, str) and path.startswith("external:"):
+        from mvitac.external import load_external
+
+        return load_external(path)
     local = Path(path)
     found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
     if found and not local.exists() and not local.parent.is_dir():
         return read(pull(found["repo"], found["revision"]))
-    return read(local) if (local / MANIFEST).is_file() else models.load(local)
+    return read(local) if (local / MANIFEST).is_file() else models.load(local, which)
 
 
 def pull(repo: str, revision: str | None = None, **options: Any) -> Path:

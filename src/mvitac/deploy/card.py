@@ -30,11 +30,23 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
         "## Data",
         "",
         *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
+        *_start(manifest.get("start")),
         "The configuration, library versions and commit are in run.json.",
         "",
     ]
     about = _about(model, learned["name"], data["name"], manifest["scores"])
     return "\n".join([*header, *about, *_usage(manifest["preprocessing"]), *end])
+
+
+def _start(start: dict[str, Any] | None) -> list[str]:
+    """A line on the weights that training started from, as its record says; nothing without them."""
+    if not start:
+        return []
+    parts = [f"{modality} {' and '.join(names)}" for modality, names in start["taken"].items()]
+    return [
+        f"Started from the weights of {start['name']} (sha256 {start['digest']}): {', '.join(parts)}. They were trained"
+        f" on: {', '.join(start['trained_on'])}. The data's licences above are not theirs."
+    ]
 
 
 def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> list[str]:

@@ -20,7 +20,7 @@ from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
-from mvitac.evaluation.probe import ProbeSplit, score_predictions, score_rows, split_rows
+from mvitac.evaluation.probe import ProbeSplit, scorable, score_predictions, score_rows, split_rows
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.value_scores import error_by_range
@@ -57,15 +57,6 @@ def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]
             found += [fitted] if fitted else []
             advance()
     return found
-
-
-def _scorable(pack: Pack, task: AnyTask) -> bool:
-    """Whether the task has labelled rows in train and test."""
-    try:
-        split_rows(pack, task)
-    except ValueError:
-        return False
-    return True
 
 
 def _fit_readout(
@@ -182,7 +173,7 @@ def with_readouts(model: Model, pack: Pack | None = None) -> Model:
 
 def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tuple[list[Source] | None, dict[str, Any]]:
     """Fit the probes of ``model``; returns what it learned from, if that is known, and the scores of ``_scores``."""
-    tasks = {task.name: task for task in pack.spec.all_tasks if _scorable(pack, task)}
+    tasks = {task.name: task for task in scorable(pack)}
     learned, scored = check_unseen([run], [model], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
     fitted = _fit_all(model, pack)
     for readout, record in fitted:
@@ -219,7 +210,8 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         write_json(partial / "run.json", record)
         if learned is not None:
             write_sources(partial, learned)
-        manifest = {**_describe(model, pack), "scores": scores}
+        start = {"start": start} if (start := record.get("start")) else {}
+        manifest = {**_describe(model, pack), **start, "scores": scores}
         write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
         manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
         write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})

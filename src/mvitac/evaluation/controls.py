@@ -29,7 +29,8 @@ from mvitac.evaluation.probe import (
     score_rows,
     split_rows,
 )
-from mvitac.model import fresh
+from mvitac.evaluation.sensors import Standardise
+from mvitac.model import Model, fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.run import Run
 from mvitac.system.processes import in_threads
@@ -63,6 +64,7 @@ def controls_of(
     probes: Sequence[str],
     imagenet: Path | None = None,
     specs: Sequence[DataSpec] = (),
+    standardise: tuple[Standardise, ...] = (),
 ) -> tuple[Records, Records]:
     """Score every control for ``runs``.
 
@@ -74,22 +76,23 @@ def controls_of(
         probes: Probes of the trunks; all other controls get logistic regression.
         imagenet: A file of ImageNet weights for one more trunk.
         specs: What the runs were trained on, where that is not ``pack``.
+        standardise: As for the runs (``sensors.touch_features``), for the trunks.
 
     Returns:
         Probe records and retrieval records, each with its "source" and "seed".
     """
-    records = _label_controls(pack, tasks)
+    records = label_controls(pack, tasks)
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)
     fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
     with work("fitting probes of the controls", num, "probes"):
-        records += _pixel_controls(pack, tasks, modalities)
-        found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes)
+        records += pixel_controls(pack, tasks, modalities)
+        found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes, standardise)
         records += found
         for name in weights:
             run, spec = starts[0]
             start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
-            records += _named("imagenet", None, probe_model(start, pack, tasks, modalities, probes))
+            records += _named("imagenet", None, probe_model(start, pack, tasks, modalities, probes, standardise))
     return records, retrieval
 
 
@@ -97,7 +100,7 @@ def _named(source: str, seed: int | None, found: Records) -> Records:
     return [{"source": source, "seed": seed, **record} for record in found]
 
 
-def _label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
+def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
     """What needs no image: the most common class or the mean value, and the dataset's own controls (table columns)."""
     records = []
     for task in tasks:
@@ -105,7 +108,8 @@ def _label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
         found = {"majority" if isinstance(task, Task) else "mean": _guess(pack, task, rows)}
         for name, columns in pack.spec.controls.items():
             x = np.stack([pack.column(column)[rows.all].astype(float) for column in columns], axis=1)
-            found[name] = probe_features(x, pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0)
+            if np.isfinite(x).all():  # else rows of a part of a mix that has no such control
+                found[name] = probe_features(x, pack, task, rows, "linear" if isinstance(task, Task) else "curve", 0)
         for name, result in found.items():
             records += _named(name, None, [{"task": task.name, "modality": "none", "probe": "linear", **result}])
     return records
@@ -121,7 +125,7 @@ def _guess(pack: Pack, task: AnyTask, rows: ProbeSplit) -> dict[str, Any]:
     return score_rows(pack, task, rows.test, np.eye(num)[np.full(len(rows.test), common)])
 
 
-def _pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
+def pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:
     """Thumbnails of every modality, and the border of the tactile image."""
 
     def pixels(modality: str, rows: np.ndarray) -> np.ndarray:
@@ -140,12 +144,15 @@ def _untrained_trunks(
     tasks: Sequence[AnyTask],
     modalities: Sequence[str],
     probes: Sequence[str],
+    standardise: tuple[Standardise, ...],
 ) -> tuple[Records, Records]:
     # Built one by one: threads would share the random generator.
     models = [fresh(scratch(run), spec, pack.size) for run, spec in starts]
-    scored = in_threads(
-        lambda model: (probe_model(model, pack, tasks, modalities, probes), cross_modal(model, pack)), models
-    )
+
+    def scores(model: Model) -> tuple[Records, Records]:
+        return probe_model(model, pack, tasks, modalities, probes, standardise), cross_modal(model, pack)
+
+    scored = in_threads(scores, models)
     records, retrieval = [], []
     for (run, _), (found, ranked) in zip(starts, scored, strict=True):
         records += _named("untrained", run.seed, found)

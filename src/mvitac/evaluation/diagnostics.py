@@ -74,6 +74,43 @@ def knn_accuracy(
     return float((votes.argmax(1) == test_labels).float().mean())
 
 
+ALPHAS = (10.0, 100.0, 1e3, 1e4, 1e5)
+"""Candidate strengths of the ridge regularisation of ``linear_probe``."""
+
+
+def linear_probe(
+    train: Float[Tensor, "N D"], targets: Float[Tensor, "N T"], groups: Int[Tensor, " N"], new: Float[Tensor, "M D"]
+) -> Float[Tensor, "M T"]:
+    """A linear probe in closed form: ridge regression of ``targets`` on standardised features, evaluated at ``new``.
+
+    Its strength is chosen on a fifth of the ``groups`` of the training rows; the final fit uses all of them. It costs
+    milliseconds where logistic regression costs seconds. For classes, give one column per class and take the largest.
+    """
+    mean, std = train.mean(0), train.std(0) + 1e-6
+    # A dimension that is not finite counts as constant.
+    x, new = (((z - mean) / std).nan_to_num(0.0, 0.0, 0.0) for z in (train, new))
+    y = targets.float()
+    names = torch.unique(groups)
+    names = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
+    held = torch.isin(groups, names[: len(names) // 5])
+    alpha = 100.0
+    if held.any():
+        fits = {a: _ridge(x[~held], y[~held], x[held], a) for a in ALPHAS}
+        alpha = min(ALPHAS, key=lambda a: float((fits[a] - y[held]).square().sum()))
+    return _ridge(x, y, new, alpha)
+
+
+def _ridge(x: Tensor, y: Tensor, new: Tensor, alpha: float) -> Tensor:
+    centre, offset = x.mean(0), y.mean(0)
+    x, y = x - centre, y - offset
+    wide = x.shape[1] > len(x)
+    gram = x @ x.T if wide else x.T @ x
+    gram.diagonal().add_(alpha)
+    factor = torch.linalg.cholesky(gram)
+    weight = x.T @ torch.cholesky_solve(y, factor) if wide else torch.cholesky_solve(x.T @ y, factor)
+    return (new - centre) @ weight + offset
+
+
 def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Tensor, "G D"]:
     """Mean normalised embedding of each group 0 .. G-1, normalised again."""
     sums = torch.zeros(int(groups.max()) + 1, z.shape[1]).index_add_(0, groups, F.normalize(z.float(), dim=1))
@@ -81,14 +118,18 @@ def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Ten
 
 
 def retrieval_ranks(
-    query: Float[Tensor, "N D"], gallery: Float[Tensor, "N D"], groups: Int[Tensor, " N"]
+    query: Float[Tensor, "N D"],
+    gallery: Float[Tensor, "M D"],
+    groups: Int[Tensor, " M"],
+    wanted: Int[Tensor, " N"] | None = None,
 ) -> Int[Tensor, " N"]:
-    """Rank (0 = first) of each query's own group. A group is represented by its mean gallery embedding.
+    """Rank (0 = first) of each query's own group, ``wanted`` (default: ``groups``, row by row).
 
-    With one gallery entry per group, chance level R@k is exactly k / number of groups.
+    A group is represented by its mean gallery embedding. With one gallery entry per group, chance level R@k is exactly k /
+    number of groups.
     """
     similarity = F.normalize(query.float(), dim=1) @ group_means(gallery, groups).T
-    own = similarity.gather(1, groups[:, None])
+    own = similarity.gather(1, (groups if wanted is None else wanted)[:, None])
     # Ties count against the query, or constant embeddings would score.
     return (similarity >= own).sum(1) - 1
 

@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +15,8 @@ from mvitac.data.spec import AnyTask, Event, Task, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
 from mvitac.evaluation.events import check_event, with_event
-from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
+from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import (
     PROBES,
     Probe,
@@ -24,12 +24,14 @@ from mvitac.evaluation.probe import (
     probe_model,
     probes_of,
     retrieved_rows,
+    seen_by,
     split_rows,
     with_classes,
 )
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
-from mvitac.model import Model, load
+from mvitac.evaluation.sensors import Standardise, describe_statistics, sensor_records
+from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import LATER, from_json, to_json, unknown
 from mvitac.run import Run, load_run
@@ -66,9 +68,16 @@ class ProbeConfig:
     (--data.order, else frame, seq or time)."""
     false_alarms: float = field(default=0.1, metadata=LATER)
     """Share of recordings without the --event in which an alarm is accepted. It sets the threshold, on train and val."""
+    standardise: tuple[Standardise, ...] = field(default=(), metadata=LATER)
+    """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
+    their own mean and standard deviation. batch-norm: take the statistics of BatchNorm anew. colours: show images of a
+    sensor that --learn-on lacks in the colours of those that it has, and take the mean features."""
+    sensors: bool = field(default=False, metadata=LATER)
+    """Also say how well touch features tell the sensor, and how often they find the same press through another one."""
 
     def __post_init__(self) -> None:
-        for name, values in (("probe", self.probes), ("task", self.tasks), ("modality", self.modalities)):
+        given = {"probe": self.probes, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
+        for name, values in given.items():
             for value in values:
                 if values.count(value) > 1:
                     raise ValueError(f"{name} {value!r} is given twice: give it once")
@@ -126,7 +135,13 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
 
 
 def probe_runs(
-    paths: Sequence[Path], session: ProbeConfig, pack: Pack | None = None, *, allow_leak: bool = False
+    paths: Sequence[Path],
+    session: ProbeConfig,
+    pack: Pack | None = None,
+    *,
+    allow_leak: bool = False,
+    weights: Which = "last",
+    encoders: Sequence[str] = (),
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
@@ -139,26 +154,33 @@ def probe_runs(
         session: What to probe.
         pack: Other data to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
+        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
+        encoders: Other people's encoders to probe beside the runs ("external:..."). They need ``pack``.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
-        "asked" (the config) and "models" (digests of the weights). A record has a "leak", which is empty unless its test
-        rows, or their groups, were trained on.
+        "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has
+        a "leak", which is empty unless its test rows, or their groups, were trained on.
 
     Raises:
         ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
             trained on rows or groups that other data than its own would score.
     """
-    _check_paths(paths)
-    models = [load(path) for path in paths]
-    names = names_of(paths, models)
+    if paths or not encoders:
+        _check_paths(paths)
+    elif session.imagenet:
+        raise ValueError("imagenet is the trunk of a run: give --encoder external:timm/NAME,weights=FILE instead")
+    others = open_encoders(encoders, pack)
+    models = [load(path, weights) for path in paths]
+    names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
-    for task, modality in product(tasks, modalities):
-        rows = split_rows(pack, task, modality)
-        if isinstance(task, Task) and task.event:
-            check_event(pack, task, rows.fitted, rows.test)
+    for task in tasks:
+        for modality in seen_by(pack, task, modalities):
+            rows = split_rows(pack, task, modality)
+            if isinstance(task, Task) and task.event:
+                check_event(pack, task, rows.fitted, rows.test)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:
@@ -166,32 +188,43 @@ def probe_runs(
     sources = check_unseen(paths, models, pack, tasks, allow_leak=allow_leak)
     each = list(zip(paths, models, names, sources, strict=True))
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
+    records += probe_encoders(others, tasks, modalities, session.probes, controls=session.controls)
     if session.controls:
         specs = [m.spec for m in models]
-        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs)
+        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
-    result = Scores(
-        data=pack.spec.name,
-        pack=pack.digest,
-        asked=to_json(session),
-        models=_digests(paths),
-        group_by=pack.spec.group_by,
-        notes=list(pack.spec.notes),
-        leaks=leaks_of([*records, *retrieval]),
-        classes={task.name: list(task.classes) for task in with_classes(tasks)},
-        targets={task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
-        records=records,
-        retrieval=retrieval,
-        summary=summarise(records, session.probes[0]),
-    )
+    result = {
+        "data": pack.spec.name,
+        "pack": pack.digest,
+        "asked": to_json(session),
+        "models": _digests(paths, weights),
+        "encoders": [model.describe() for model, _ in others],
+        "group_by": pack.spec.group_by,
+        "notes": list(pack.spec.notes),
+        "leaks": leaks_of([*records, *retrieval]),
+        "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
+        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
+        "records": records,
+        "retrieval": retrieval,
+        "summary": summarise(records, session.probes[0]),
+    }
+    if session.standardise:
+        result["statistics"] = describe_statistics(pack, session.standardise)
+    if session.sensors:
+        found_by = zip(names, models, strict=True)
+        result["sensors"] = [
+            {"source": n, "seed": m.run.seed, **r} for n, m in found_by for r in sensor_records(m, pack)
+        ]
     for path in paths:
-        write_json(path / "probe.json", result)
-    return result
+        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
+    return Scores(result)
 
 
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
     """``pack``, or the data that all of ``models`` were trained on."""
-    packs = [pack or model.open_data() for model in models]
+    if pack:
+        return pack
+    packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError(
             "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
@@ -207,6 +240,8 @@ def _probe_models(
     session: ProbeConfig,
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of runs, given as folder, model, name and what it learned from."""
+    if not each:
+        return [], []
     rows = Scored(pack)
     num = len(each) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
     with work("fitting probes", num, "probes"):
@@ -227,12 +262,13 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
     except (ValueError, KeyError, TypeError):  # 0.1.0 wrote the scores of the run alone
         return None
     whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
+    whole &= not asked.standardise
     return result if same and whole and scored == {path.resolve() for path in paths} else None
 
 
-def _digests(paths: Sequence[Path]) -> list[str]:
+def _digests(paths: Sequence[Path], weights: Which = "last") -> list[str]:
     """Digests of the weights of finished runs, sorted."""
-    return sorted(digest_file(path / "model.safetensors") for path in paths)
+    return sorted(digest_file(weights_file(path, weights)) for path in paths)
 
 
 def _check_paths(paths: Sequence[Path]) -> None:
@@ -249,12 +285,17 @@ def _check_models(paths: Sequence[Path], models: Sequence[Model], pack: Pack) ->
     """Check that each model can embed this data and that its probe.json can be written."""
     for path, model in zip(paths, models, strict=True):
         check_place(path / "probe.json")
-        for modality in pack.spec.modalities:
-            if model.spec.channels(modality) != pack.spec.channels(modality):
-                raise ValueError(
-                    f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
-                    f" it was trained on {model.spec.name!r}"
-                )
+        check_channels(path, model, pack, pack.spec.modalities)
+
+
+def check_channels(path: Path, model: Model, pack: Pack, modalities: Sequence[str]) -> None:
+    """Raise ValueError unless the ``model`` at ``path`` was trained on images like those of ``pack``."""
+    for modality in modalities:
+        if model.spec.channels(modality) != pack.spec.channels(modality):
+            raise ValueError(
+                f"{path} cannot embed this data's {modality} ({pack.spec.channels(modality)} channels):"
+                f" it was trained on {model.spec.name!r}, with {model.spec.channels(modality)}"
+            )
 
 
 def check_unseen(
@@ -263,15 +304,16 @@ def check_unseen(
     """What each run at ``paths`` learned from; None where that is not known.
 
     Raises:
-        ValueError: If a run saw what other data than its own would score. In its own data the split was chosen, so the
-            scores only say LEAK.
+        ValueError: If a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
+            its own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
     for path, model in zip(paths, models, strict=True):
         digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
         sources.append(learned := read_sources(path, model.run, digest, pack))
-        for task in tasks if learned is not None and digest != pack.digest and not allow_leak else ():
-            if leak := scored.leak(learned, split_rows(pack, task).test):
+        refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
+        for task in tasks if refused else ():
+            if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
                 raise ValueError(
                     f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}; give a pack whose test"
                     " groups it was not trained on, or --allow-leak to score it with LEAK beside every score"
@@ -297,7 +339,7 @@ def _probe_run(
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of one run."""
     own, pack = {"source": source, "seed": model.run.seed, "run": str(path)}, scored.pack
-    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes)]
+    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes, session.standardise)]
     leaks = {task.name: scored.leak(learned, split_rows(pack, task).test) for task in tasks}
     for record in records:
         record["source"] += END_TO_END if record["probe"] == "own" else ""

@@ -12,11 +12,9 @@ from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.model import Model
-from mvitac.nn.encoders import last_map
 from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
-from mvitac.transforms.preprocess import encoder_input
 
 HALF = (-65504.0, 65504.0)
 """Range of fp16."""
@@ -47,9 +45,7 @@ def pack_features(
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
         if maps:
-            with torch.no_grad():
-                found = last_map(model.encoders[modality], encoder_input(images, model.run.augment.eval_size))
-            chunks.append(found.clamp(*HALF).half().cpu())
+            chunks.append(model.last_map(modality, images).clamp(*HALF).half().cpu())
         else:
             chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
         advance(len(chunk))
@@ -74,9 +70,8 @@ def features(
     The cached file is a .npy followed by its sha256. One that does not match, or has none, is computed again.
     """
     device = next(model.parameters()).device
-    sides = model.run.augment
-    # The weights' digest covers eval_size already.
-    side = [sides.size] if for_heads and sides.size != sides.eval_size else []
+    whole, heads = model.sides  # the weights' digest covers the first
+    side = [heads] if for_heads and heads != whole else []
     kind = [*side, *(["map"] if maps else [])]
     key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type, *kind])
     path = cache_dir() / "features" / f"{key[:32]}.npy"

@@ -3,12 +3,12 @@
     <run>/trained_on.safetensors    for each source i: <i>.ids and <i>.groups, sorted hashes (uint64) of the ids and groups
                                     of the rows trained on; its name in the header
 
-A run has one source, its own training rows. A run that starts from another's weights would add that run's sources.
+The first source of a run is its own training rows. A run that starts from another model's weights adds the sources of that
+model. A source without rows stands for weights of which nothing says what they were trained on.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ import safetensors
 import safetensors.numpy
 
 from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import row_hashes
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.run import Run
@@ -43,7 +44,29 @@ class Source:
 
 def source_of(pack: Pack, rows: np.ndarray) -> Source:
     """The source that pack ``rows`` are."""
-    return Source(pack.spec.name, *(np.unique(found[rows]) for found in _hashes(pack)))
+    return Source(pack.spec.name, *(np.unique(found[rows]) for found in row_hashes(pack)))
+
+
+def unknown_source(name: str) -> Source:
+    """The source of weights of which nothing says what they were trained on."""
+    return Source(name, np.zeros(0, np.uint64), np.zeros(0, np.uint64))
+
+
+def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:
+    """``own`` and those of ``ancestors`` that add rows or groups to the ones before them."""
+    found = [own]
+    for source in ancestors:
+        if not any((len(source.ids) and _covers(other, source)) or _same(other, source) for other in found):
+            found.append(source)
+    return found
+
+
+def _covers(whole: Source, part: Source) -> bool:
+    return bool(np.isin(part.ids, whole.ids).all() and np.isin(part.groups, whole.groups).all())
+
+
+def _same(a: Source, b: Source) -> bool:
+    return a.name == b.name and not len(a.ids) and not len(b.ids)
 
 
 def write_sources(folder: Path, sources: Sequence[Source]) -> None:
@@ -98,10 +121,13 @@ class Scored:
     """The rows of a pack that are scored, to be compared with what models learned from."""
 
     def __init__(self, pack: Pack) -> None:
-        self.pack, (self._ids, self._groups) = pack, _hashes(pack)
+        self.pack, (self._ids, self._groups) = pack, row_hashes(pack)
 
     def leak(self, sources: Sequence[Source] | None, rows: np.ndarray) -> str:
-        """Say which of the test ``rows``, and how many of their groups, are in ``sources``; "" if none is."""
+        """Say which of the test ``rows``, and how many of their groups, are in ``sources``; "" if none is.
+
+        ``UNKNOWN`` if none is in those that are known, but not all are known.
+        """
         if sources is None:
             return UNKNOWN
         found = []
@@ -116,7 +142,8 @@ class Scored:
                     f"{num_rows} of {len(rows)} test rows and {num_groups} of {len(groups)} test {by}s were trained on"
                     f" ({source.name})"
                 )
-        return "; ".join(found)
+        unknown = any(not len(source.ids) for source in sources)
+        return "; ".join(found) or (UNKNOWN if unknown else "")
 
 
 def leak_mark(leak: str) -> str:
@@ -129,26 +156,9 @@ def leaks_of(records: Sequence[dict[str, Any]]) -> list[str]:
     lines: dict[str, None] = {}
     for record in records:
         if record.get("leak") == UNKNOWN:
-            lines[f"{record['source']}: what it was trained on is unknown, so leaks cannot be excluded"] = None
+            lines[
+                f"{record['source']}: what it or its start weights were trained on is unknown, so leaks cannot be excluded"
+            ] = None
         elif record.get("leak"):
             lines[f"{record['source']}, {record.get('task') or 'retrieval'}: {record['leak']}"] = None
     return list(lines)
-
-
-def _hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
-    """uint64 [N] hashes of the ids and of the groups of all rows.
-
-    Numbers, and groups that are single rows, mean nothing outside their dataset: its name is part of them.
-    """
-    name = pack.spec.name.split(" (")[0]
-    ids, groups = pack.own_ids, pack.column("group").astype(str)
-    weak = pack.spec.group_by == "row"
-    return _hash(ids, name, False), _hash(groups, name, weak)
-
-
-def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:
-    unique, inverse = np.unique(texts, return_inverse=True)
-    named = (f"{name}/{text}" if weak or text.isdigit() else text for text in unique.tolist())
-    return np.array([int.from_bytes(hashlib.blake2b(t.encode(), digest_size=8).digest()) for t in named], np.uint64)[
-        inverse
-    ]

@@ -22,6 +22,7 @@ from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
 from mvitac.evaluation.regressors import Regressor, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
+from mvitac.evaluation.sensors import Standardise, touch_features
 from mvitac.evaluation.trained_probes import TRAINED, fit_network
 from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
@@ -93,6 +94,18 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
     return ProbeSplit(train, val, test)
 
 
+def scorable(pack: Pack) -> list[AnyTask]:
+    """The tasks of ``pack`` that have labelled rows in train and test."""
+    found = []
+    for task in pack.spec.all_tasks:
+        try:
+            split_rows(pack, task)
+        except ValueError:
+            continue
+        found.append(task)
+    return found
+
+
 def _check_measured(values: np.ndarray, task: ValueTask, rows: dict[str, np.ndarray]) -> None:
     """Check that each target has two different values in each of ``rows``: without them it has no R2."""
     for t, target in enumerate(task.targets):
@@ -107,6 +120,13 @@ def _check_measured(values: np.ndarray, task: ValueTask, rows: dict[str, np.ndar
 def names_in(modality: str, pack: Pack) -> tuple[str, ...]:
     """The modalities that "touch", "vision", "both" or "none" stands for."""
     return tuple(pack.spec.modalities) if modality == "both" else () if modality == "none" else (modality,)
+
+
+def seen_by(pack: Pack, task: AnyTask, modalities: Sequence[str]) -> list[str]:
+    """Those of ``modalities`` that ``task`` can be probed by: of a mix, those that the parts of its rows have."""
+    rows = np.flatnonzero(pack.answered(task))
+    has = {m: not pack.parts or bool(pack.has(m)[rows].any()) for m in pack.spec.modalities}
+    return [modality for modality in modalities if all(has[m] for m in names_in(modality, pack))]
 
 
 def _num_classes(pack: Pack, task: AnyTask, rows: np.ndarray) -> int:
@@ -193,9 +213,16 @@ def fit_values(
 
 
 def probe_model(
-    model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], probes: Sequence[str]
+    model: Model,
+    pack: Pack,
+    tasks: Sequence[AnyTask],
+    modalities: Sequence[str],
+    probes: Sequence[str],
+    standardise: tuple[Standardise, ...] = (),
 ) -> list[dict[str, Any]]:
     """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
+
+    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones.
 
     Returns:
         One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
@@ -204,23 +231,25 @@ def probe_model(
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
         return []
-    needed = np.unique(np.concatenate([split_rows(pack, task, m).all for task in tasks for m in modalities]))
+    needed = np.unique(
+        np.concatenate([split_rows(pack, t, m).all for t in tasks for m in seen_by(pack, t, modalities)])
+    )
     own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
 
     def source_of(maps: bool) -> FeatureSource:
-        by_modality = {m: features(model, pack, m, rows, maps=maps) for m, rows in own.items()}
+        by_modality = {m: touch_features(model, pack, m, rows, standardise, maps=maps) for m, rows in own.items()}
 
         def source(modality: str, rows: np.ndarray) -> np.ndarray:
-            return _joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
+            return joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
 
         return source
 
     maps = source_of(True) if "attentive" in probes else None
-    records = probe_all(source_of(False), pack, tasks, modalities, probes, model.run.seed, maps)
-    return records + _own_heads(model, pack, tasks, modalities)
+    records = probe_all(source_of(False), pack, tasks, modalities, probes, model.seed, maps)
+    return records + own_heads(model, pack, tasks, modalities)
 
 
-def _joined(parts: list[np.ndarray]) -> np.ndarray:
+def joined(parts: list[np.ndarray]) -> np.ndarray:
     """Features [N, D] of several modalities, or maps [N, P, D], side by side. Narrow maps are filled up with zeros."""
     if parts[0].ndim == 3:
         width = max(part.shape[2] for part in parts)
@@ -228,15 +257,19 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
-def _own_heads(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> list[dict[str, Any]]:
-    """Records of the heads that the model trained along with its encoders."""
+def own_heads(
+    model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], among: np.ndarray | None = None
+) -> list[dict[str, Any]]:
+    """Records of the heads that the model trained along with its encoders, on test rows or on the labelled ``among``."""
     whole = "both" if len(model.encoders) == 2 else next(iter(model.encoders))
     known = {task.name: _outputs(task) for task in model.spec.all_tasks if task.name in model.tasks}
     records = []
     for task in tasks:
         if whole not in modalities or task.name not in known or set(_outputs(task)) - set(known[task.name]):
             continue  # not a task that it learned, or not all of its classes or targets
-        rows = split_rows(pack, task, whole).test
+        rows = split_rows(pack, task, whole).test if among is None else among[pack.answered(task)[among]]
+        if not len(rows):
+            continue
         z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
         # Match columns by name: this pack may order the classes differently or have fewer.
         columns = [known[task.name].index(name) for name in _outputs(task)]
@@ -291,7 +324,7 @@ def probe_all(
     papers = _papers(source, pack, with_classes(tasks), modalities, seed) if "paper" in probes else {}
     records = []
     for task in tasks:
-        for modality in modalities:
+        for modality in seen_by(pack, task, modalities):
             rows = split_rows(pack, task, modality)
             x = source(modality, rows.all)
             for kind in probes_of(task, probes):
@@ -314,7 +347,7 @@ def _papers(
     found: dict[tuple[str, str], Classifier] = {}
     for modality in modalities:
         sharing: dict[bytes, list[Task]] = {}
-        for task in tasks:
+        for task in (task for task in tasks if seen_by(pack, task, [modality])):
             sharing.setdefault(split_rows(pack, task, modality).fitted.tobytes(), []).append(task)
         for key, group in sharing.items():
             rows = np.frombuffer(key, np.int64)
@@ -337,16 +370,16 @@ def retrieved_rows(pack: Pack) -> np.ndarray:
     return pack.rows("test", only=only, having=pack.spec.modalities)
 
 
-def cross_modal(model: Model, pack: Pack) -> list[dict[str, Any]]:
-    """Retrieval of test groups across modalities, in both directions.
+def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
+    """Retrieval of groups across modalities, in both directions, among ``rows`` (default: ``retrieved_rows``).
 
     Returns:
         One record per direction: R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. Empty without a
-        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` test groups.
+        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []
-    rows = retrieved_rows(pack)
+    rows = retrieved_rows(pack) if rows is None else rows
     sizes = np.bincount(_group_numbers(pack, rows))
     if len(sizes) < MIN_GALLERY:
         return []

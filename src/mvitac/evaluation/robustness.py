@@ -17,7 +17,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
-from mvitac.evaluation.features import features
+from mvitac.evaluation.features import features, sample
 from mvitac.evaluation.probe import (
     ProbeSplit,
     fit_probe,
@@ -26,15 +26,20 @@ from mvitac.evaluation.probe import (
     probe_features,
     score_predictions,
     score_rows,
+    seen_by,
     split_rows,
 )
 from mvitac.model import Model
+from mvitac.transforms.denoise import denoise, noise_level
 
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}
 """Fraction of the labelled training and validation rows that a probe sees; at least one row per class, two of values."""
 NOISE = "noisy images"
 NOISE_LEVELS = 20.0
 """Standard deviation of the noise added to each 8-bit channel of test images."""
+CLEANED = "noisy images, cleaned"
+"""The same images, denoised (``transforms.denoise``), and their features given the mean and standard deviation of clean
+ones. Level of noise and statistics come from noisy images of training rows, without labels."""
 MISSING = {"vision": "vision missing", "touch": "touch missing"}
 """modality -> name. The probe uses both modalities; in test rows, features of this one are replaced by their mean."""
 DROPOUT = "modality dropout"
@@ -43,7 +48,7 @@ both present and, under names such as "modality dropout, vision missing", with o
 LEAK = {"unseen groups": False, "groups seen in training": True}
 """name -> whether half of each test group's rows replace as many training rows. Both score the other half."""
 PREPARED = {lost: f"{DROPOUT}, {name}" for lost, name in MISSING.items()}
-STRESSES = (*SHARES, NOISE, *MISSING.values(), DROPOUT, *PREPARED.values(), *LEAK)
+STRESSES = (*SHARES, NOISE, CLEANED, *MISSING.values(), DROPOUT, *PREPARED.values(), *LEAK)
 
 Scores = Iterator[tuple[str, dict[str, Any]]]
 """(name of the stress, scores)."""
@@ -79,24 +84,41 @@ def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Seque
 
     Rows and noise are drawn alike for all models of one seed, so that differences are paired.
     """
-    seed, records = model.run.seed, []
-    noisy: dict[str, dict[int, np.ndarray]] = {}  # modality -> test row -> features of its noisy image
+    seed, records = model.seed, []
+    known: dict[tuple[str, float], dict[int, np.ndarray]] = {}  # -> row -> features of its noisy, denoised image
+    levels = {m: _added_noise(pack, m, seed) for m in model.encoders if m in pack.spec.modalities}
+
+    def noisy(modality: str, rows: np.ndarray, level: float = 0.0) -> np.ndarray:
+        mine = known.setdefault((modality, level), {})
+        if len(new := np.array([row for row in rows if int(row) not in mine], np.int64)):
+            mine.update(zip(new.tolist(), _noisy_features(model, pack, modality, new, seed, level), strict=True))
+        return np.stack([mine[int(row)] for row in rows])
+
+    def cleaned(case: _Case, modality: str) -> np.ndarray:
+        z, seen = (noisy(modality, rows, levels[modality]) for rows in (case.rows.test, sample(case.rows.train, 256)))
+        clean = case.clean[modality][: len(case.rows.fitted)]
+        return (z - seen.mean(0)) / (seen.std(0) + 1e-6) * clean.std(0) + clean.mean(0)
+
     for task, modality in product(tasks, modalities):
         names = names_in(modality, pack)
-        if not set(names) <= set(model.encoders):
+        if not set(names) <= set(model.encoders) or not seen_by(pack, task, [modality]):
             continue
         rows = split_rows(pack, task, modality)
         case = _Case(pack, task, rows, {m: features(model, pack, m, rows.all) for m in names}, seed)
-        for m in names:
-            known = noisy.setdefault(m, {})
-            new = np.array([row for row in rows.test if int(row) not in known], np.int64)
-            if len(new):
-                known.update(zip(new.tolist(), _noisy_features(model, pack, m, new, seed), strict=True))
-        test = np.concatenate([np.stack([noisy[m][int(row)] for row in rows.test]) for m in names], axis=1)
-        for scores in (_fewer_or_leaked(case), _worse_images(case, test), _dropout(case)):
+        worse = {
+            NOISE: np.concatenate([noisy(m, rows.test) for m in names], axis=1),
+            CLEANED: np.concatenate([cleaned(case, m) for m in names], axis=1),
+        }
+        for scores in (_fewer_or_leaked(case), _worse_images(case, worse), _dropout(case)):
             for kind, result in scores:
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
+
+
+def few_labels(x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, share: float, seed: int) -> dict[str, Any]:
+    """Scores of the linear probe on features ``x`` of ``rows.all``, fitted with ``share`` of the labels (``SHARES``)."""
+    case = _Case(pack, task, rows, {"": x}, seed)
+    return case.probe(*_few(rows, _strata(case), share, seed))
 
 
 def _fewer_or_leaked(case: _Case) -> Scores:
@@ -123,11 +145,12 @@ def _strata(case: _Case) -> np.ndarray:
     return np.unique(np.column_stack([np.isnan(values), low]), axis=0, return_inverse=True)[1]
 
 
-def _worse_images(case: _Case, noisy: np.ndarray) -> Scores:
-    """Noisy test images, and for a probe on both modalities one of them missing."""
+def _worse_images(case: _Case, worse: dict[str, np.ndarray]) -> Scores:
+    """Features of ``worse`` test images, and for a probe on both modalities one of them missing."""
     num = len(case.rows.fitted)
     score = case.fit(case.joined()[:num], case.rows)
-    yield NOISE, score(noisy)
+    for kind, z in worse.items():
+        yield kind, score(z)
     if len(case.clean) == 2:
         for lost, kind in MISSING.items():
             yield kind, score(_without(lost, case.clean, num)[num:])
@@ -195,11 +218,20 @@ def _halved(rows: ProbeSplit, groups: np.ndarray, leaks: bool, seed: int) -> tup
     return keep, ProbeSplit(rows.all[train], rows.val, rows.test[scored])
 
 
-def _noisy_features(model: Model, pack: Pack, modality: str, rows: np.ndarray, seed: int) -> np.ndarray:
-    """Features [len(rows), D] of images with Gaussian noise, the same noise for the same (seed, row)."""
+def _added_noise(pack: Pack, modality: str, seed: int) -> float:
+    """The noise of ``NOISE_LEVELS`` as an estimate from 64 noisy and 64 other images of training rows."""
+    rows = sample(pack.rows("train", having=(modality,)), 128)
+    noisy = np.stack([_noisy(pack.images[modality][row], seed, int(row)) for row in rows[::2]])
+    return max(0.0, noise_level(noisy) ** 2 - noise_level(pack.images[modality][rows[1::2]]) ** 2) ** 0.5
+
+
+def _noisy_features(
+    model: Model, pack: Pack, modality: str, rows: np.ndarray, seed: int, level: float = 0.0
+) -> np.ndarray:
+    """Features [len(rows), D] of images with Gaussian noise, the same for the same (seed, row), denoised by ``level``."""
     device, found = next(model.parameters()).device, []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
-        images = np.stack([_noisy(pack.images[modality][row], seed, int(row)) for row in chunk])
+        images = denoise(np.stack([_noisy(pack.images[modality][row], seed, int(row)) for row in chunk]), level)
         found.append(model.features(modality, torch.from_numpy(images).permute(0, 3, 1, 2).to(device)).cpu().numpy())
     return np.concatenate(found)
 

@@ -96,7 +96,8 @@ def one_target(record: dict[str, Any], t: int) -> dict[str, Any]:
     """The record of target ``t`` alone."""
     sums = {name: [found[t]] for name, found in record["group_sums"].items()}
     target = record["targets"][t]
-    return {**record, "r2": target["r2"], "targets": [target], "group_sums": sums, "points": [record["points"][t]]}
+    points = {"points": [record["points"][t]]} if "points" in record else {}
+    return {**record, "r2": target["r2"], "targets": [target], "group_sums": sums, **points}
 
 
 def r_squared(sums: dict[str, Any]) -> Any:

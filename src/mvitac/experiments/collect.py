@@ -2,6 +2,7 @@
 
     <out>/plan.json                      the plan
           runs/<row>/seed<k>/            a run as ``mvitac pretrain`` leaves it, with scores.json but no checkpoint
+          encoders.json                  scores of other people's encoders, if the plan has rows with one
           controls.json                  majority, untrained trunk, pixels, border, the data's own, ImageNet if asked
           result.json  table.*           the tables (``table_formats``)
 
@@ -24,6 +25,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
+from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
 from mvitac.experiments.jobs import Job, Work, pairs_per_second, seconds_of
 from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.nn.encoders import SCRATCH
@@ -63,6 +65,9 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
         if row.label in pack.spec.controls:
             raise ValueError(f"row {row.label!r} has the name of a control of this data: give it another label")
         try:
+            if row.encoder:
+                open_encoders([row.encoder], pack)
+                continue
             own, key = _check_row(plan, row, pack)
         except ValueError as error:
             left_out[row.label] = str(error)
@@ -94,7 +99,7 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
     own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
     run.check(own.spec, len(run.method.training_rows(own)), own.size)
     gel_mirror(run, own, torch.device("cpu"))
-    run.method.build(own.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+    run.method.on_tiny_trunk(own.spec, run.encoder)
     return own, run.without_idle(own.spec).digest()
 
 
@@ -121,6 +126,7 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         raise ValueError(f"no run of {out} is finished: nothing to show yet{f' ({lost})' if lost else ''}")
     scored = [_scores(job) for job in finished]
     controls, found = _controls(work, out, session)
+    others, described, names = _encoders(work, out, session)
     runs = [load_run(job.out) for job in finished]
     return {
         "plan": to_json(work.plan),
@@ -129,9 +135,10 @@ def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
         "group_by": work.pack.spec.group_by,
         "notes": [" ".join(note.split()) for note in work.pack.spec.notes],
         "leaks": leaks(work.pack, chosen(work.pack, session)[0]),
-        "records": [record for records, _ in scored for record in records] + controls,
+        "records": [record for records, _ in scored for record in records] + others + controls,
         "retrieval": [record for _, retrieval in scored for record in retrieval] + found,
-        "rows": [row.label for row in work.plan.rows if row.label not in work.left_out],
+        "rows": [names.get(row.label, row.label) for row in work.plan.rows if row.label not in work.left_out],
+        "encoders": described,
         "left_out": work.left_out,
         "failed": failed,
         "unfinished": [job.name for job in work.jobs if not job.done],
@@ -153,6 +160,22 @@ def _scores(job: Job) -> tuple[Records, Records]:
     method = job.run.method.name
     named = [{**record, "source": job.label + record["source"].removeprefix(method)} for record in records]
     return named, [{**found, "source": job.label} for found in scores["retrieval"]]
+
+
+def _encoders(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, list[dict[str, Any]], dict[str, str]]:
+    """Records and descriptions of the rows with an encoder, and their names in tables; kept in encoders.json."""
+    rows = [row for row in work.plan.rows if row.encoder and row.label not in work.left_out]
+    bound = [open_encoders([row.encoder], work.pack)[0] for row in rows]
+    for row, (model, _) in zip(rows, bound, strict=True):
+        model.name = row.label
+    described, names = [model.describe() for model, _ in bound], {m.name: m.title for m, _ in bound}
+    key, path = digest([to_json(session), work.pack.digest, to_json(work.pack.spec), described]), out / "encoders.json"
+    if path.exists() and (kept := read_json(path, "scores of encoders"))["key"] == key:
+        return kept["records"], described, names
+    records = probe_encoders(bound, *chosen(work.pack, session), session.probes, controls=session.controls)
+    if bound:
+        write_json(path, {"key": key, "records": records})
+    return records, described, names
 
 
 def _labels(jobs: Sequence[Job]) -> list[str]:
@@ -249,7 +272,7 @@ def forecast(work: Work, *, measure: bool = False) -> list[str]:
 
 def _images_per_pair(run: Run, pack: Pack) -> int:
     """Views of all modalities that a step reads for one pair."""
-    method = run.method.build(pack.spec, replace(run.encoder, trunk="mvitac_tiny", weights=SCRATCH))
+    method = run.method.on_tiny_trunk(pack.spec, run.encoder)
     return method.views * len(method.encoders())
 
 

@@ -26,6 +26,7 @@ from mvitac.evaluation.robustness import stress
 from mvitac.experiments.plan import Plan
 from mvitac.model import load
 from mvitac.nn.encoders import SCRATCH
+from mvitac.nn.initial import Init
 from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.system.console import Console
@@ -320,9 +321,10 @@ def pairs_per_second(run: Run, pack: Pack) -> float:
     """Speed of the first steps of ``run`` after its start-up, trained from random weights in a temporary folder."""
 
     def stop(step: int, values: dict[str, float]) -> None:
-        raise _Measured(values["pairs_per_s"])
+        if "pairs_per_s" in values:
+            raise _Measured(values["pairs_per_s"])
 
-    run = replace(run, eval_every=0, encoder=replace(run.encoder, weights=SCRATCH))
+    run = replace(run, eval_every=0, encoder=replace(run.encoder, weights=SCRATCH), init=Init())
     with tempfile.TemporaryDirectory() as folder:
         try:
             train(run, Path(folder) / "run", quiet=True, loggers=(stop,), pack=pack)

@@ -10,7 +10,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe import Probe
 from mvitac.recipes import recipe, with_method
-from mvitac.registry import to_json, unknown
+from mvitac.registry import LATER, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import parse_json
 
@@ -34,6 +34,14 @@ class Row:
     """Fields of the run to change, by dotted name, e.g. {"method.temperature": 0.2, "optim.lr": 0.03}."""
     printed: Printed = field(default_factory=dict)
     """The paper's numbers for this row, with positives of the same image. Shown beside such scores of probe paper only."""
+    encoder: str = field(default="", metadata=LATER)
+    """Another's encoder instead of a run, e.g. "external:timm/NAME" (``mvitac.external``). It is probed, not trained."""
+
+    def __post_init__(self) -> None:
+        if self.encoder and (self.method, self.recipe, self.set) != ("mvitac", None, {}):
+            raise ValueError(
+                f"row {self.label!r} has an encoder, which is not trained: leave out method, recipe and set"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +102,8 @@ class Plan:
                 setting(pair, "fold")
         if self.reference not in labels:
             raise unknown("reference row", self.reference, labels)
+        if self.rows[labels.index(self.reference)].encoder:
+            raise ValueError(f"reference {self.reference!r} is another's encoder: choose a row that is trained")
 
     def only(self, labels: Sequence[str]) -> Plan:
         """The plan with only these rows and the reference; all rows if none is given."""
@@ -145,7 +155,7 @@ def changed(run: Run, changes: Mapping[str, Any]) -> Run:
     """``run`` with fields changed by dotted name; values as in JSON."""
     value = to_json(run)
     for name, new in changes.items():
-        *path, last = name.split(".")
+        *path, last = ("init", "path") if name == "init" else name.split(".")
         inner = value
         for part in path:
             inner = inner.get(part) if isinstance(inner, dict) else None

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mvitac.evaluation.external_encoders import about_lines
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, with_interval
 from mvitac.evaluation.scores import by_cell, least_p, num_groups_of
@@ -223,7 +224,7 @@ def _cost(result: dict[str, Any]) -> list[str]:
             f"| {c['row']} | {c['seeds']} | {c['steps']} | {c['pairs']} | {c['pairs_of']} | {c['images']} |"
             f" {c['trained_parameters'] / 1e6:.2f} M | {c['seconds']:.0f} | {peak} |"
         )
-    return [*text, ""]
+    return [*text, "", *(f"- {line}" for line in about_lines(result.get("encoders", ())))]
 
 
 # -- LaTeX, CSV, figure -----------------------------------------------------------------------------------------------

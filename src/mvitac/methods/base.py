@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.registry import Registered
 
 Embeddings = dict[Hashable, Tensor]
@@ -29,13 +29,18 @@ class Views:
     """A batch as a method sees it."""
 
     images: dict[str, list[Tensor]]
-    """modality -> V tensors [B, C, H, W], augmented and normalised. A modality the dataset lacks is absent."""
+    """modality -> V tensors [B, C, H, W], augmented and normalised. A modality that the dataset, or all but one row of the
+    batch, lacks is absent. If ``both`` is given, B is the number of rows that have the modality."""
     labels: dict[str, Tensor]
     """task -> [B] int64, -1 = unlabelled. Only supervised methods use it."""
     rows: Tensor
     """[B] int64, the row of each pair in its pack. Memory banks are indexed by it."""
     values: dict[str, Tensor] = field(default_factory=dict)
     """Task with values -> [B, T] float32 in the units of its targets, NaN = not measured. For supervised methods."""
+    both: dict[str, Tensor] = field(default_factory=dict)
+    """Modality -> [P] int64, positions in its images of the rows that have both modalities, if some rows lack one."""
+    seed: Tensor = field(default_factory=lambda: torch.tensor(0))
+    """Integer, a function of (seed, step), for what a method draws for each row, e.g. masks (``nn.vit.row_uniform``)."""
 
 
 class Method(nn.Module, ABC):
@@ -122,6 +127,23 @@ class Contrastive(Method):
         return self.contrast(self.queries(batch) | self.keys(batch))
 
 
+def present(towers: nn.ModuleDict, batch: Views) -> list[tuple[str, nn.Module]]:
+    """(modality, tower) of the modalities that the batch has."""
+    return [(modality, tower) for modality, tower in towers.items() if modality in batch.images]
+
+
+def row_pairs(z: Embeddings, x: str, y: str, query: Hashable, key: Hashable) -> tuple[Tensor, Tensor] | None:
+    """The embeddings ``query`` of modality ``x`` and ``key`` of ``y``, of the rows that have both.
+
+    ``z`` has ``Views.both`` under ("both", modality), if the batch has it. None if fewer than two rows have both.
+    """
+    if query not in z or key not in z:
+        return None
+    if x == y or ("both", x) not in z:
+        return z[query], z[key]
+    return (z[query][z["both", x]], z[key][z["both", y]]) if len(z["both", x]) > 1 else None
+
+
 def with_sum(losses: dict[str, Tensor]) -> dict[str, Tensor]:
     """``losses`` and, as "loss", their sum."""
     return {"loss": torch.stack(list(losses.values())).sum(), **losses}
@@ -133,6 +155,10 @@ class MethodConfig(Registered, ABC):
 
     needs_pairs: ClassVar[bool] = False
     """Whether the method needs both modalities. If not, it also trains on vision or touch alone."""
+    takes_missing: ClassVar[bool] = False
+    """Whether rows of a batch may lack a modality: they then have no part in the losses that need it."""
+    needs_vit: ClassVar[bool] = False
+    """Whether the trunk must be a plain ViT."""
 
     def check_fields(
         self,
@@ -166,6 +192,11 @@ class MethodConfig(Registered, ABC):
             if not 1 <= getattr(self, name) <= 65536:
                 raise ValueError(f"{name} {getattr(self, name)}: give 1 to 65536")
 
+    def on_tiny_trunk(self, spec: DataSpec, encoder: EncoderConfig) -> Method:
+        """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
+        trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
+        return self.build(spec, replace(encoder, trunk=trunk, weights=SCRATCH))
+
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
         if self.needs_pairs and len(spec.modalities) < 2:
@@ -176,13 +207,52 @@ class MethodConfig(Registered, ABC):
             )
 
     @property
+    def sensor_view(self) -> bool:
+        """Whether ``Views.images["touch"]`` ends with one more view, of the same press through another sensor."""
+        return False
+
+    def check_pack(self, pack: Pack) -> None:
+        """Raise ValueError if ``pack`` lacks rows that a setting needs. Called before anything is written."""
+        if not self.sensor_view:
+            return
+        rows, pairs = self.training_rows(pack), np.zeros((2, 0), np.int64)
+        if "press" in pack.table.column_names:
+            pairs = np.unique(np.stack([pack.presses[rows], pack.sensors[rows]]), axis=1)
+        if not (np.bincount(pairs[0]) > 1).any():
+            raise ValueError(
+                "lambda_sensor needs rows of one press (column press) and different sensors (column sensor) to train on:"
+                " simulate with --data.sensors-per-press 2"
+            )
+
+    @property
     def label_splits(self) -> tuple[str, ...]:
         """Splits whose labels ``Views.labels`` has."""
         return ("train",)
 
     def training_rows(self, pack: Pack) -> np.ndarray:
-        """Pack rows to train on, ascending: train and unlabelled, with all modalities."""
-        return pack.rows("train", "unlabelled", having=pack.spec.modalities)
+        """Pack rows to train on, ascending: train and unlabelled, with all modalities of their dataset (part of a mix).
+
+        Raises:
+            ValueError: If a part of a mix lacks a modality, and the method needs it.
+        """
+        rows = pack.rows("train", "unlabelled")
+        rows = rows[pack.whole[rows]]
+        if not self.takes_missing:
+            self.check_senses(pack, rows, pack.spec.modalities)
+        return rows
+
+    def check_senses(self, pack: Pack, rows: np.ndarray, modalities: tuple[str, ...]) -> None:
+        """Raise ValueError unless all of ``rows`` have all of ``modalities``."""
+        for modality in modalities:
+            lacking = rows[~pack.has(modality)[rows]]
+            if len(lacking):
+                parts = ", ".join(np.unique(pack.column("part")[lacking]))
+                others = sorted(name for name, config in self.choices.items() if config.takes_missing)  # type: ignore
+                raise ValueError(
+                    f"method {self.name!r} needs {' and '.join(modalities)} of every row, but {len(lacking)} rows of part"
+                    f" {parts} have no {modality}: leave the part out, or choose a --method with losses for each modality"
+                    f" ({', '.join(others)})"
+                )
 
     def without_idle(self, spec: DataSpec) -> Self:
         """This config with every setting that has no effect on the dataset at a fixed value.

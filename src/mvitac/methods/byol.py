@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import EncoderConfig, Head, Projected, build_trunk, num_features, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
 
@@ -24,6 +24,7 @@ class BYOLConfig(MethodConfig):
     """Predict the momentum tower's embedding of another view, per modality."""
 
     name: ClassVar[str] = "byol"
+    takes_missing: ClassVar[bool] = True
 
     momentum: float = 0.996
     """Momentum m of the target tower at the start (BYOL: .996)."""
@@ -64,16 +65,20 @@ class BYOL(Contrastive):
     def queries(self, batch: Views) -> Embeddings:
         return {
             ("q", m, i): self.predictor[m](online(batch.images[m][i]))
-            for m, online in self.online.items()
+            for m, online in present(self.online, batch)
             for i in (0, 1)
         }
 
     def keys(self, batch: Views) -> Embeddings:
-        return {("k", m, i): target(batch.images[m][i]) for m, target in self.target.items() for i in (0, 1)}
+        return {("k", m, i): target(batch.images[m][i]) for m, target in present(self.target, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         return with_sum(
-            {m: regression(z["q", m, 0], z["k", m, 1]) + regression(z["q", m, 1], z["k", m, 0]) for m in self.online}
+            {
+                m: regression(z["q", m, 0], z["k", m, 1]) + regression(z["q", m, 1], z["k", m, 0])
+                for m in self.online
+                if ("q", m, 0) in z
+            }
         )
 
     def encoders(self) -> dict[str, nn.Module]:

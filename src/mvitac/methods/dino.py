@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
 from mvitac.registry import formerly
@@ -37,6 +37,7 @@ class DINOConfig(MethodConfig):
     """Match the momentum tower's centred, sharpened prototype scores of another view, per modality."""
 
     name: ClassVar[str] = "dino"
+    takes_missing: ClassVar[bool] = True
 
     student_temperature: float = 0.1
     """Student temperature tau_s (DINO: .1)."""
@@ -104,15 +105,22 @@ class DINO(Contrastive):
         self.pending: Tensor | None = None
 
     def queries(self, batch: Views) -> Embeddings:
-        return {("student", m, i): tower(batch.images[m][i]) for m, tower in self.student.items() for i in (0, 1)}
+        return {
+            ("student", m, i): tower(batch.images[m][i]) for m, tower in present(self.student, batch) for i in (0, 1)
+        }
 
     def keys(self, batch: Views) -> Embeddings:
-        return {("teacher", m, i): tower(batch.images[m][i]) for m, tower in self.teacher.items() for i in (0, 1)}
+        return {
+            ("teacher", m, i): tower(batch.images[m][i]) for m, tower in present(self.teacher, batch) for i in (0, 1)
+        }
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         config, losses, means = self.config, {}, []
         with torch.autocast(self.centre.device.type, enabled=False):
             for m, centre in zip(self.student, self.centre, strict=True):
+                if ("student", m, 0) not in z:
+                    means.append(centre)  # after_step leaves it where it is
+                    continue
                 s = [z["student", m, i].float() / config.student_temperature for i in (0, 1)]
                 raw = [z["teacher", m, i].float() for i in (0, 1)]
                 t = [(scores - centre) / config.teacher_temperature for scores in raw]

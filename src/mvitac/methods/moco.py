@@ -15,7 +15,7 @@ from typing import ClassVar
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import EncoderConfig, Head, build_towers, trunks
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
@@ -55,6 +55,7 @@ class MoCoConfig(QueueConfig):
     """Momentum contrast with a queue, per modality."""
 
     name: ClassVar[str] = "moco"
+    takes_missing: ClassVar[bool] = True
 
     temperature: float = 0.2
     """Temperature tau (MoCo v2: .2)."""
@@ -87,17 +88,17 @@ class MoCo(Contrastive):
         self.queues = nn.ModuleDict({m: Queue(size, self.config.out) for m in self.query})
 
     def queries(self, batch: Views) -> Embeddings:
-        return {("q", m): tower(batch.images[m][0]) for m, tower in self.query.items()}
+        return {("q", m): tower(batch.images[m][0]) for m, tower in present(self.query, batch)}
 
     def keys(self, batch: Views) -> Embeddings:
-        return {("k", m): tower(batch.images[m][1]) for m, tower in self.key.items()}
+        return {("k", m): tower(batch.images[m][1]) for m, tower in present(self.key, batch)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         assert self.queues, "call prepare(rows) first"
-        self.pending = {m: z["k", m] for m in self.query}
+        self.pending = {m: z["k", m] for m in self.query if ("k", m) in z}
         tau = self.config.temperature
         queue: dict[str, Tensor] = {m: queue.keys for m, queue in self.queues.items()}  # type: ignore[misc]
-        return with_sum({m: queue_nce(z["q", m], z["k", m], queue[m], tau) for m in self.query})
+        return with_sum({m: queue_nce(z["q", m], z["k", m], queue[m], tau) for m in self.pending})
 
     def encoders(self) -> dict[str, nn.Module]:
         return trunks(self.query)
@@ -105,5 +106,6 @@ class MoCo(Contrastive):
     def after_step(self, progress: float) -> None:
         m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for modality, tower in self.query.items():
-            self.queues[modality].push(self.pending[modality])  # type: ignore[operator]
+            if modality in self.pending:
+                self.queues[modality].push(self.pending[modality])  # type: ignore[operator]
             self.key[modality].follow(tower, m)  # type: ignore[operator]

@@ -22,11 +22,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, row_pairs
 from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers, num_features, trunks
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum, momentum_at
@@ -42,11 +44,15 @@ class MViTacConfig(MethodConfig):
     """Momentum contrast within and across vision and touch. With one modality, only its intra-modal loss is used."""
 
     name: ClassVar[str] = "mvitac"
+    takes_missing: ClassVar[bool] = True
 
     temperature: float = 0.07
     """Temperature tau of InfoNCE. The paper compares .07, .2, .5 and 1; .07 is best."""
     lambda_inter: float = 1.0
     """Weight of the two inter-modal losses (eq. 14). Not given in the paper; 1 in the authors' code."""
+    lambda_sensor: float = field(default=0.0, metadata=LATER_IN_DIGEST)
+    """Weight of one more loss beside eq. 14: a touch view is told from others by the same press through another sensor
+    (rows with the same value in column press and another in column sensor). 0: none (paper)."""
     momentum: float = 0.99
     """Momentum m of eq. 1-3. Not given in the paper; .99 in the authors' code."""
     momentum_end: float | None = None
@@ -79,7 +85,7 @@ class MViTacConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(
             positive=("temperature",),
-            weight=("lambda_inter",),
+            weight=("lambda_inter", "lambda_sensor"),
             share=("momentum", "momentum_end"),
             width=("out", "hidden"),
         )
@@ -93,12 +99,24 @@ class MViTacConfig(MethodConfig):
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
 
     @property
+    def sensor_view(self) -> bool:
+        return self.lambda_sensor > 0
+
+    @property
     def both_ways(self) -> bool:
         """Whether each view is used as query and as key."""
         return self.symmetric or self.keys == "end-to-end"
 
+    def training_rows(self, pack: Pack) -> np.ndarray:
+        rows = super().training_rows(pack)
+        has = {modality: pack.has(modality)[rows] for modality in pack.spec.modalities}
+        parts = [PARTS[part] for part in self.losses if set(PARTS[part]) <= has.keys()]
+        return rows[np.any([has[x] & has[y] for x, y in parts], axis=0)] if parts else rows
+
     def without_idle(self, spec: DataSpec) -> Self:
         mine = replace(self, losses=tuple(part for part in possible_losses(spec) if part in self.losses))
+        if "touch" not in spec.modalities:
+            mine = replace(mine, lambda_sensor=0.0)
         return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
@@ -108,6 +126,8 @@ class MViTacConfig(MethodConfig):
                 f"losses {', '.join(self.losses)} need another modality than dataset {spec.name!r} has:"
                 f" give some of {', '.join(possible)}"
             )
+        if self.sensor_view and "touch" not in spec.modalities:
+            raise ValueError(f"lambda_sensor {self.lambda_sensor}: dataset {spec.name!r} has no touch, leave it out")
         return MViTac(self, spec, encoder)
 
 
@@ -158,24 +178,31 @@ class MViTac(Contrastive):
     def queries(self, batch: Views) -> Embeddings:
         """Eq. 4, 6, 9, 12."""
         views = (0, 1) if self.config.both_ways else (0,)
-        return embed("q", self.query, batch, views)
+        return embed("q", self.query, batch, views, more=self.config.keys == "end-to-end")
 
     def keys(self, batch: Views) -> Embeddings:
         """Eq. 5, 7, 10, 13. End-to-end keys are the queries themselves, so there is nothing to add."""
         views = (1, 0) if self.config.both_ways else (1,)
-        return embed("k", self.key, batch, views)
+        return embed("k", self.key, batch, views, more=True) | {
+            ("both", m): positions for m, positions in batch.both.items()
+        }
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         k = "q" if self.config.keys == "end-to-end" else "k"
         losses = {}
         for part, (x, y) in PARTS.items():
-            if x in self.query and y in self.query:
-                head = "intra" if x == y else "inter"
-                pairs = self.view_pairs(head)
-                terms = [info_nce(z["q", x, i, head], z[k, y, j, head], self.config.temperature) for i, j in pairs]
+            head = "intra" if x == y else "inter"
+            found = [row_pairs(z, x, y, ("q", x, i, head), (k, y, j, head)) for i, j in self.view_pairs(head)]
+            terms = [info_nce(*pair, self.config.temperature) for pair in found if pair]
+            if terms:
                 losses[part] = torch.stack(terms).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         minimised = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
+        if (
+            self.config.sensor_view and ("q", "touch", 0, "intra") in z
+        ):  # its key is the same press through another sensor
+            losses["sensor"] = info_nce(z["q", "touch", 0, "intra"], z[k, "touch", 2, "intra"], self.config.temperature)
+            minimised.append(self.config.lambda_sensor * losses["sensor"])
         return {"loss": torch.stack(minimised).sum(), **losses}  # eq. 14; losses that are not minimised are logged too
 
     def view_pairs(self, head: str) -> tuple[tuple[int, int], ...]:
@@ -196,20 +223,22 @@ class MViTac(Contrastive):
             key.follow(self.query[modality], m)  # type: ignore[operator]  # eq. 1-3
 
 
-def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...]) -> Embeddings:
+def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...], *, more: bool) -> Embeddings:
     """Embeddings of ``views`` of each modality by both heads, keyed ``(name, modality, view, head)``.
+
+    With ``more``, also of the views after the first two (``MethodConfig.sensor_view``).
 
     On a CPU the two towers run side by side, except with dropout, which needs one order of random numbers.
     """
 
     def of(modality: str) -> Embeddings:
         z: Embeddings = {}
-        for view in views:
+        for view in (*views, *(range(2, len(batch.images[modality])) if more else ())):
             images = batch.images[modality][view]
             z[name, modality, view, "intra"], z[name, modality, view, "inter"] = towers[modality](images)
         return z
 
-    branches = [partial(of, modality) for modality in towers]
+    branches = [partial(of, modality) for modality, _ in present(towers, batch)]
     if batch.rows.device.type != "cpu" or draws_random_numbers(towers):
         return {key: tensor for branch in branches for key, tensor in branch().items()}
     return in_branches(branches)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import EncoderConfig, Head, build_towers, trunks
 
 
@@ -24,6 +24,7 @@ class SimCLRConfig(MethodConfig):
     """Contrast two views of an image with the rest of the batch, per modality."""
 
     name: ClassVar[str] = "simclr"
+    takes_missing: ClassVar[bool] = True
 
     temperature: float = 0.1
     """Temperature tau (SimCLR, table 5: .1 is best with normalised embeddings)."""
@@ -64,10 +65,10 @@ class SimCLR(Contrastive):
         )
 
     def queries(self, batch: Views) -> Embeddings:
-        return {(m, i): tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}
+        return {(m, i): tower(batch.images[m][i]) for m, tower in present(self.towers, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
-        return with_sum({m: nt_xent(z[m, 0], z[m, 1], self.config.temperature) for m in self.towers})
+        return with_sum({m: nt_xent(z[m, 0], z[m, 1], self.config.temperature) for m in self.towers if (m, 0) in z})
 
     def encoders(self) -> dict[str, nn.Module]:
         return trunks(self.towers)

@@ -4,6 +4,8 @@ A task asks for a class (cross-entropy) or for values (smooth L1 on standardised
 
 This is how the paper describes its ResNet-18 rows (appendix C). It also shows how much of a task the same network can learn
 from labels: its own heads are scored, and its frozen trunks are probed like those of any other method.
+
+From the weights of another run (``Run.init``) the same method is fine-tuning, of all weights or of a part of them.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
-from mvitac.registry import formerly, unknown
+from mvitac.nn.finetuning import AttentivePool, Part, freeze_statistics, merged, train_part
+from mvitac.registry import LATER, formerly, unknown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +48,10 @@ class LabelledConfig(MethodConfig):
         if self.labels == "train":
             rows = super().training_rows(pack)
         else:
-            rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in self.modalities_of(pack.spec)]))
+            modalities = self.modalities_of(pack.spec)
+            known = [pack.answered(task, *self.label_splits) for task in self.tasks_of(pack.spec)]
+            self.check_senses(pack, np.flatnonzero(pack.whole & np.any(known, axis=0)), modalities)
+            rows = np.flatnonzero(np.logical_and.reduce([pack.has(m) for m in modalities]))
         labelled = {t.name: pack.answered(t, *self.label_splits)[rows] for t in self.tasks_of(pack.spec)}
         for task, there in labelled.items():
             if not there.any():
@@ -118,17 +124,77 @@ class SupervisedConfig(LabelledConfig):
 
     name: ClassVar[str] = "supervised"
 
+    train: Part = field(default="all", metadata=LATER)
+    """What of the trunks is trained, beside the heads. all. last-stage. lora: low-rank updates of all layers, and
+    BatchNorm. attentive: an attention over the last feature map that is added to the pooled features. head: nothing."""
+    rank: int = field(default=8, metadata=LATER)
+    """Rank of the updates of lora."""
+    heads_from: Literal["random", "probe"] = field(default="random", metadata=LATER)
+    """Start of the heads. probe: linear probes fitted on the start features of the training rows (LP-FT,
+    arXiv:2202.10054)."""
+    share: float = field(default=1.0, metadata=LATER)
+    """Share of the labelled groups to learn from, drawn at random; at least one group of each class."""
+    draw: int = field(default=1, metadata=LATER)
+    """Which random draw: 1, 2, ..."""
+    hold_out: bool = field(default=False, metadata=LATER)
+    """Leave out some of these groups, on which settings are chosen: those of split val, else a fifth."""
+
+    def __post_init__(self) -> None:
+        self.check_fields(width=("rank", "draw"))
+        if not 0 < self.share <= 1:
+            raise ValueError(f"share {self.share}: give a share of the groups, above 0, at most 1")
+
+    def training_rows(self, pack: Pack) -> np.ndarray:
+        rows = super().training_rows(pack)
+        if self.share == 1 and not self.hold_out:
+            return rows
+        kept, held = self._drawn_groups(pack, rows)
+        return rows[np.isin(pack.column("group")[rows].astype(str), kept if self.hold_out else [*kept, *held])]
+
+    def _drawn_groups(self, pack: Pack, rows: np.ndarray) -> tuple[list[str], list[str]]:
+        """Names of the groups to learn from, and of those to choose settings on. A larger share adds to a smaller one.
+
+        Raises:
+            ValueError: If groups are to be held out, and there are too few.
+        """
+        groups = pack.column("group")[rows].astype(str)
+        order = np.random.default_rng(self.draw).permutation(np.unique(groups))
+        tasks = self.tasks_of(pack.spec)
+        needed: dict[str, None] = {}
+        for task in tasks:
+            labels = pack.labels(task.name, *self.label_splits)[rows] if isinstance(task, Task) else np.zeros(len(rows))
+            for label in np.unique(labels[labels >= 0]):
+                mine = set(groups[labels == label])
+                needed.setdefault(next(name for name in order if name in mine))
+        drawn = [*needed, *(name for name in order if name not in needed)]
+        drawn = drawn[: max(len(needed), round(self.share * len(drawn)))]
+        spare = [name for name in drawn if name not in needed]
+        val = set(groups[pack.column(tasks[0].split)[rows] == "val"])
+        held = [name for name in spare if name in val]
+        held = held if len(held) > 1 else spare[max(0, len(spare) - len(drawn) // 5) :]
+        if self.hold_out and not held:
+            raise ValueError(
+                f"{len(drawn)} labelled {pack.spec.group_by}s are too few to hold some out and choose settings on them"
+            )
+        return [name for name in drawn if name not in held], held
+
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
         trunks = {m: build_trunk(encoder, spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
+        for m in trunks if self.train == "attentive" else ():
+            trunks[m] = AttentivePool(trunks[m])
         width = sum(num_features(trunk) for trunk in trunks.values())
-        return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)))
+        return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)), self.train, self.rank)
 
 
 class Supervised(Method):
-    """One head per task on the concatenated features."""
+    """One head per task on the concatenated features. Of the trunks, ``part`` is trained (``nn.finetuning.train_part``)."""
 
-    def __init__(self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module]) -> None:
+    def __init__(
+        self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module], part: Part = "all", rank: int = 8
+    ) -> None:
         super().__init__()
+        self.part: Part = part
+        self.rank = rank
         self.trunks = nn.ModuleDict(trunks)
         # A list, because task names may contain characters that module names may not.
         self.tasks = tuple(classifiers)
@@ -146,13 +212,23 @@ class Supervised(Method):
             losses[task] = total / (labels >= 0).sum().clamp(min=1)  # 0, not NaN, for a batch without labels
         return with_sum(losses)
 
+    def prepare(self, rows: Tensor) -> None:
+        for trunk in self.trunks.values():
+            train_part(trunk, self.part, self.rank)
+
+    def train(self, mode: bool = True) -> Self:
+        super().train(mode)
+        for trunk in self.trunks.values() if self.part != "all" else ():
+            freeze_statistics(trunk)
+        return self
+
     def learn_scale(self, values: dict[str, Tensor]) -> None:
         for task, head in zip(self.tasks, self.heads, strict=True):
             if isinstance(head, ValueHead):
                 head.learn_scale(values[task])
 
     def encoders(self) -> dict[str, nn.Module]:
-        return dict(self.trunks.items())
+        return {m: merged(trunk) for m, trunk in self.trunks.items()}
 
     def classifiers(self) -> dict[str, nn.Module]:
         return dict(zip(self.tasks, self.heads, strict=True))

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
-from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
 
 
@@ -30,6 +30,7 @@ class VICRegConfig(MethodConfig):
     """Variance, invariance and covariance terms on two views, per modality."""
 
     name: ClassVar[str] = "vicreg"
+    takes_missing: ClassVar[bool] = True
 
     invariance: float = 25.0
     """Weight of s (VICReg: 25)."""
@@ -78,11 +79,11 @@ class VICReg(Contrastive):
         self.towers = build_towers(encoder, spec, expander)
 
     def queries(self, batch: Views) -> Embeddings:
-        return {(m, i): tower(batch.images[m][i]) for m, tower in self.towers.items() for i in (0, 1)}
+        return {(m, i): tower(batch.images[m][i]) for m, tower in present(self.towers, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         losses: dict[str, Tensor] = {}
-        for modality in self.towers:
+        for modality in (m for m in self.towers if (m, 0) in z):
             first, second = (z[modality, i].float() for i in (0, 1))
             with torch.autocast(first.device.type, enabled=False):
                 s = F.mse_loss(first, second)

@@ -16,9 +16,11 @@ import torch.nn.functional as F
 from huggingface_hub import constants, get_session, try_to_load_from_cache
 from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
+from timm.models.vision_transformer import VisionTransformer
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
+from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.small_conv import use_convolutions, use_products
 from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.system.files import brief
@@ -28,6 +30,10 @@ MAP_SIDE = 7
 """A feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px."""
 _WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """Names of timm's files on the hub."""
+_VITS = ("timm.models.vision_transformer", "timm.models.deit", "timm.models.eva")
+"""timm's files of ViTs that take images of any size ..."""
+_ANY_SIZE = {"dynamic_img_size": True, "dynamic_img_pad": True}
+"""... with these arguments: positions are interpolated, and the last patches padded."""
 
 
 @register_model
@@ -39,6 +45,32 @@ def mvitac_tiny(pretrained: bool = False, **kwargs: Any) -> ResNet:
         kwargs.pop(key, None)
     shape: dict[str, Any] = {"block": BasicBlock, "layers": (1, 1, 1, 1), "channels": (8, 16, 32, 64)}
     return ResNet(**shape, stem_width=8, stem_type="deep", **kwargs)
+
+
+@register_model
+def mvitac_vit(pretrained: bool = False, **kwargs: Any) -> VisionTransformer:
+    """A ViT for CPUs and small images: 192 features, 6 blocks, patches of 8 px (2.7 M parameters)."""
+    return _small_vit("mvitac_vit", pretrained, {"embed_dim": 192, "depth": 6, "num_heads": 3}, kwargs)
+
+
+@register_model
+def mvitac_tiny_vit(pretrained: bool = False, **kwargs: Any) -> VisionTransformer:
+    """A ViT with 64 features and 2 blocks, patches of 8 px (116 k parameters), for tests."""
+    return _small_vit("mvitac_tiny_vit", pretrained, {"embed_dim": 64, "depth": 2, "num_heads": 2}, kwargs)
+
+
+def _small_vit(name: str, pretrained: bool, shape: dict[str, Any], kwargs: dict[str, Any]) -> VisionTransformer:
+    """A ViT for 64 px without a class token; its learned positions start as sines and cosines."""
+    if pretrained:
+        raise ValueError(f"{name} has no ImageNet weights: use --encoder.weights scratch")
+    for key in ("pretrained_cfg", "pretrained_cfg_overlay", "cache_dir"):
+        kwargs.pop(key, None)
+    usual: dict[str, Any] = {"class_token": False, "global_pool": "avg", "fc_norm": False} | _ANY_SIZE
+    vit = VisionTransformer(**{"img_size": 64, "patch_size": 8, **usual, **shape, **kwargs})
+    assert vit.pos_embed is not None
+    with torch.no_grad():
+        vit.pos_embed.copy_(sin_cos_positions(*vit.patch_embed.grid_size, vit.embed_dim))  # type: ignore[call-arg]
+    return vit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,10 +159,13 @@ def last_map(trunk: nn.Module, images: Tensor) -> Tensor:
     if found.ndim == 3:  # [B, tokens, D]
         front = int(getattr(trunk, "num_prefix_tokens", 0))
         side = math.isqrt(found.shape[1] - front)
-        if side <= MAP_SIDE or side * side != found.shape[1] - front:
+        grid: tuple[int, ...] = getattr(trunk, "grid", (1, side, side))  # steps of time, rows, columns
+        if max(grid[1:]) <= MAP_SIDE or math.prod(grid) != found.shape[1] - front:
             return found
-        grid = found[:, front:].mT.unflatten(2, (side, side))
-        return torch.cat([found[:, :front], F.adaptive_avg_pool2d(grid, MAP_SIDE).flatten(2).mT], dim=1)
+        places = found[:, front:].mT.unflatten(2, grid).flatten(1, 2)
+        places = F.adaptive_avg_pool2d(places, (min(grid[1], MAP_SIDE), min(grid[2], MAP_SIDE)))
+        places = places.unflatten(1, (-1, grid[0])).flatten(2).mT
+        return torch.cat([found[:, :front], places], dim=1)
     if found.shape[1] != num_features(trunk) == found.shape[3]:
         found = found.permute(0, 3, 1, 2)  # timm's Swin has channels last
     height, width = (min(side, MAP_SIDE) for side in found.shape[2:])
@@ -140,14 +175,23 @@ def last_map(trunk: nn.Module, images: Tensor) -> Tensor:
 def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:
     trunk = _from_timm(config, channels)
     if config.stem == "random" and channels != 3:
-        names = trunk.pretrained_cfg["first_conv"]  # type: ignore[index]
-        for name in [names] if isinstance(names, str) else names:
+        for name in stem_names(trunk):
             trunk.get_submodule(name).reset_parameters()  # type: ignore[operator]
     return trunk
 
 
+def stem_names(trunk: nn.Module) -> list[str]:
+    """Names of the convolutions of a timm model that see the image."""
+    known = (getattr(trunk, "pretrained_cfg", None) or {}).get("first_conv")
+    if known:
+        return [known] if isinstance(known, str) else list(known)
+    return [name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d)][:1]
+
+
 def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
     arguments: dict[str, Any] = {"num_classes": 0, "in_chans": channels}
+    if timm.models.model_entrypoint(config.trunk.split(".")[0]).__module__ in _VITS:
+        arguments |= _ANY_SIZE
     if config.weights == SCRATCH:
         try:
             return timm.create_model(config.trunk, **arguments)

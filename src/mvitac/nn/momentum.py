@@ -28,6 +28,7 @@ class Momentum(nn.Module):
         super().__init__()
         self.module = copy.deepcopy(query).requires_grad_(False)
         self.running_norm = running_norm
+        self._query = (query,)  # in a tuple, or its parameters would be listed here, too
 
     def train(self, mode: bool = True) -> Momentum:
         return super().train(mode and not self.running_norm)
@@ -35,6 +36,10 @@ class Momentum(nn.Module):
     @torch.no_grad()
     def forward(self, *inputs: Any) -> Any:
         return self.module(*inputs)
+
+    def restart(self) -> None:
+        """Copy the query module again, after other weights were loaded into it."""
+        self.follow(self._query[0], 0.0)
 
     @torch.no_grad()
     def follow(self, query: nn.Module, m: float) -> None:

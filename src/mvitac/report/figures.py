@@ -224,6 +224,9 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
         look: dict[str, Any] = {"color": colour(line.hue), "marker": marker, "markersize": 3.2}
         (drawn,) = axes.plot(line.x, line.y, line.dash, linewidth=1.2 if several else 1.8, **look)
         handles.setdefault(line.label, drawn)
+        if line.x[0] == 0:  # the value before the first step
+            look = {"color": colour(line.hue), "linestyle": "--", "linewidth": 0.9, "alpha": 0.6}
+            handles["start"] = axes.axhline(line.y[0], zorder=0.9, **look)
     for number, (name, value) in enumerate((references or {}).items()):
         look = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3], "linewidth": 1.1}
         handles[name] = axes.axhline(value, zorder=0.9, **look)

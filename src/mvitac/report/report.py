@@ -112,7 +112,7 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     usable = []
     for task in pack.spec.all_tasks:
         try:
-            split_rows(pack, task, "both")
+            split_rows(pack, task, "none" if pack.parts else "both")
         except ValueError:  # no labelled rows to fit or to score
             continue
         usable.append(task.name)

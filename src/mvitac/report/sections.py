@@ -170,19 +170,22 @@ def collapse(study: Study) -> str:
     where = f"{study.pack.spec.group_by}s held out for this (split val)"
     if len(study.pack.rows("val")) < 2:
         where = "training rows (no val split)"
-    return html.paragraph(f"Measured while training, on {where}.") + html.grid(drawn)
+    said = [f"{r.source}, seed {r.run.seed}: {e['verdict']}." for r in study.runs for e in r.log if "verdict" in e]
+    intro = f"Measured while training, on {where}. Dashed: the value at the start, before the first step."
+    return html.paragraph(intro) + "".join(map(html.paragraph, said)) + html.grid(drawn)
 
 
 def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
     """Title, curves (key in the log -> label, hue) and caption of each figure about collapse."""
 
     def each(name: str) -> dict[str, tuple[str, str]]:
-        return {f"{m}/{name}": (m, MODALITY_HUES[m]) for m in study.pack.spec.modalities}
+        return {f"{m}/{name}": (m, hue) for m, hue in MODALITY_HUES.items()}  # a curve that no log has is left out
 
     across = {
         f"{d} R@5": (d.replace("->", " → "), hue)
         for d, hue in {"vision->touch": "green", "touch->vision": "purple"}.items()
     }
+    probe = "Accuracy, or R2 of values; fitted on training rows, scored on held-out rows, never test."
     knn = "20 nearest training rows vote; held-out rows, never test."
     return [
         ("std of the features", each("std"), "About 1: spread out; 0: collapsed."),
@@ -190,6 +193,7 @@ def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
         ("alignment", {"alignment": ("pairs", "green")}, "Squared distance of pairs; 0: they agree, 2: unrelated."),
         ("uniformity", each("uniformity"), "0: collapsed; −4: spread over the sphere."),
         ("modality gap", {"modality gap": ("touch to vision", "green")}, "Distance of the two means; 0: mixed."),
+        *((f"linear probe, {task.name}", each(f"linear {task.name}"), probe) for task in study.pack.spec.all_tasks),
         *((f"kNN accuracy, {task.name}", each(f"knn {task.name}"), knn) for task in study.pack.spec.tasks),
         ("retrieval R@5", across, "Own group among the first five, in the space both share."),
     ]

@@ -21,7 +21,7 @@ from mvitac.evaluation.score_text import (
     tested_on,
     with_interval,
 )
-from mvitac.evaluation.scores import interval, leaks_in
+from mvitac.evaluation.scores import interval, leaks_in, paired_difference
 from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
@@ -141,6 +141,22 @@ def print_retrieval(result: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
+def print_sensors(result: dict[str, Any], console: Console) -> None:
+    """Print which statistics of touch sensors were used, and what features tell of the sensor, if either was asked for."""
+    for line in result.get("statistics", ()):
+        console.print(line, markup=False, highlight=False)
+    if not result.get("sensors"):
+        return
+    table = Table(title="touch sensors", title_justify="left", title_style="bold")
+    for column in ("", "", "%", "chance %"):
+        table.add_column(column)
+    for source, name in dict.fromkeys((r["source"], r["name"]) for r in result["sensors"]):
+        found = [r for r in result["sensors"] if (r["source"], r["name"]) == (source, name)]
+        shown = [percent(sum(r[key] for r in found) / len(found)) for key in ("score", "chance")]
+        table.add_row(source, "R@5: " * (name != "which sensor") + name, *shown)
+    console.print(table)
+
+
 def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Rows of source, direction and ``RETRIEVAL`` in percent, averaged over seeds."""
     rows = []
@@ -164,3 +180,57 @@ def by_direction(records: Sequence[dict[str, Any]]) -> dict[tuple[str, str], lis
     for record in records:
         found.setdefault((record["source"], record["direction"]), []).append(record)
     return found
+
+
+def print_finetuning(result: dict[str, Any], console: Console) -> None:
+    """Print the result of ``experiments.finetune``: a table per task, with a column for each share of the labels."""
+    tasks: dict[str, dict[str, dict[float, list[dict[str, Any]]]]] = {}
+    for record in result["records"]:
+        cells = tasks.setdefault(record["task"], {}).setdefault(record["source"], {})
+        cells.setdefault(record["fraction"], []).append(record)
+    for task, cells in tasks.items():
+        (_, ours), *others = cells.items()
+        score = "R2" if "r2" in next(iter(ours.values()))[0] else "accuracy"
+        table = _table(f"{result['data']}: {task}", f"{score} %", *(f"{f:g} % of {result['group_by']}s" for f in ours))
+        for source, found in cells.items():
+            table.add_row(source, *map(_score_text, found.values()))
+        table.add_section()
+        for source, found in others:
+            table.add_row(f"gain over {source}", *(_gain_text(ours[f], found[f]) for f in ours))
+        console.print(table)
+    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
+    for note in [*(f"note: {note}" for note in result["notes"]), *(f"LEAK: {leak}" for leak in result["leaks"])]:
+        console.print(note, markup=False, highlight=False)
+
+
+def print_adaptation(result: dict[str, Any], console: Console) -> None:
+    """Print the result of ``experiments.adapt``: a table for each data, before and after."""
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for record in result["records"]:
+        found.setdefault(record["data"], {}).setdefault(f"{record['task']}, {record['modality']}", []).append(record)
+    for name, rows in found.items():
+        table = _table(f"{name}: test {result['group_by']}s", "score %", "before", "after", "change")
+        for what, (before, after) in rows.items():
+            table.add_row(what, _score_text([before]), _score_text([after]), _gain_text([after], [before]))
+        console.print(table)
+    if not found:
+        console.print("nothing to score: the data has no labels and no shared space of two modalities")
+    about = f"95 % intervals: over test {result['group_by']}s only, for this one run; R2 of values, else accuracy."
+    console.print(about, style="dim")
+
+
+def _table(title: str, first: str, *columns: str) -> Table:
+    table = Table(first, title=title, title_justify="left", title_style="bold")
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
+    return table
+
+
+def _score_text(records: Sequence[dict[str, Any]]) -> str:
+    return with_interval(*interval(records), leaks_in(records)).replace(" LEAK", "\nLEAK")
+
+
+def _gain_text(ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]) -> str:
+    """The paired difference in points with its interval, such as '+3.1 [+0.4, +5.8]'."""
+    mean, low, high, _ = paired_difference(ours, theirs)
+    return f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"

@@ -11,6 +11,7 @@ untrained trunk, and below 97 %. Therefore:
 - Force, LED gain, sensor, lamp, tint, amplitude, background and clutter vary much more than the labels' effects.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -22,7 +23,7 @@ from mvitac.sim.contact import contact
 from mvitac.sim.coordinates import Motion, grid, outline, turn
 from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
-from mvitac.sim.sensors import SENSORS
+from mvitac.sim.sensors import SENSORS, Sensor
 
 VERSION = 1
 """Stored in the pack. Increase it with every change of a pixel."""
@@ -163,6 +164,8 @@ def touch(
     background: bool = False,
     moment: int = 0,
     measured: bool = False,
+    sensors: Sequence[Sensor] = (),
+    through: int = 0,
 ) -> dict[str, Any]:
     """Simulate one pair.
 
@@ -173,6 +176,9 @@ def touch(
         background: Also return "background", the same copy of the sensor before contact.
         moment: 0, or the number of a later moment of the same press (`motion.Motion`).
         measured: Also return depth, position and size of the contact (`contact.KNOWN`).
+        sensors: Sensors to choose from. Default: the known ones, or the held-out one.
+        through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs from
+            those of smaller numbers; the camera takes another picture.
 
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
@@ -183,9 +189,15 @@ def touch(
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
     motion = Motion.draw(_TAG, seed, category, instance, touch, moment) if moment else None
-    vision = _look(thing, eye, angle + eye.normal(0, 0.1), place, size, motion)
+    choice = sensors or [s for s in SENSORS.values() if s.held_out == held_out_sensor]
+    if not 0 <= through < len(choice):
+        raise ValueError(
+            f"through {through}: there are {len(choice)} sensors to press on one spot, give a smaller number"
+        )
+    again = np.random.default_rng([_TAG, seed, category, instance, touch, 0, through]) if through else None
+    vision = _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size, motion)
     pressed = _feel(
-        thing, finger, angle + finger.normal(0, 0.1), place, size, held_out_sensor, background, motion, measured
+        thing, finger, angle + finger.normal(0, 0.1), place, size, choice, background, motion, measured, through, again
     )
     return {
         "vision": vision,
@@ -297,14 +309,18 @@ def _feel(
     angle: float,
     place: NDArray[np.float64],
     size: int,
-    held_out: bool,
+    choice: Sequence[Sensor],
     background: bool,
     motion: Motion | None,
     measured: bool,
+    through: int,
+    again: np.random.Generator | None,
 ) -> dict[str, Any]:
-    """Press the object into a gel: "touch" and, if requested, "background" (uint8 [size, size, 3]), sensor and force."""
-    choice = [s for s in SENSORS.values() if s.held_out == held_out]
-    sensor = choice[int(rng.random() * len(choice))]
+    """Press the object into a gel: "touch" and, if requested, "background" (uint8 [size, size, 3]), sensor and force.
+
+    The further sensor number `through` has a copy, LED gain and noise of its own, drawn from `again`.
+    """
+    sensor = choice[(int(rng.random() * len(choice)) + through) % len(choice)]
     force = float(np.exp(rng.uniform(*np.log((2.0, 12.0)))))
     gain = float(np.exp(rng.uniform(*np.log((0.5, 1.2)))))
     dome = float(rng.uniform(18.0, 40.0))
@@ -331,6 +347,8 @@ def _feel(
     relief = relief + tilt[0] * x + tilt[1] * y - bulge * (x * x + y * y)
     physics: dict[str, Any] = {"stiffness": thing.stiffness, "pixel_mm": pixel, "dome_radius_mm": dome}
     imprint = press(relief, force_n=force, **physics)
+    if again is not None:
+        rng, gain = again, float(np.exp(again.uniform(*np.log((0.5, 1.2)))))
     unit = int(rng.integers(2**31))
     noise = motion.noise if motion else rng
     draw = partial(render, sensor=sensor, rng=noise, pixel_mm=pixel, size=size, unit=unit, gain=gain)

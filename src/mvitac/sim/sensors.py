@@ -1,6 +1,11 @@
 """Models of tactile sensors: colours, LED directions, printed dots, dirt and lens edge."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any, cast
+
+import numpy as np
 
 RGB = tuple[float, float, float]
 Pair = tuple[float, float]
@@ -123,3 +128,53 @@ SENSORS: dict[str, Sensor] = {
         ),
     )
 }
+
+MARGIN = 0.25
+"""How far a random sensor may lie outside the four known ones: this part of their range, on either side."""
+_TAG = 0x5E5
+
+
+@cache
+def random_sensors(seed: int, num: int) -> tuple[Sensor, ...]:
+    """Draw ``num`` sensors that no shop sells, to train on many instead of four.
+
+    Every number is uniform over the range of the known sensors (held-out ones excluded), widened by ``MARGIN``. The LEDs
+    of the three channels lie about 120 degrees apart, as in all known sensors; their order round the gel and the direction
+    of the first are random. Half of the sensors have dots. Sensor i depends on (seed, i) only.
+
+    Example:
+        >>> [sensor.name for sensor in random_sensors(0, 2)]
+        ['random0000', 'random0001']
+    """
+    return tuple(_random_sensor(seed, number) for number in range(num))
+
+
+def _random_sensor(seed: int, number: int) -> Sensor:
+    rng, known = np.random.default_rng([_TAG, seed, number]), [s for s in SENSORS.values() if not s.held_out]
+
+    def within(values: Iterable[float], *size: int) -> np.ndarray:
+        low, high = min(values := list(values)), max(values)
+        extra = MARGIN * (high - low)
+        return rng.uniform(max(low - extra, 0.0) if low >= 0 else low - extra, high + extra, size)
+
+    base = within((level for s in known for level in s.base), 3)
+    spots = np.array([spot for s in known for spot in s.glow])
+    # A dark channel has a high spot: the level at the centre varies much less than either.
+    height = within((b + spot[0] for s in known for b, spot in zip(s.base, s.glow, strict=True)), 3) - base
+    place = [within(column, 3) for column in spots.T[1:]]
+    tilt = np.stack([within((pair[axis] for s in known for pair in s.tilt), 3) for axis in (0, 1)], axis=1)
+    strength = within((float(np.hypot(*pair)) for s in known for pair in s.response), 3)
+    spread = np.arange(3) * 2 * np.pi / 3 + rng.uniform(-0.4, 0.4, 3)
+    angle = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * spread
+    dots = [f.name for f in fields(Sensor) if f.name.startswith("marker_")] * int(rng.random() < 0.5)
+    plain = ("saturation", "shadow", "dirt", "scratches", "edge", "noise")
+    values: dict[str, Any] = {name: float(within(getattr(s, name) for s in known)) for name in plain}
+    values |= {name: float(within(getattr(s, name) for s in known if s.marker_pitch_mm)) for name in dots}
+    pairs: Any = [
+        np.stack([np.maximum(height, 10.0), *place], 1),
+        tilt,
+        strength[:, None] * np.c_[np.cos(angle), np.sin(angle)],
+    ]
+    glow, tilts, response = (cast(Any, tuple(map(tuple, rows.tolist()))) for rows in pairs)
+    base = tuple(base.tolist())
+    return Sensor(name=f"random{number:04d}", base=base, glow=glow, tilt=tilts, response=response, **values)

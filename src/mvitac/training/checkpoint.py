@@ -38,17 +38,24 @@ class Damaged(ValueError):
 
 
 def save(
-    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, step: int, world: World | None = None
+    out: Path,
+    run: Run,
+    method: Method,
+    optimiser: torch.optim.Optimizer,
+    step: int,
+    world: World | None = None,
+    *,
+    kept: dict[str, Any] | None = None,
 ) -> None:
     """Write the state after ``step`` steps to checkpoint.pt in the run's folder ``out``, and keep the one before it.
 
-    All processes of ``world`` must call it; one of them writes.
+    All processes of ``world`` must call it; one of them writes. ``kept`` is the state of validation (tensors and numbers).
     """
     state = {"method": method.state_dict(), "optimiser": optimiser.state_dict(), "step": step}
     if world and not world.writes:
         return
     buffer = io.BytesIO()  # torch.save to a file would hide the error of a full disk
-    torch.save({**state, "run": run.digest()}, buffer)
+    torch.save({**state, "run": run.digest(), "kept": kept or {}}, buffer)
     seal(buffer)
 
     def write(file: Any) -> None:
@@ -68,9 +75,16 @@ def seal(buffer: io.BytesIO) -> None:
 
 
 def restore(
-    out: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, num_steps: int, world: World | None = None
+    out: Path,
+    run: Run,
+    method: Method,
+    optimiser: torch.optim.Optimizer,
+    num_steps: int,
+    world: World | None = None,
+    *,
+    kept: dict[str, Any] | None = None,
 ) -> int:
-    """Load the checkpoint in the run's folder ``out`` into ``method`` and ``optimiser``.
+    """Load the checkpoint in the run's folder ``out`` into ``method`` and ``optimiser``, and what it kept into ``kept``.
 
     If it is damaged, it is deleted and the one before it is used, with a message on stderr.
 
@@ -84,7 +98,7 @@ def restore(
     damage: Damaged | None = None
     for path in found:
         try:
-            step = _restore(path, run, method, optimiser, num_steps)
+            step = _restore(path, run, method, optimiser, num_steps, {} if kept is None else kept)
         except Damaged as error:
             damage = damage or error
             continue
@@ -98,7 +112,9 @@ def restore(
     return 0
 
 
-def _restore(path: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, num_steps: int) -> int:
+def _restore(
+    path: Path, run: Run, method: Method, optimiser: torch.optim.Optimizer, num_steps: int, kept: dict[str, Any]
+) -> int:
     try:
         _check_seal(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
@@ -122,6 +138,7 @@ def _restore(path: Path, run: Run, method: Method, optimiser: torch.optim.Optimi
         optimiser.load_state_dict(state["optimiser"])
     except Exception as error:  # other names, other shapes, other types
         raise ValueError(f"{path} does not fit this run ({brief(error)}): delete it to start over") from None
+    kept.update(state.get("kept", {}))  # older checkpoints have none
     return state["step"]
 
 

@@ -69,8 +69,8 @@ def ahead(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
     for batch, made in prefetch(on_side()):
         stream = torch.cuda.current_stream(device)
         stream.wait_event(made)
-        answers = (*batch.labels.values(), *batch.values.values())
-        for tensor in [batch.rows, *answers, *(v for views in batch.images.values() for v in views)]:
+        answers = (*batch.labels.values(), *batch.values.values(), *batch.both.values())
+        for tensor in [batch.rows, batch.seed, *answers, *(v for views in batch.images.values() for v in views)]:
             tensor.record_stream(stream)  # else its memory could be reused while the network reads it
         yield batch
 

@@ -37,8 +37,8 @@ class Log:
         self, out: Path, start: int, num_steps: int, batch_size: int, *, quiet: bool, loggers: tuple[Logger, ...]
     ) -> None:
         path = out / "log.jsonl"
-        kept = []
-        if path.exists():
+        kept, self.first = [], {}
+        if path.exists() and start:  # a run that starts again writes all lines again
             for line in path.read_text(errors="replace").splitlines():
                 try:
                     entry = parse_json(line)
@@ -47,6 +47,8 @@ class Log:
                     break  # an incomplete line, written when the run was killed
                 if early:
                     kept.append(line + "\n")
+                    if entry["step"] == 0:
+                        self.first = entry.get("eval", {})
         write_atomic(path, lambda file: file.write("".join(kept).encode()))
         self.path, self.file = path, path.open("a")
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
@@ -81,10 +83,20 @@ class Log:
         if self.bars:
             self.bars.update(self.bar, completed=step)
 
-    def evaluation(self, step: int, values: dict[str, float]) -> None:
-        self._write({"step": step, "eval": values})
-        best = [f"{name} {value:.3f}" for name, value in values.items() if "knn" in name or name.endswith("R@5")]
-        self.say(f"step {step}: " + ", ".join(best))
+    def evaluation(self, step: int, values: dict[str, float], verdict: str = "") -> None:
+        """Log ``values`` of an evaluation, each beside that of step 0; ``verdict`` is a sentence about the whole run."""
+        self._write({"step": step, "eval": values, **({"verdict": verdict} if verdict else {})})
+        if step == 0:
+            self.first = values
+        shown = []
+        for name, value in values.items():
+            if "/linear " in name or "/knn " in name or name.endswith("R@5"):
+                beside = step and name in self.first and not name.startswith("chance")
+                gain = f" ({value - self.first[name]:+.3f})" if beside else ""
+                shown.append(f"{name} {value:.3f}{gain}")
+        self.say(f"{'start, the line to beat' if step == 0 else f'step {step}'}: {', '.join(shown)}")
+        if verdict:
+            self.say(verdict)
 
     def say(self, text: str) -> None:
         """Print ``text`` on a line above the progress bar."""

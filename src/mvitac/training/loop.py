@@ -26,7 +26,7 @@ from mvitac.training import checkpoint
 from mvitac.training.log import EARLY, Log, Logger
 from mvitac.training.sampler import mix
 from mvitac.training.setup import Setup, check_out, check_still_there, set_up
-from mvitac.training.validation import evaluate
+from mvitac.training.validation import Validation
 from mvitac.training.views import load_chunks
 
 
@@ -46,12 +46,13 @@ def train(
     quiet: bool = False,
     loggers: tuple[Logger, ...] = (),
     pack: Pack | None = None,
+    validate: bool = True,
 ) -> Path:
     """Pre-train and write the result into a folder.
 
     The folder gets run.json (the settings), trained_on.safetensors (hashes of the rows it learns from), log.jsonl,
-    checkpoint.pt (to resume from) and model.safetensors (the result). Until it is finished, checkpoint.previous.pt is the
-    checkpoint before.
+    checkpoint.pt (to resume from) and model.safetensors (the result). With ``eval_every``, model.best.safetensors has the
+    weights that were best on split val. Until it is finished, checkpoint.previous.pt is the checkpoint before.
 
     Args:
         run: What to train, e.g. ``mvitac.recipe("demo")``.
@@ -60,6 +61,7 @@ def train(
         quiet: Print nothing.
         loggers: Functions ``(step, values)`` that receive all logged values.
         pack: The data, if it is already open. Default: open it from ``run.data``.
+        validate: Evaluate on held-out groups. It changes no weights.
 
     Returns:
         ``out``.
@@ -81,11 +83,11 @@ def train(
     with hold_lock(out, busy, wait=False) if world.writes else nullcontext():
         setup = set_up(run, out, world, quiet=quiet, pack=pack)
         if setup is not None:  # else the run is already finished
-            _loop(setup, out, quiet=quiet, loggers=loggers)
+            _loop(setup, out, quiet=quiet, loggers=loggers, validate=validate)
     return out
 
 
-def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) -> None:
+def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], validate: bool) -> None:
     run, pack, world, method, step = setup.run, setup.pack, setup.world, setup.method, setup.step
     start, num_steps = setup.start, setup.num_steps
     steps_per_epoch = run.steps_per_epoch(len(setup.rows))
@@ -97,6 +99,9 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) 
     with log_or_none or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
             log.say(describe_precision(setup.asked.precision, run.precision, setup.device))
+        validation = Validation(out, run, method, pack, log, setup.kept) if log and validate else None
+        if validation and start == 0:
+            validation(0)
         method.train()
         for at, chunks in enumerate(batches, start=start):
             done = at + 1  # number of steps, with this one
@@ -119,21 +124,21 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...]) 
             # Stop after Ctrl-C or SIGTERM. Several processes must agree on the step, and ask each other when they report.
             stop = stop_requested() if world.size == 1 else report and world.anyone(stop_requested())
             save = last or done % save_every == 0 or stop
-            if save:
+            evaluate = last or (run.eval_every > 0 and done % run.eval_every == 0)
+            if save or evaluate:
                 _check_weights(method, done, run)
 
             # Evaluate on held-out groups (split val).
             if log:
                 log.advance(done)
-                if last or (run.eval_every and done % run.eval_every == 0):
-                    log.evaluation(done, evaluate(Model(method, run, pack.spec, pack.size), pack, run))
-                    method.train()
+                if evaluate and validation:
+                    validation(done, last=last)
 
             # Save a checkpoint. All processes take part, because memory banks are sharded.
             if save:
                 if world.writes:
                     check_still_there(out)
-                checkpoint.save(out, run, method, step.optimiser, done, world)
+                checkpoint.save(out, run, method, step.optimiser, done, world, kept=setup.kept)
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
     if world.writes:

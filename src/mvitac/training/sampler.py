@@ -9,10 +9,14 @@ from typing import Literal
 import numpy as np
 import torch
 
+from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
 from mvitac.data.windows import places
 from mvitac.run import Run
 from mvitac.system.distributed import World
+
+Order = Callable[[int, np.ndarray | None, int], np.ndarray]
+"""(number of rows, their touch groups, seed) -> an order of the rows."""
 
 
 def mix(*numbers: int) -> int:
@@ -40,6 +44,8 @@ class Batches:
         self.order = spread_order if run.sampler == "spread" else epoch_order
         self.shards = pack.shards[rows]
         self._epoch = lru_cache(2)(self._order)
+        weighted = isinstance(pack, MixedPack) and pack.weighted
+        self.drawn = PartOrder(run, pack, rows, self.per_epoch, self.order) if weighted else None  # type: ignore[arg-type]
 
     def __getitem__(self, step: int) -> np.ndarray:
         """Rows [batch_size] of step ``step``, counted from 0."""
@@ -56,11 +62,96 @@ class Batches:
     def _order(self, epoch: int) -> np.ndarray:
         """[per_epoch, batch_size]"""
         seed, num = mix(self.seed, 1, epoch), self.per_epoch * self.batch_size
+        if self.drawn:
+            return self.drawn.epoch(epoch)
         if not self.window:
             return self.rows[self.order(len(self.rows), self.touch_groups, seed)[:num]].reshape(self.per_epoch, -1)
         size = self.world.size
         lanes = shard_order(self.shards, self.touch_groups, self.window, size, num, seed, self.order)
         return self.rows[lanes.reshape(size, self.per_epoch, self.share).swapaxes(0, 1).reshape(self.per_epoch, -1)]
+
+
+class PartOrder:
+    """Rows of each epoch of a mix whose parts are drawn by weight.
+
+    An epoch draws as many rows as it has room for. Each draw is of a random part, by weight: a row, or a whole batch if
+    batches are of one part. It takes the next rows of that part's endless sequence: pass after pass over its rows, each pass
+    in another order. All of it is a function of (seed, epoch); the number of earlier draws is counted from the first epoch.
+
+    Args:
+        run: Gives seed, batch size and sampler.
+        pack: The mix.
+        rows: Its rows to train on.
+        per_epoch: Number of steps in an epoch.
+        order: ``epoch_order`` or ``spread_order``, for a pass over a part.
+    """
+
+    def __init__(self, run: Run, pack: MixedPack, rows: np.ndarray, per_epoch: int, order: Order) -> None:
+        self.seed, self.order, self.shape = run.seed, order, (per_epoch, run.batch_size)
+        self.rows = [rows[pack.part_of[rows] == number] for number in range(len(pack.parts))]
+        self.touch_groups = [pack.touch_groups[own] if run.sampler != "shuffle" else None for own in self.rows]
+        self.shares = pack.shares(rows)
+        self.length = run.batch_size if pack.one_part else 1
+        """Rows of one draw."""
+        self.num = per_epoch * run.batch_size // self.length
+        """Draws of an epoch."""
+        self.before = [np.zeros(len(self.rows), np.int64)]
+        """Draws of each part before each epoch."""
+
+    def epoch(self, number: int) -> np.ndarray:
+        """Rows [per_epoch, batch_size] of epoch ``number``."""
+        for earlier in range(len(self.before) - 1, number + 1):
+            counts = np.random.default_rng(mix(self.seed, 2, earlier)).multinomial(self.num, self.shares)
+            self.before.append(self.before[-1] + counts)
+        first, last = self.before[number : number + 2]
+        parts = np.repeat(np.arange(len(self.rows)), last - first)
+        parts = np.random.default_rng(mix(self.seed, 3, number)).permutation(parts)
+        drawn = np.empty((self.num, self.length), np.int64)
+        for part in np.unique(parts).tolist():
+            wanted = self._sequence(part, int(first[part]) * self.length, int(last[part]) * self.length)
+            drawn[parts == part] = wanted.reshape(-1, self.length)
+        return drawn.reshape(self.shape)
+
+    def _sequence(self, part: int, start: int, end: int) -> np.ndarray:
+        """Rows ``start`` to ``end`` of the endless sequence of ``part``."""
+        rows, groups = self.rows[part], self.touch_groups[part]
+        passes = range(start // len(rows), -(-end // len(rows)))
+        orders = [rows[self.order(len(rows), groups, mix(self.seed, 4, part, number))] for number in passes]
+        skipped = passes.start * len(rows)
+        return np.concatenate(orders)[start - skipped : end - skipped]
+
+
+def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
+    """Check that ``run`` can train on ``rows`` of ``pack``, if it is a mix.
+
+    Raises:
+        ValueError: If a part has no rows, or fewer than its weight asks for in a batch, or the rows of a batch have other
+            modalities and are embedded in several places.
+    """
+    if not isinstance(pack, MixedPack):
+        return
+    sizes = np.bincount(pack.part_of[rows], minlength=len(pack.parts))
+    shares = np.ones(len(sizes)) if pack.one_part else pack.shares(rows)
+    for name, size, share in zip(pack.parts, sizes.tolist(), shares.tolist(), strict=True):
+        if not size:
+            raise ValueError(
+                f"method {run.method.name!r} with its settings learns from no row of part {name}: leave it out"
+            )
+        if size < share * run.batch_size - 1e-6:
+            raise ValueError(
+                f"part {name} has {size} rows to train on, but {share * run.batch_size:.0f} of a batch of {run.batch_size}"
+                f" are to be of it: a row would be its own negative; give a smaller --batch-size, or a smaller weight"
+            )
+    senses = np.stack([pack.has(modality)[rows] for modality in pack.spec.modalities])
+    if pack.one_part or (senses == senses[:, :1]).all():
+        return
+    if world.size > 1 or run.chunk:
+        raise ValueError(
+            "parts that lack a modality, in mixed batches, support neither several processes nor --chunk: give"
+            " --data.batches one-part"
+        )
+    if run.batch_size < 3:
+        raise ValueError(f"batch_size {run.batch_size}: parts that lack a modality need at least 3")
 
 
 def batches(
@@ -131,7 +222,7 @@ def shard_order(
     num_lanes: int,
     num: int,
     seed: int,
-    order: Callable[[int, np.ndarray | None, int], np.ndarray] = epoch_order,
+    order: Order = epoch_order,
 ) -> np.ndarray:
     """A random order of rows 0..N-1 in which each process needs few shards at a time.
 
@@ -167,23 +258,26 @@ def partners(
     generator: torch.Generator,
     of: Literal["touch_groups", "presses"] = "touch_groups",
     within: float = 0.0,
+    other_sensor: bool = False,
 ) -> np.ndarray:
     """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
 
-    With ``within``, its distance in time is at most that. A row without such others is its own partner.
+    With ``within``, its distance in time is at most that; with ``other_sensor``, it is of another sensor. A row without
+    such others is its own partner.
     """
     groups: np.ndarray = getattr(pack, of)
     split, shards = pack.column("split"), pack.shards
     place = places(pack, pack.spec.window)[1] if within else np.zeros(0)
-    whole = np.logical_and.reduce([pack.has(modality) for modality in pack.spec.modalities])
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]), of)
-        others = others[(others != row) & (split[others] == split[row]) & whole[others]]
+        others = others[(others != row) & (split[others] == split[row]) & pack.whole[others]]
         others = others[shards[others] == shards[row]]
         if within:
             others = others[abs(place[others] - place[row]) <= within + 1e-9]
+        if other_sensor:
+            others = others[pack.sensors[others] != pack.sensors[row]]
         if len(others):
             found[i] = others[int(draws[i] * len(others))]
     return found

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,10 +14,13 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.leaks import FILE, source_of, write_sources
+from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
 from mvitac.methods.base import Method
+from mvitac.methods.supervised import Supervised, SupervisedConfig
 from mvitac.model import Model, load
+from mvitac.nn.finetuning import renew_norms
 from mvitac.nn.memory_bank import replicated, shard_banks
+from mvitac.nn.momentum import Momentum
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import describe, pick_device, pick_precision
@@ -24,8 +29,12 @@ from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
+from mvitac.training.heads import fit_heads
+from mvitac.training.sampler import check_mix
+from mvitac.training.start import Start, load_start, read_start, warning
+from mvitac.training.start import describe as describe_start
 from mvitac.training.step import Step
-from mvitac.training.views import gel_mirror, values_of
+from mvitac.training.views import gel_mirror, load_chunks, values_of
 from mvitac.transforms.gel_flip import GelMirror
 
 
@@ -48,6 +57,8 @@ class Setup:
     start: int
     """Number of steps that are already done."""
     num_steps: int
+    kept: dict[str, Any]
+    """State of validation (``Validation``)."""
 
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
@@ -56,6 +67,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     Returns:
         The set-up, or None if the run in ``out`` is already finished.
     """
+    asked = replace(asked, init=asked.init.resolved())
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
     pack = open_pack(run.data, world, quiet) if pack is None else pack
@@ -63,10 +75,12 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
         _ = pack.presses  # the ValueError comes before anything is written
     if run.positives_within:
         places(pack, pack.spec.window)  # the same
+    run.method.check_pack(pack)
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     mirror = gel_mirror(run, pack, device)
     check_divisible(run, world)
+    check_mix(run, pack, rows, world)
     resumed = (out / "run.json").exists()
     if resumed:
         begun = check_same(asked, pack, out)
@@ -74,19 +88,30 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
             return None
         _check_precision(begun, asked, run, out)
 
-    method = _build_method(run, pack, rows, device, world)
+    start_weights = read_start(run.init, pack)
+    method, taken = _build_method(run, pack, rows, device, world, start_weights)
     step = Step(run, method, device, world)
     num_steps = run.num_steps(len(rows))
-    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world)
+    kept: dict[str, Any] = {}
+    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
+    if start == 0:
+        _before_first_step(run, method, pack, rows, device, world, mirror)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
     if not resumed and world.writes:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
         here = {"device": describe(device), "precision": run.precision}
+        if start_weights:
+            record |= {"start": taken}
+            for line in [] if quiet else [describe_start(taken)]:
+                print(f"mvitac: {line}", file=sys.stderr)
+            if found := warning(start_weights, pack):
+                print(f"mvitac: warning: {found}", file=sys.stderr)
         write_json(out / "run.json", {**record, **here, **provenance()})
     if world.writes and not (out / FILE).exists():
-        write_sources(out, [source_of(pack, rows)])
-    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps)
+        own = source_of(pack, rows)
+        write_sources(out, with_ancestors(own, start_weights.sources if start_weights else []))
+    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept)
 
 
 def check_out(out: Path, resume: bool) -> None:
@@ -179,19 +204,45 @@ def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
     return pack
 
 
-def _build_method(run: Run, pack: Pack, rows: np.ndarray, device: torch.device, world: World) -> Method:
-    """The method of ``run`` with fresh weights, on ``device``."""
+def _build_method(
+    run: Run, pack: Pack, rows: np.ndarray, device: torch.device, world: World, start: Start | None
+) -> tuple[Method, dict[str, Any]]:
+    """The method of ``run`` with fresh or start weights, on ``device``, and what was taken of ``start``."""
     if device.type == "cpu":
         keep_freed_memory()
     torch.manual_seed(run.seed)
     method = run.method.build(pack.spec, run.encoder)
+    taken = load_start(start, method) if start else {}
     method.prepare(torch.from_numpy(rows))
     method.learn_scale(values_of(run, pack, rows))
     shard_banks(method, world)
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _check_image_size(method, run, pack)
     synchronise_norms(method, world)
-    return method
+    return method, taken
+
+
+def _before_first_step(
+    run: Run,
+    method: Method,
+    pack: Pack,
+    rows: np.ndarray,
+    device: torch.device,
+    world: World,
+    mirror: GelMirror | None,
+) -> None:
+    """Estimate statistics of BatchNorm and fit heads, if the run asks for it. Their rows are a function of the seed."""
+    if run.renew_norms:
+        if world.size > 1:
+            raise ValueError("renew_norms works on one process only: leave it out, or start without torchrun")
+        steps = load_chunks(run, pack, rows, method.views, device, world, 0, run.renew_norms, mirror)
+        renew_norms(method.train(), (partial(method, chunk()) for chunks in steps for chunk in chunks))
+        for module in method.modules():
+            if isinstance(module, Momentum):
+                module.restart()
+    if isinstance(run.method, SupervisedConfig) and run.method.heads_from == "probe":
+        assert isinstance(method, Supervised)
+        fit_heads(method, run, pack, rows)
 
 
 @torch.no_grad()

@@ -14,9 +14,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from timm.optim import param_groups_layer_decay  # pyright: ignore[reportPrivateImportUsage]
 from torch import Tensor
 
 from mvitac.methods.base import Contrastive, Embeddings, Method, Views
+from mvitac.nn.encoders import PerFrame
 from mvitac.run import Optim, Run
 from mvitac.system.distributed import World
 
@@ -65,7 +67,7 @@ class Step:
             The losses, detached, on the device.
         """
         for group in self.optimiser.param_groups:
-            group["lr"] = lr
+            group["lr"] = lr * group.get("lr_scale", 1.0)
         self.optimiser.zero_grad(set_to_none=True)
         if len(chunks) == 1 and self.world.size == 1:
             torch.manual_seed(seed)
@@ -152,7 +154,9 @@ def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
     """Create the optimiser of the trainable parameters (momentum copies have none). Uses a fused kernel if available."""
     parameters: Any = [p for p in method.parameters() if p.requires_grad]
     fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
-    if config.weight_decay and not config.decay_norms:
+    if config.layer_decay < 1:
+        parameters = _by_layer(config, method, parameters)
+    elif config.weight_decay and not config.decay_norms:
         vectors = [p for p in parameters if p.ndim <= 1]  # biases and BatchNorm
         parameters = [
             {"params": [p for p in parameters if p.ndim > 1]},
@@ -163,6 +167,25 @@ def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
         return torch.optim.SGD(parameters, config.lr, momentum=momentum, weight_decay=decay, fused=fused)
     kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[config.name]
     return kind(parameters, config.lr, config.betas, config.eps, config.weight_decay, fused=fused)
+
+
+def _by_layer(config: Optim, method: Method, parameters: list[Tensor]) -> list[dict[str, Any]]:
+    """Groups of ``parameters`` with equal weight decay and, by layer of their trunk, equal share of the rate (lr_scale)."""
+    scales: dict[int, float] = {}
+    for name, encoder in method.encoders().items():
+        trunk = encoder.trunk if isinstance(encoder, PerFrame) else encoder
+        if not hasattr(trunk, "group_matcher"):
+            raise ValueError(f"the trunk of {name} names no layers: leave out --optim.layer-decay")
+        # timm gives a trunk without its classifier's layer the full rate at the end; here the heads are that layer.
+        for group in param_groups_layer_decay(trunk, layer_decay=config.layer_decay):
+            scales |= {id(p): config.layer_decay * group["lr_scale"] for p in group["params"]}
+    groups: dict[tuple[float, bool], list[Tensor]] = {}
+    for p in parameters:
+        groups.setdefault((scales.get(id(p), 1.0), p.ndim > 1 or config.decay_norms), []).append(p)
+    return [
+        {"params": found, "lr_scale": scale, "weight_decay": config.weight_decay if decayed else 0.0}
+        for (scale, decayed), found in groups.items()
+    ]
 
 
 def set_precision(precision: str) -> None:

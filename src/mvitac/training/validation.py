@@ -1,44 +1,123 @@
-"""Evaluation during training: kNN accuracy, signs of collapse, and retrieval on held-out groups (split val)."""
+"""Evaluation during training on held-out groups (split val, never test): what the features are worth, from step 0 on.
+
+A linear probe, kNN accuracy, retrieval and signs of collapse. The start (step 0) is the line to beat. The best weights are
+those with the highest mean of the linear probe over tasks and modalities: accuracy of classes, R2 of values (below 0: 0).
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
+from scipy.special import stdtrit
+from torch import Tensor
 
+from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
+from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features
-from mvitac.model import Model
+from mvitac.methods.base import Method
+from mvitac.model import BEST, Model
 from mvitac.run import Run
+from mvitac.training.log import Log
 
 NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
+Cells = dict[str, Tensor]
+"""Task and modality -> [targets, groups, 2]: the sum of errors of each group, and that of a guess. A score is 1 - their
+ratio: accuracy of a class (errors: wrong rows; guess: all rows), R2 of a value (squared errors; those of the mean)."""
 
 
-@torch.no_grad()
+class Validation:
+    """Evaluates a method while it trains, compares it with its start, and keeps the best weights.
+
+    Args:
+        out: Folder of the run.
+        run: Its settings.
+        method: The method that trains.
+        pack: The data.
+        log: Where values are logged.
+        kept: State of the last checkpoint, which a resumed run continues with; empty at the start.
+    """
+
+    def __init__(self, out: Path, run: Run, method: Method, pack: Pack, log: Log, kept: dict[str, Any]) -> None:
+        self.out, self.run, self.method, self.pack, self.log, self.kept = out, run, method, pack, log, kept
+
+    def __call__(self, step: int, *, last: bool = False) -> None:
+        """Evaluate after ``step`` steps; write model.best.safetensors if it is the best so far."""
+        model = Model(self.method, self.run, self.pack.spec, self.pack.size)
+        values, cells = validate(model, self.pack, self.run)
+        self.method.train()
+        if step == 0:
+            self.kept["start"] = cells
+        if cells and (mean := _mean(cells)) > self.kept.get("best", -1.0):
+            self.kept |= {"best": mean, "best_step": step}
+            if self.run.eval_every:
+                model.save(self.out / BEST)
+                self.method.train()
+        self.log.evaluation(step, values, self._verdict(cells) if last else "")
+
+    def _verdict(self, cells: Cells) -> str:
+        start = self.kept.get("start")
+        if start is None:
+            return ""
+        text = verdict(start, cells, self.pack.spec.group_by)
+        best = self.kept.get("best_step")
+        if self.run.eval_every and cells and best is not None:
+            text += f"; best at step {best} ({100 * (self.kept['best'] - _mean(start)):+.1f}, {BEST})"
+        return text
+
+
 def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """Scores on held-out groups (split val, never test). Only rows with both modalities are used.
 
-    Without rows of val that are not trained on, the scores are computed on training rows, and there is no kNN accuracy.
+    Without rows of val that are not trained on, the scores are computed on training rows, and there are no probes.
 
     Returns:
-        name -> value, e.g. "touch/knn category", "vision/rankme", "vision->touch R@5".
+        name -> value, e.g. "touch/linear category", "touch/knn category", "vision/rankme", "vision->touch R@5". Of a mix,
+        the scores of each part, named "<part> <name>".
     """
+    return validate(model, pack, run)[0]
+
+
+def validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cells]:
+    """Scores as of ``evaluate``, and the linear probes' errors by group, to compare two evaluations of one pack."""
+    if not isinstance(pack, MixedPack):
+        return _validate(model, pack, run)
+    values: dict[str, float] = {}
+    cells: Cells = {}
+    for part in pack.parts:
+        found = _validate(model, pack.alone(part), run)
+        values |= {f"{part} {name}": value for name, value in found[0].items()}
+        cells |= {f"{part} {name}": cell for name, cell in found[1].items()}
+    return values, cells
+
+
+@torch.no_grad()
+def _validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cells]:
+    """Scores and errors on ``pack`` alone."""
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
     modalities = pack.spec.modalities
     train_rows = _sample(pack, pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
     val_rows = np.setdiff1d(pack.rows("val", having=modalities), run.method.training_rows(pack))
     held_out = len(val_rows) > 1
     rows = _sample(pack, val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
-    z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders}
+    z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders if m in modalities}
     values: dict[str, float] = {}
+    cells: Cells = {}
     for modality, features in z.items():
         values[f"{modality}/std"] = diagnostics.spread(features)
         values[f"{modality}/rankme"] = diagnostics.rank_me(features)
     if held_out:
-        values |= _knn(model, pack, run, train_rows, rows, z)
-    if len(model.projectors) == 2:
+        bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in z}
+        values |= _knn(pack, train_rows, rows, bank, z)
+        cells = _linear(pack, train_rows, rows, _with_both(bank), _with_both(z))
+        values |= {name: float(_scores(cell).mean()) for name, cell in cells.items()}
+    if len(model.projectors) == len(z) == 2:
         values |= _shared_space(model, pack, run, rows, z)
-    return values
+    return values, cells
 
 
 def _sample(pack: Pack, rows: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
@@ -47,11 +126,10 @@ def _sample(pack: Pack, rows: np.ndarray, num: int, rng: np.random.Generator) ->
 
 
 def _knn(
-    model: Model, pack: Pack, run: Run, train_rows: np.ndarray, rows: np.ndarray, z: dict[str, torch.Tensor]
+    pack: Pack, train_rows: np.ndarray, rows: np.ndarray, bank: dict[str, Tensor], z: dict[str, Tensor]
 ) -> dict[str, float]:
-    """kNN accuracy of each task on ``rows``, whose features are ``z``; neighbours are ``train_rows``."""
+    """kNN accuracy of each task on ``rows``, whose features are ``z``; neighbours are ``train_rows``, with ``bank``."""
     values = {}
-    bank = {m: pack_features(model, pack, m, train_rows, bf16=run.bf16) for m in model.encoders}
     for task in pack.spec.tasks:
         known = torch.from_numpy(pack.labels(task.name, "train"))[train_rows]
         asked = torch.from_numpy(pack.labels(task.name, "val"))[rows]
@@ -64,7 +142,93 @@ def _knn(
     return values
 
 
-def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[str, torch.Tensor]) -> dict[str, float]:
+def _with_both(z: dict[str, Tensor]) -> dict[str, Tensor]:
+    """``z``, and the features of two modalities side by side as "both"."""
+    return z | {"both": torch.cat(list(z.values()), dim=1)} if len(z) > 1 else z
+
+
+def _linear(
+    pack: Pack, train_rows: np.ndarray, rows: np.ndarray, bank: dict[str, Tensor], z: dict[str, Tensor]
+) -> Cells:
+    """Errors by group of a linear probe of each task and modality, and of both together, as for ``_knn``."""
+    names = np.unique(pack.column("group").astype(str), return_inverse=True)[1]
+    groups = torch.from_numpy(names[train_rows])
+    by_group = torch.from_numpy(np.unique(names[rows], return_inverse=True)[1])
+    cells = {}
+    for task in pack.spec.all_tasks:
+        known, asked = _answers(pack, task, "train", train_rows), _answers(pack, task, "val", rows)
+        for m in z:
+            found = []
+            for y, true in zip(known, asked, strict=True):
+                have, scored = ~y.isnan().any(1), ~true.isnan().any(1)
+                if len(torch.unique(y[have], dim=0)) < 2 or len(torch.unique(true[scored], dim=0)) < 2:
+                    continue
+                guess = diagnostics.linear_probe(bank[m][have], y[have], groups[have], z[m][scored])
+                errors = _errors(guess, true[scored])
+                sums = torch.zeros(int(by_group.max()) + 1, 2, dtype=torch.float64)
+                found.append(sums.index_add_(0, by_group[scored], errors))
+            if found:
+                cells[f"{m}/linear {task.name}"] = torch.stack(found)
+    return cells
+
+
+def _answers(pack: Pack, task: AnyTask, split: str, rows: np.ndarray) -> list[Tensor]:
+    """What a probe fits: one column per class of a task, or one column for each value on its own; NaN = not known."""
+    if not isinstance(task, Task):
+        return [torch.from_numpy(column[rows, None]).float() for column in pack.values(task, split).T]
+    labels = torch.from_numpy(pack.labels(task.name, split))[rows]
+    columns = torch.nn.functional.one_hot(labels.clamp(min=0), len(task.classes)).float()
+    columns[labels < 0] = torch.nan
+    return [columns]
+
+
+def _errors(guess: Tensor, true: Tensor) -> Tensor:
+    """[rows, 2]: each row's error, and that of a guess without features (``Cells``)."""
+    if true.shape[1] > 1:
+        wrong = (guess.argmax(1) != true.argmax(1)).double()
+        return torch.stack([wrong, torch.ones_like(wrong)], dim=1)
+    return torch.cat([guess - true, true.mean() - true], dim=1).double().square()
+
+
+def _scores(cell: Tensor) -> Tensor:
+    """[targets]: accuracy or R2."""
+    errors, guess = cell.sum(1).unbind(-1)
+    return 1 - errors / guess.clamp(min=1e-12)
+
+
+def _mean(cells: Cells) -> float:
+    """Mean score over tasks and modalities; an R2 below 0, worse than the mean value, counts as 0."""
+    return float(torch.stack([_scores(cell).clamp(min=0).mean() for cell in cells.values()]).mean())
+
+
+def verdict(start: Cells, end: Cells, by: str) -> str:
+    """One sentence: are the features better, level or worse than at the start, by the linear probe on split val?
+
+    The interval (95 %) is over groups, of the mean over tasks and modalities: a jackknife that leaves out one group at a
+    time. Level means that it includes 0. It leaves out the variation between seeds.
+    """
+    names = sorted(start.keys() & end.keys())
+    num = start[names[0]].shape[1] if names else 0
+    if num < 2:
+        return "no labelled groups of split val: nothing says whether the features are better than at the start"
+
+    def gain(keep: Tensor) -> float:
+        before, after = ({name: cells[name][:, keep] for name in names} for cells in (start, end))
+        return 100 * (_mean(after) - _mean(before))
+
+    every = torch.arange(num)
+    points = gain(every)
+    without = torch.tensor([gain(every[every != g]) for g in range(num)])
+    margin = float(stdtrit(num - 1, 0.975) * ((num - 1) / num * (without - without.mean()).square().sum()).sqrt())
+    word = "level" if abs(points) <= margin else "better" if points > 0 else "worse"
+    interval = f"[{points - margin:+.1f}, {points + margin:+.1f}]"
+    return (
+        f"compared with the start, the features are {word}: {points:+.1f} points {interval}"
+        f" (linear probe on {num} {by}s of val, mean of {', '.join(name.replace('linear ', '') for name in names)})"
+    )
+
+
+def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[str, Tensor]) -> dict[str, float]:
     """Alignment, uniformity and retrieval in the space shared by both modalities, on ``rows``, whose features are ``z``."""
     device = next(model.parameters()).device
     if run.augment.size != run.augment.eval_size:

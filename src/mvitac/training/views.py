@@ -92,9 +92,17 @@ def make_views(
     sources = dict.fromkeys(pack.spec.modalities, views)
     if run.positives == "same-touch-pairs" and num_views == 1:
         sources["touch"] = [partners(pack, rows, generator, within=run.positives_within)]
+    if run.method.sensor_view:
+        sources["touch"] = [*sources["touch"], partners(pack, rows, generator, "presses", other_sensor=True)]
     dtype = torch.bfloat16 if run.bf16 else torch.float32
     images: dict[str, list[Tensor]] = {}
-    for modality in pack.spec.modalities:
+    has = senses(pack, rows)
+    both: dict[str, Tensor] = {}
+    if not all(there.all() for there in has.values()):
+        pairs = np.logical_and.reduce(list(has.values()))
+        both = {m: torch.from_numpy(np.flatnonzero(pairs[there])).to(device) for m, there in has.items()}
+        sources = {m: _some(sources[m], there) for m, there in has.items()}
+    for modality in has:
         config, images[modality] = getattr(run.augment, modality), []
         if mirror and modality == "touch":
             config = replace(config, flip=0.0)  # the mirror flips instead
@@ -110,7 +118,22 @@ def make_views(
         for t in pack.spec.tasks
     }
     values = {task: value.to(device) for task, value in values_of(run, pack, rows).items()}
-    return Views(images=images, labels=labels, rows=torch.from_numpy(rows).to(device), values=values)
+    at, seed = torch.from_numpy(rows).to(device), torch.tensor(generator.initial_seed()).to(device)
+    return Views(images=images, labels=labels, rows=at, values=values, both=both, seed=seed)
+
+
+def _some(sources: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:
+    """The rows ``kept`` of each of ``sources``. What was one array twice still is."""
+    fewer = {id(source): source[kept] for source in sources}
+    return [fewer[id(source)] for source in sources]
+
+
+def senses(pack: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Modality -> bool [B], which of ``rows`` have an image. Of a mix, modalities of fewer than two rows are left out."""
+    if not pack.parts:
+        return dict.fromkeys(pack.spec.modalities, np.ones(len(rows), bool))
+    has = {modality: pack.has(modality)[rows] for modality in pack.spec.modalities}
+    return {modality: there for modality, there in has.items() if there.sum() > 1}
 
 
 def values_of(run: Run, pack: Pack, rows: np.ndarray) -> dict[str, Tensor]:

@@ -99,17 +99,22 @@ def examine(
     ]
 
 
-def examine_pack(path: Path, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
+def examine_pack(path: str | Path, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
     """Check the pack at ``path``; return the findings and the blocks of the contact sheet."""
     try:
         pack = Pack(path)
     except ValueError as error:
-        if not (path / "pack.json").is_file():
+        if not (Path(path) / "pack.json").is_file():
             raise
         found = Finding(
             item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it, too"
         )
         return [found], [Block(f"broken: pack. {error}")]
+    return examine_open(pack, window)
+
+
+def examine_open(pack: Pack, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
+    """As ``examine_pack``, for a pack that is open."""
     whole = Finding(item="pack", verdict="ok", evidence=f"{pack.num} rows, every digest matches")
     findings = [whole, *examine(pack, window=window)]
     return findings, blocks_of(pack, findings)

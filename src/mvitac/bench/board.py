@@ -1,0 +1,278 @@
+"""The board: one static page that compares results of one suite. Tasks down, encoders across, controls first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from mvitac.bench.charts import against_labels, against_parameters
+from mvitac.bench.result import problems, read_result, records_of, suite_of
+from mvitac.bench.suite import SuiteTask
+from mvitac.evaluation.leaks import UNKNOWN
+from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
+from mvitac.evaluation.scores import by_cell, paired_difference, summarise
+from mvitac.report import html as page
+from mvitac.report.figures import to_svg
+from mvitac.report.tables import probe_name
+from mvitac.system.files import write_atomic
+
+GUESS = "majority or mean"
+CONTROLS = (GUESS, "border", "pixels", "untrained")
+"""Controls from left to right; the data's own columns come after the first."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A task by one modality, with scores by the name of the encoder or control.
+
+    Attributes:
+        task: Set and task.
+        about: Its test groups.
+        records: Records of the probe, one for each seed.
+        cells: Their summary (``scores.summarise``).
+        few: [(fraction of the labels, summary)], from few labels to all.
+    """
+
+    task: str
+    about: str
+    modality: str
+    records: dict[str, list[dict[str, Any]]]
+    cells: dict[str, dict[str, Any]]
+    few: dict[str, list[tuple[float, dict[str, Any]]]]
+
+    @cached_property
+    def score(self) -> str:
+        return score_name({self.modality: self.cells})
+
+
+@dataclass(frozen=True)
+class Board:
+    """Results by the encoder's name, what they scored row by row, and a line for each task that a result lacks."""
+
+    results: dict[str, dict[str, Any]]
+    rows: list[Row]
+    not_run: list[str]
+
+    @property
+    def controls(self) -> list[str]:
+        found = dict.fromkeys(name for row in self.rows for name in row.cells if name not in self.results)
+        return sorted(found, key=lambda name: CONTROLS.index(name) if name in CONTROLS else 0.5)
+
+    @cached_property
+    def encoders(self) -> list[str]:
+        """Names of encoders by their mean rank over the rows that all of them have, the best one first."""
+        common = [row for row in self.rows if all(name in row.cells for name in self.results)]
+        ranks = dict.fromkeys(self.results, 0)
+        for row in common:
+            for rank, name in enumerate(sorted(self.results, key=lambda n: -row.cells[n]["mean"])):
+                ranks[name] += rank
+        return sorted(self.results, key=lambda name: ranks[name])
+
+
+def write_board(files: Sequence[Path], out: Path) -> Path:
+    """Write the page that compares the results in ``files``.
+
+    Raises:
+        ValueError: If a file is no result, was changed, is of another suite or version than the others or than the one
+            of this mvitac, has scores that its own sums do not give, or two results have one name.
+    """
+    results: dict[str, dict[str, Any]] = {}
+    for path in files:
+        result = read_result(path)
+        if found := problems(result):
+            raise ValueError(f"{path}: {found[0]}")
+        first = next(iter(results.values()), result)
+        if first["suite_digest"] != result["suite_digest"]:
+            versions = " and ".join(f"{r['suite']['name']} ({r['suite_digest'][:12]})" for r in (first, result))
+            raise ValueError(f"{path} is of another suite than {files[0]}: {versions}; make a board for each")
+        if (name := result["encoder"]["name"]) in results:
+            raise ValueError(f"{path}: another result is of an encoder named {name!r}: bench one of them with --name")
+        results[name] = result
+    text = _page(gather(results))
+    write_atomic(out, lambda file: file.write(text.encode()))
+    return out
+
+
+def gather(results: dict[str, dict[str, Any]]) -> Board:
+    """Put the blocks of all results side by side. Only those on the same rows of data are one row of the page."""
+    suite = suite_of(next(iter(results.values())))
+    rows: list[Row] = []
+    not_run: list[str] = []
+    for number, (one, ask) in enumerate((each, ask) for each in suite.sets for ask in each.tasks):
+        forms: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
+        for name, result in results.items():
+            block = result["blocks"][number]
+            if "not_run" in block:
+                not_run.append(f"{one.name}, {ask.name}: {name} was not run: {block['not_run']}")
+            else:
+                forms.setdefault((block["form"], block["data"]["rows"]), []).append((name, block))
+        for (form, _), found in forms.items():
+            task = f"{one.name}: {ask.name}{f' ({form})' if len(one.forms) > 1 else ''}"
+            records = []
+            for name, block in found:  # controls are the same in all results: those of the first one are shown
+                mine = records_of(block, results[name]["encoder"])
+                records += [r for r in mine if r["source"] == name or block is found[0][1]]
+            rows += _rows(task, found[0][1]["group_by"], records, suite.probes[0], ask)
+    return Board(results, rows, not_run)
+
+
+def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: SuiteTask) -> list[Row]:
+    """The rows of one task, one for each modality."""
+    records = [{**r, "source": GUESS} if r["source"] in ("majority", "mean") else r for r in records]
+    found, cells = summarise(records, probe)[ask.name], by_cell(records, probe)
+    shares = {}
+    for share in sorted(ask.labels):
+        kind = f"{100 * share:g} % of labels"
+        shares[share] = summarise([r for r in records if r["probe"] == kind], kind).get(ask.name, {})
+    rows, none = [], found.pop("none", {})
+    for modality in (m for m in ask.modalities if m in found):
+        own = {**none, **found[modality]}
+        lists = {name: cells.get((ask.name, modality, name)) or cells[ask.name, "none", name] for name in own}
+        few = {
+            name: [(s, each[modality][name]) for s, each in shares.items() if name in each.get(modality, ())]
+            for name in own
+        }
+        whole = {name: [*line, (1.0, own[name])] for name, line in few.items() if line}
+        rows.append(Row(task, tested_on({modality: own}, by), modality, lists, own, whole))
+    return rows
+
+
+def order_of(row: Row, names: Sequence[str]) -> str:
+    """Encoders from best to worst: '>' where the paired 95 % interval of a step excludes 0, '≈' where it does not.
+
+    Encoders that saw test rows are not in the order.
+    """
+    clean = [name for name in names if name in row.cells and row.cells[name].get("leak", "") in ("", UNKNOWN)]
+    found = sorted(clean, key=lambda name: -row.cells[name]["mean"])
+    text = ""
+    for ours, theirs in pairwise(found):
+        mean, low, high, _ = paired_difference(row.records[ours], row.records[theirs])
+        sign = ">" if low > 0 else "≈"
+        text += f"{ours} {percent(row.cells[ours]['mean'])} {sign} ({percent(mean)} [{percent(low)}, {percent(high)}]) "
+    left_out = [name for name in names if name in row.cells and name not in clean]
+    text += f"{found[-1]} {percent(row.cells[found[-1]]['mean'])}" if found else "no encoder without a leak"
+    return text + (f"; not ordered because of LEAK: {', '.join(left_out)}" if left_out else "")
+
+
+SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder has several), in percent: accuracy, or R2
+of values. Controls come first. Encoders follow by their mean rank, which is for reading only: the order of each task is
+below. An empty cell was not run."""
+ORDER = """'>' means that the 95 % interval of the difference to the next encoder, paired over test groups, excludes 0; '≈'
+that this order is not resolved. Differences are in points, not corrected for the number of comparisons."""
+LEAKS = """Leaks compare the rows and groups that an encoder was trained on with the test rows, where a list of them came
+with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
+DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.
+'other pixels', 'other rows': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
+FOOT = "<p>Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it.</p>"
+
+
+def _page(board: Board) -> str:
+    suite = suite_of(next(iter(board.results.values())))
+    probes = dict.fromkeys(probe_name(suite.probes[0], row.score) for row in board.rows)
+    chips = [("definition", suite.digest()[:12]), ("encoders", str(len(board.results))), ("probe", " or ".join(probes))]
+    head = (
+        f"<p class='eyebrow'>mvitac bench</p><h1>{escape(suite.name)}</h1><p class='verdict'>{escape(suite.title)}</p>"
+        f"<ul class='chips'>{''.join(f'<li>{escape(k)} <b>{escape(v)}</b></li>' for k, v in chips)}</ul>"
+    )
+    orders = [[f"{row.task}, {row.modality}", order_of(row, board.encoders)] for row in board.rows]
+    sections = [
+        ("scores", "Scores", _scores(board)),
+        ("order", "Order", _text_table(ORDER, ["", "from best to worst"], orders)),
+        ("encoders", "Encoders and leaks", _encoders(board)),
+        ("parameters", "Score against parameters", page.grid(_by_parameters(board))),
+        ("labels", "Score against labels", page.grid(_by_labels(board))),
+        ("data", "Data", _data(board)),
+    ]
+    return page.html_page(f"mvitac bench: {suite.name}", head, sections, FOOT)
+
+
+def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return page.paragraph(" ".join(intro.split())) + page.table(columns, rows, words=True, label=columns[1])
+
+
+def _scores(board: Board) -> str:
+    """A table of all scores, and folded below it one of the errors of values in their units."""
+    columns, rows, errors, above = [*board.controls, *board.encoders], [], [], ""
+    for row in board.rows:
+        if row.task != above:
+            rows.append([f"{(above := row.task)} ({row.about})"])
+        cells = [row.cells.get(name) for name in columns]
+        shown = [with_interval(c["mean"], c["low"], c["high"], c.get("leak", "")) if c else "" for c in cells]
+        rows.append([f"{row.modality}{', R2' * (row.score == 'R2')}", *shown])
+        for t, target in enumerate(next(filter(None, cells)).get("targets", ())):
+            what = f"{row.task}, {row.modality}: {target['name']} ({target['unit']})"
+            errors.append([what, *(f"{c['targets'][t]['mae']:.3g}" if c else "" for c in cells)])
+    found = page.paragraph(" ".join(SCORES.split())) + page.table(["", *columns], rows, label="scores")
+    table = page.table(["", *columns], errors, label="errors")
+    return found + (page.fold("Mean absolute errors in their units", table) if errors else "")
+
+
+def _encoders(board: Board) -> str:
+    columns = [
+        "",
+        "leak",
+        "parameters",
+        "images seen",
+        "licence",
+        "trained on",
+        "notes",
+        "seeds, input",
+        "weights",
+        "versions",
+    ]
+    rows = []
+    for name in board.encoders:
+        result, encoder = board.results[name], board.results[name]["encoder"]
+        sizes = ", ".join(f"{m} {num / 1e6:.1f} M" for m, num in encoder["parameters"].items())
+        seen = "not known" if encoder["images_seen"] is None else f"{encoder['images_seen']:,}"
+        notes = dict.fromkeys(note for block in result["blocks"] for note in block.get("notes", ()))
+        known = [*(encoder[key] or "not given" for key in ("licence", "trained_on")), "; ".join(notes)]
+        read = f"{', '.join(map(str, encoder['seeds']))}; {encoder['size']} px"
+        versions = ", ".join(f"{library} {result['versions'].get(library, '')}" for library in ("mvitac", "torch"))
+        weights = ", ".join(one[:12] for one in encoder["weights"])
+        rows.append([name, _leaks(result), sizes, seen, *known, read, weights, versions])
+    return _text_table(LEAKS, columns, rows)
+
+
+def _leaks(result: dict[str, Any]) -> str:
+    """The leak column: LEAK with the tasks, LEAK? or "none found"."""
+    marks: dict[str, list[str]] = {}
+    for block in result["blocks"]:
+        for leak in dict.fromkeys(block.get("leaks", ())):
+            marks.setdefault(leak, []).append(f"{block['set']}, {block['task']}")
+    found = [f"LEAK: {leak}: {'; '.join(tasks)}" for leak, tasks in marks.items() if leak not in ("", UNKNOWN)]
+    return ". ".join([*found, *(["LEAK? not known"] if UNKNOWN in marks else [])]) or "none found"
+
+
+def _by_parameters(board: Board) -> Iterator[str]:
+    for row in (row for row in board.rows if row.modality == "touch"):
+        sizes = {name: board.results[name]["encoder"]["parameters"] for name in board.encoders if name in row.cells}
+        points = {name: (each["touch"], row.cells[name]) for name, each in sizes.items()}
+        drawn = against_parameters(row.task, points, row.cells["untrained"]["mean"], f"{row.score} %, touch")
+        yield page.figure(to_svg(drawn, f"parameters {row.task}", f"{row.task} against parameters; numbers are above"))
+
+
+def _by_labels(board: Board) -> Iterator[str]:
+    for row in (row for row in board.rows if row.few):
+        lines = {name: row.few[name] for name in (*board.encoders, *board.controls) if name in row.few}
+        title = f"{row.task}, {row.modality}"
+        drawn = against_labels(title, lines)
+        yield page.figure(to_svg(drawn, f"labels {title}", f"{title} against labels; numbers are in the results"))
+
+
+def _data(board: Board) -> str:
+    rows: dict[tuple[str, str, str], dict[str, None]] = {}
+    for name, result in board.results.items():
+        for block in (block for block in result["blocks"] if "not_run" not in block):
+            key = (block["set"], block["form"], block["data"]["rows"][:12])
+            rows.setdefault(key, {})[f"{name} ({block['pinned']})"] = None
+    table = _text_table(
+        DATA, ["", "form", "digest of rows", "results"], [[*k, ", ".join(who)] for k, who in rows.items()]
+    )
+    lost = page.fold(f"{len(board.not_run)} tasks that were not run", page.code("\n".join(board.not_run)))
+    return table + (lost if board.not_run else "")

@@ -1,0 +1,118 @@
+"""The encoder of a bench: load it, say what it is, score it, write its result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from mvitac.bench.result import read_result, sign, write_result
+from mvitac.bench.score import Entry, score_suite
+from mvitac.bench.suite import Suite
+from mvitac.deploy.artifact import load
+from mvitac.evaluation.evaluate import names_of
+from mvitac.evaluation.leaks import FILE, UNKNOWN, read_sources
+from mvitac.experiments.plan import slug
+from mvitac.external import ExternalModel
+from mvitac.model import Model
+from mvitac.nn.encoders import SCRATCH, num_features
+from mvitac.system.files import check_place, digest
+from mvitac.system.locks import hold_lock
+from mvitac.system.provenance import provenance
+
+
+@dataclass(frozen=True, kw_only=True)
+class About:
+    """What only the encoder's owner knows."""
+
+    name: str = ""
+    """Name on the page. Default: method, recipe and trunk, or the name of an external encoder."""
+    licence: str = ""
+    """Licence of the weights. Default: that of the adapter of an external encoder."""
+    trained_on: str = ""
+    """Names of all data that it was trained on. Default: what its run or its adapter says."""
+    images_seen: int = 0
+    """Images that it saw in training, with repeats. Default: steps x batch size of its run."""
+
+
+def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:
+    """Score an encoder on a suite and write <out>/<suite>-<name>.json; the same call continues an interrupted one.
+
+    Args:
+        places: Folders of runs or artifacts, or "external:...": the seeds of one encoder.
+        suite: The suite.
+        out: Folder of results.
+        root: Folder of real data; None = without.
+        about: What its owner says.
+
+    Raises:
+        ValueError: If the encoder cannot be loaded or reads no task, or the folder has other weights under this name.
+    """
+    models = [load(place) for place in places]
+    encoder = describe(models, places, about)
+    path = out / f"{suite.name}-{slug(encoder['name'])}.json"
+    check_place(path)
+    if path.exists() and (old := read_result(path)["encoder"]["weights"]) != encoder["weights"]:
+        raise ValueError(f"{path} is the result of other weights ({old[0][:12]}): give --name, or another --out")
+    start, parts, key = time.perf_counter(), out / "parts", digest(encoder)
+    entry = Entry(models, places, encoder["name"], encoder["trained_on"])
+    with hold_lock(path, f"another process writes {path}: wait for it, or give another --out", wait=False):
+        blocks = list(score_suite(entry, suite, root, parts, key))
+        if all("not_run" in block for block in blocks):
+            raise ValueError(f"{entry.name} was scored on no task of {suite.name}: {blocks[0]['not_run']}")
+        now = {"time": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": round(time.perf_counter() - start)}
+        write_result(path, sign(suite, encoder, blocks, {**provenance(), **now}))
+        for part in parts.glob(f"{key[:16]}-*.json"):
+            part.unlink()
+    return path
+
+
+def describe(models: Sequence[Model], places: Sequence[str], about: About) -> dict[str, Any]:
+    """What a result says of its encoder; ValueError if the models are not seeds of one encoder."""
+    model, seeds = models[0], [each.seed for each in models]
+    external = isinstance(model, ExternalModel)
+    names = [m.title for m in models] if external else names_of([Path(place) for place in places], models)
+    if len(set(names)) > 1 or len(set(seeds)) < len(seeds):
+        raise ValueError(f"{', '.join(places)} are not seeds of one encoder: bench them one by one")
+    found = _of_external(model) if isinstance(model, ExternalModel) else _of_run(model, Path(places[0]))
+    given = {key: value for key, value in vars(about).items() if value}
+    return {
+        **found,
+        **given,
+        "size": model.sides[0],
+        "seeds": seeds,
+        "weights": [each.weights_digest() for each in models],
+        "parameters": {m: sum(p.numel() for p in trunk.parameters()) for m, trunk in model.encoders.items()},
+    }
+
+
+def _of_external(model: ExternalModel) -> dict[str, Any]:
+    described = model.describe()
+    licences = dict.fromkeys(part["licence"] for part in described["encoders"].values())
+    known = None if UNKNOWN in model.trained_on else "; ".join(model.trained_on)
+    nothing = model.trained_on == ("nothing",)
+    about = {"name": model.title, "licence": "; ".join(licences), "trained_on": known}
+    return {**about, "images_seen": 0 if nothing else None, "external": described}
+
+
+def _of_run(model: Model, path: Path) -> dict[str, Any]:
+    run = model.run
+    start = [] if run.encoder.weights == SCRATCH else [f"starts from {Path(run.encoder.weights).name}"]
+    widths = {m: num_features(trunk) for m, trunk in model.encoders.items()}
+    name = f"{run.method.name} ({run.recipe}, {run.encoder.trunk})"
+    about = {"name": name, "licence": None, "trained_on": "; ".join([model.spec.name, *start])}
+    return {**about, "images_seen": _images_seen(model, path), "method": run.method.name, "features": widths}
+
+
+def _images_seen(model: Model, path: Path) -> int | None:
+    """Steps x batch size, which is images of each modality. None if it started from weights, or rows are not known."""
+    run, steps = model.run, model.run.steps
+    if run.encoder.weights != SCRATCH or not (steps or (path / FILE).exists()):
+        return None
+    if not steps:
+        with_rows = read_sources(path, run, None, None)  # type: ignore[arg-type]  # the file exists, no pack is needed
+        steps = run.num_steps(sum(len(source.ids) for source in with_rows or ()))
+    return steps * run.batch_size

@@ -1,0 +1,242 @@
+"""Score one encoder on a suite, task by task, and the controls beside it.
+
+Scores of a finished task are kept in <out>/parts until the result is written, so an interrupted bench continues. Those of
+the controls stay: they are the same for every encoder of the folder.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvitac.bench.result import trimmed
+from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
+from mvitac.data.jpeg import Lazy
+from mvitac.data.pack import Images, Pack
+from mvitac.data.spec import AnyTask
+from mvitac.evaluation.controls import Records, label_controls, pixel_controls
+from mvitac.evaluation.evaluate import check_unseen
+from mvitac.evaluation.features import features
+from mvitac.evaluation.leaks import UNKNOWN, Scored
+from mvitac.evaluation.probe import joined, names_in, probe_all, split_rows
+from mvitac.evaluation.robustness import few_labels
+from mvitac.evaluation.scores import pool
+from mvitac.external import ExternalModel, load_external
+from mvitac.model import Model
+from mvitac.system.files import digest, read_json, write_json
+from mvitac.system.progress import work
+from mvitac.system.provenance import provenance
+
+
+class _Channels(Lazy):
+    """Some channels of images: one of several sensors that are stacked."""
+
+    def __init__(self, images: Images, kept: slice) -> None:
+        num, height, width, _ = images.shape
+        super().__init__((num, height, width, kept.stop - kept.start))
+        self.images, self.kept = images, kept
+
+    def _made(self, rows: np.ndarray) -> np.ndarray:
+        return self.images[rows][..., self.kept]
+
+
+def sensors(pack: Pack, modality: str, channels: int) -> list[Pack]:
+    """Views of ``pack`` for an encoder of ``channels``: one for each of the sensors that are stacked."""
+    if (have := pack.spec.channels(modality)) == channels:
+        return [pack]
+    views = []
+    for first in range(0, have, channels):
+        views.append(view := copy.copy(pack))
+        view.images = {**pack.images, modality: _Channels(pack.images[modality], slice(first, first + channels))}
+        view.digests = {**pack.digests, modality: f"channels from {first}"}
+    return views
+
+
+def misfit(model: Model, pack: Pack, modality: str) -> str:
+    """Why ``model`` cannot read the images of a modality; "" if it can."""
+    if modality not in model.encoders:
+        return f"the encoder has no {modality}"
+    if isinstance(model, ExternalModel):
+        return ""
+    have, takes = pack.spec.channels(modality), model.spec.channels(modality)
+    if model.spec.frames(modality) > 1:
+        return f"the encoder takes windows of {model.spec.frames(modality)} frames, the data has single ones"
+    if modality == "touch" and model.spec.difference != pack.spec.difference:
+        return "the encoder was trained on touch minus its background, the data has raw images"
+    return f"the encoder takes {takes} channels of {modality}, the data has {have}" if have % takes else ""
+
+
+@dataclass
+class Reader:
+    """Features of one model for one set, of all rows that its tasks need. Stacked sensors are read one by one."""
+
+    model: Model
+    opened: Opened
+    name: str
+    known: dict[tuple[str, bool], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+    @cached_property
+    def bound(self) -> tuple[Model, Pack]:
+        """The model and the data, for each other (``ExternalModel.on``)."""
+        pack = self.opened.packs[0]
+        return self.model.on(pack) if isinstance(self.model, ExternalModel) else (self.model, pack)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the data lacks that the encoder's owner wants."""
+        return list(self.bound[0].notes) if isinstance(self.bound[0], ExternalModel) else []
+
+    def read(self, modality: str, rows: np.ndarray, maps: bool = False) -> np.ndarray:
+        """Features [len(rows), D], or maps [len(rows), P, D]."""
+        parts = []
+        for m in names_in(modality, self.opened.packs[0]):
+            if (m, maps) not in self.known:
+                self.known[m, maps] = self._all(m, maps)
+            own, z = self.known[m, maps]
+            parts.append(z[np.searchsorted(own, rows)])
+        return joined(parts)
+
+    def _all(self, modality: str, maps: bool) -> tuple[np.ndarray, np.ndarray]:
+        """All rows of a modality that are needed, and their features; ValueError if these are no finite numbers."""
+        model, pack = self.bound
+        asked = [(task, m) for ask, task in self.opened.tasks for m in ask.modalities if modality in names_in(m, pack)]
+        rows = np.unique(np.concatenate([split_rows(v, task, m).all for v in self.opened.packs for task, m in asked]))
+        z = joined(
+            [
+                features(model, v, modality, rows, maps=maps)
+                for v in sensors(pack, modality, model.spec.channels(modality))
+            ]
+        )
+        if z.ndim != 2 + maps or len(z) != len(rows):
+            raise ValueError(
+                f"{self.name} gives features of shape {list(z.shape)} for {len(rows)} images of {modality}: give one"
+                " vector per image"
+            )
+        if bad := int((~np.isfinite(z).reshape(len(z), -1).all(axis=1)).sum()):
+            raise ValueError(
+                f"{self.name} gives NaN or infinite features of {modality} for {bad} of {len(rows)} images: check its"
+                " weights and preprocessing"
+            )
+        return rows, z
+
+    def score(self, suite: Suite, ask: SuiteTask, task: AnyTask, source: str, probes: Sequence[str]) -> Records:
+        """Records of every modality that the model can read; folds are pooled."""
+        pack, each = self.opened.packs[0], []
+        able = [m for m in ask.modalities if not any(misfit(self.model, pack, one) for one in names_in(m, pack))]
+        maps = (lambda m, rows: self.read(m, rows, maps=True)) if "attentive" in probes else None
+        for view in self.opened.packs if able else ():
+            found = probe_all(self.read, view, [task], able, probes, suite.seed, maps)
+            for modality, share in ((m, share) for m in able for share in ask.labels):
+                rows = split_rows(view, task, modality)
+                few = few_labels(self.read(modality, rows.all), view, task, rows, share, suite.seed)
+                about = {"task": task.name, "modality": modality, "probe": f"{100 * share:g} % of labels"}
+                found.append({**about, **few})
+            each.append([{"source": source, "seed": self.model.seed, **record} for record in found])
+        return pool(each) if len(each) > 1 else [record for found in each for record in found]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An encoder to score: the models of its seeds, their folders, its name, and the words on its training data."""
+
+    models: Sequence[Model]
+    places: Sequence[str]
+    name: str
+    trained_on: str | None
+
+    def leaks(self, opened: Opened, task: AnyTask, names: Sequence[str]) -> list[str]:
+        """What each seed saw of the test rows (``evaluation.leaks``); without a list of rows, what its owner says."""
+        rows = np.unique(np.concatenate([split_rows(view, task).test for view in opened.packs]))
+        pack, found = opened.packs[0], []
+        for place, model in zip(self.places, self.models, strict=True):
+            own = isinstance(model, ExternalModel)
+            sources = None if own else check_unseen([Path(place)], [model], pack, [], allow_leak=True)[0]
+            found.append(self._declared(names) if sources is None else Scored(pack).leak(sources, rows))
+        return found
+
+    def _declared(self, names: Sequence[str]) -> str:
+        if self.trained_on is None:
+            return UNKNOWN
+        named = [name for name in names if name.lower() in self.trained_on.lower()]
+        return f"{named[0]} was in its owner's training, which rows is not known" if named else ""
+
+
+def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key: str) -> Iterator[dict[str, Any]]:
+    """Score ``entry``, and yield a block for each task: "set", "task", and "not_run" or its records.
+
+    Args:
+        entry: The encoder.
+        suite: The suite.
+        root: Folder of the real data.
+        parts: Folder in which scores of finished tasks are kept.
+        key: Digest of the encoder.
+
+    Raises:
+        ValueError: If features are no finite numbers, or data is not that of the suite.
+    """
+    here = provenance()
+    random = [load_external(text) for text in suite.untrained]
+    with work(f"{entry.name} on {suite.name}", sum(len(one.tasks) for one in suite.sets), "tasks") as advance:
+        for one in suite.sets:
+            opened = open_set(one, root)
+            if isinstance(opened, str):
+                yield from ({"set": one.name, "task": ask.name, "not_run": opened} for ask in one.tasks)
+                advance(len(one.tasks))
+                continue
+            own = [Reader(model, opened, entry.name) for model in entry.models]
+            beside = [Reader(model, opened, "untrained") for model in random]
+            for ask, task in opened.tasks:
+                about = [suite.digest(), one.name, ask.name, opened.digests, here["versions"], here["commit"]]
+                about_all = (opened, suite, ask, task)
+                controls = _kept(parts, "controls", about, lambda r=beside, a=about_all: _controls(r, *a))
+                scored = _kept(parts, key, about, lambda r=own, a=about_all: _scores(r, *a))
+                block = _block(entry, one, opened, ask, task, scored, controls)
+                yield {**block, "notes": own[0].notes} if scored else block
+                advance()
+
+
+def _scores(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
+    return [record for reader in readers for record in reader.score(suite, ask, task, "", suite.probes)]
+
+
+def _controls(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
+    """Majority or mean, the data's own columns, pixels, border, and the untrained trunks that ``readers`` are."""
+    each = [label_controls(view, [task]) + pixel_controls(view, [task], ask.modalities) for view in opened.packs]
+    trunks = [r for reader in readers for r in reader.score(suite, ask, task, "untrained", ["linear"])]
+    return [*(pool(each) if len(each) > 1 else each[0]), *trunks]
+
+
+def _block(
+    entry: Entry, one: SuiteSet, opened: Opened, ask: SuiteTask, task: AnyTask, own: Records, controls: Records
+) -> dict[str, Any]:
+    """The scores of one task and what they were made on."""
+    pack = opened.packs[0]
+    if not own:
+        why = [misfit(entry.models[0], pack, each) for m in ask.modalities for each in names_in(m, pack)]
+        return {"set": one.name, "task": task.name, "not_run": next(filter(None, why))}
+    names = [np.unique(v.column("group")[split_rows(v, task).test].astype(str)).tolist() for v in opened.packs]
+    return {
+        "set": one.name,
+        "task": task.name,
+        "form": opened.form,
+        "data": opened.digests,
+        "pinned": opened.pinned,
+        "group_by": pack.spec.group_by,
+        "groups": [name for fold in names for name in fold],
+        "leaks": entry.leaks(opened, task, one.names),
+        "records": [*own, *controls],
+    }
+
+
+def _kept(parts: Path, key: str, about: list[Any], score: Callable[[], Records]) -> Records:
+    """The records of a part: those kept, else scored now and kept."""
+    path = parts / f"{key[:16]}-{digest([key, *about])[:24]}.json"
+    if not path.exists():
+        write_json(path, [trimmed(record) for record in score()])
+    return read_json(path, "a part of a bench")

@@ -1,0 +1,236 @@
+"""Suites: versioned definitions of tasks (``suites/*.toml``), and their data opened as packs.
+
+A suite fixes data, rows, splits, probes, seeds and controls. Its digest covers all of it except the pins, which are the
+digests of the data that was measured. A definition that changes gets another name (sim-v2).
+"""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.data.spec import AnyTask, Task
+from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.table.splits import folds
+from mvitac.evaluation.probe import Probe
+from mvitac.registry import from_json, to_json, unknown
+from mvitac.system.files import brief, digest
+
+SUITES = Path(__file__).parent / "suites"
+Pinned = Literal["same", "other pixels", "other rows", "not pinned"]
+"""Data beside the pins of its suite. Only simulated data may have other rows: those of another processor's arithmetic."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteTask:
+    """A task of a set."""
+
+    name: str
+    """Its name in the data."""
+    modalities: tuple[Literal["touch", "vision", "both"], ...]
+    """Features to probe."""
+    labels: tuple[float, ...] = ()
+    """Fractions of the labels with which the linear probe is fitted once more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Form:
+    """One way in which the data of a set exists."""
+
+    name: str
+    data: dict[str, Any]
+    """Options of a dataset config, with its name."""
+    at: dict[str, str] = field(default_factory=dict)
+    """Option that names a place -> the place below --data-root. Empty: the data is simulated."""
+    score_on: dict[str, Any] = field(default_factory=dict)
+    """Options that are different in the data that is scored, if probes are fitted on other data (a new sensor)."""
+    pins: dict[str, str] = field(default_factory=dict)
+    """Digests of the rows and of the images of each modality, where the suite was measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteSet:
+    """A dataset, its tasks and its split."""
+
+    name: str
+    forms: tuple[Form, ...]
+    """The first one that is found below --data-root is used. Scores of different forms are not compared."""
+    tasks: tuple[SuiteTask, ...]
+    folds: int = 0
+    """Cross-validation over this number of folds of whole groups; 0 = the data's own split."""
+    val_every: int = 2
+    """Of the groups tested in the next fold, every n-th chooses the regularisation."""
+    names: tuple[str, ...] = ()
+    """What owners of encoders call this data in their list of training data."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """A versioned set of tasks."""
+
+    name: str
+    title: str
+    probes: tuple[Probe, ...]
+    """Probes of encoders; the page shows the first. Controls have the linear one."""
+    seed: int
+    """Seed of the probes, and of which labels are kept."""
+    untrained: tuple[str, ...]
+    """The seeds of the control "untrained": external encoders with random weights."""
+    sets: tuple[SuiteSet, ...]
+
+    def __post_init__(self) -> None:
+        names = [one.name for one in self.sets]
+        if len(set(names)) < len(names):
+            raise ValueError(f"suite {self.name!r}: two sets have one name")
+
+    def digest(self) -> str:
+        """Digest of the definition without its pins."""
+        value = to_json(self)
+        for one in value["sets"]:
+            for form in one["forms"]:
+                del form["pins"]
+        return digest(value)
+
+
+def shipped() -> list[str]:
+    """Names of the suites of this version."""
+    return sorted(path.stem for path in SUITES.glob("*.toml"))
+
+
+def find_suite(name: str) -> Suite:
+    """The suite ``name``, or that in a TOML file; ValueError if there is none or it is invalid."""
+    file = Path(name) if name.endswith(".toml") else SUITES / f"{name}.toml"
+    if not file.is_file():
+        raise unknown("suite", name, [*shipped(), "FILE.toml"])
+    try:
+        suite = from_json(Suite, tomllib.loads(file.read_text()), "suite")
+        for form in (form for one in suite.sets for form in one.forms):
+            _config(form, Path(), form.data)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
+        raise ValueError(f"{file} is not a suite ({brief(error)})") from None
+    return suite
+
+
+def _config(form: Form, root: Path, options: dict[str, Any]) -> DatasetConfig:
+    places = {option: str(root / place) for option, place in form.at.items()}
+    return from_json(DatasetConfig, {**options, **places}, "data")
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A set with its data.
+
+    Attributes:
+        form: Name of the form.
+        packs: One pack per fold, which differ in the column split only.
+        tasks: The tasks as the data defines them, beside what the suite asks.
+        digests: Digests of the data.
+        pinned: Whether the data is what the suite was measured on.
+    """
+
+    form: str
+    packs: tuple[Pack, ...]
+    tasks: tuple[tuple[SuiteTask, AnyTask], ...]
+    digests: dict[str, str]
+    pinned: Pinned
+
+
+def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
+    """Open the data of a set; the reason in one line if it is not there.
+
+    Raises:
+        ValueError: If the data is there, but not that of the suite.
+    """
+    for form in one.forms:
+        if form.at and (root is None or not all((root / place).exists() for place in form.at.values())):
+            continue
+        made = [_config(form, root or Path(), form.data).open()]
+        if form.score_on:
+            made.append(_config(form, root or Path(), {**form.data, **form.score_on}).open())
+        pack = JoinedPack(*made) if form.score_on else made[0]
+        known = {task.name: task for task in pack.spec.all_tasks}
+        for asked in one.tasks:
+            if asked.name not in known:
+                raise unknown(f"task of {one.name}", asked.name, known)
+        tasks = tuple((asked, known[asked.name]) for asked in one.tasks)
+        packs = _fold(pack, one) if one.folds else (pack,)
+        found = {"rows": _rows_digest(packs, [task for _, task in tasks]), **_image_digests(made)}
+        return Opened(form.name, packs, tasks, found, _compared(one, form, found))
+    places = " or ".join(
+        dict.fromkeys(str((root or Path()) / place) for form in one.forms for place in form.at.values())
+    )
+    return f"{places} is not there" if root else f"no --data-root was given, where {places} would be"
+
+
+def _compared(one: SuiteSet, form: Form, found: dict[str, str]) -> Pinned:
+    """Compare digests with the pins of ``form``; ValueError if rows, labels or splits of real data differ."""
+    if not form.pins:
+        return "not pinned"
+    if found["rows"] != form.pins["rows"] and not form.at:
+        return "other rows"
+    if found["rows"] != form.pins["rows"]:
+        raise ValueError(
+            f"the data of {one.name} ({form.name}) has other rows, labels or splits than the suite: digest"
+            f" {found['rows'][:12]}, the suite has {form.pins['rows'][:12]}. Get the data again, or run without this set"
+        )
+    return "same" if found == form.pins else "other pixels"
+
+
+def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
+    """One view of ``pack`` per fold of its groups. Groups without any answer are "unlabelled"."""
+    tasks = {task.name: task for task in pack.spec.all_tasks}
+    groups = pack.column("group").astype(str)
+    answered = np.any([pack.answered(tasks[asked.name]) for asked in one.tasks], axis=0)
+    kept = sorted(set(groups[answered].tolist()))
+    if one.folds > len(kept):
+        raise ValueError(f"{one.name} has {len(kept)} labelled groups, the suite asks for {one.folds} folds")
+    columns = folds(
+        kept, [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept], one.folds, one.val_every
+    )
+    found = []
+    for column in columns.values():
+        side = dict(zip(kept, column, strict=True))
+        view = copy.copy(pack)
+        split = pa.array([side.get(group, "unlabelled") for group in groups.tolist()])
+        view.table = pack.table.set_column(pack.table.schema.get_field_index("split"), "split", split)
+        for cached in ("_answers", "hidden"):  # of another split
+            view.__dict__.pop(cached, None)
+        found.append(view)
+    return tuple(found)
+
+
+def _stratum(pack: Pack, task: AnyTask, rows: np.ndarray) -> str:
+    """What folds have an equal share of: groups with this mean label. Of values: all groups."""
+    labels = pack.labels(task.name)[rows] if isinstance(task, Task) else np.zeros(0)
+    known = labels[labels >= 0]
+    return f"{known.mean():.2f}" if len(known) else ""
+
+
+def _rows_digest(packs: Sequence[Pack], tasks: Sequence[AnyTask]) -> str:
+    """Digest of ids, groups, splits and answers. Unlike ``Pack.digest`` it does not depend on how the table was written."""
+    pack, columns = packs[0], sorted({task.split for task in tasks})
+    splits = [view.column(column).astype(str).tolist() for view in packs for column in columns]
+    answers = [  # values in six digits: the last bits of a sum do not matter
+        pack.labels(task.name).tolist()
+        if isinstance(task, Task)
+        else [f"{value:.6g}" for value in pack.values(task).ravel().tolist()]
+        for task in tasks
+    ]
+    return digest([pack.own_ids.tolist(), pack.column("group").astype(str).tolist(), splits, answers])
+
+
+def _image_digests(packs: Sequence[Pack]) -> dict[str, str]:
+    """Digests of the images by modality; of the scored pack with the prefix "scored"."""
+    files = [
+        (prefix, *item) for prefix, pack in zip(("", "scored "), packs, strict=False) for item in pack.digests.items()
+    ]
+    return {prefix + name.partition(".")[0]: found for prefix, name, found in files if name != "samples.parquet"}

@@ -1,0 +1,101 @@
+"""``mvitac bench``, ``mvitac bench board`` and ``mvitac bench check``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from mvitac.bench.board import write_board
+from mvitac.bench.encoder import About, run_bench
+from mvitac.bench.result import problems, read_result, records_of
+from mvitac.bench.suite import find_suite, shipped
+from mvitac.cli.options import parse
+from mvitac.evaluation.leaks import leaks_of
+from mvitac.evaluation.scores import summarise
+from mvitac.report.tables import print_summary
+from mvitac.system.console import Console
+from mvitac.system.files import check_place
+from mvitac.system.progress import shown
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    models: Positional[tuple[str, ...]]
+    """The encoder: the folder of a run or an artifact, or an id on the Hub; several are seeds of one encoder."""
+    suite: str
+    """Name of a suite, or a TOML file of the same form."""
+    out: Path = Path("results")
+    """Folder of results. An interrupted bench continues from <out>/parts."""
+    data_root: Path | None = None
+    """Folder with the clones or manifests of real data (docs/bench.md). What is not there is marked "not run"."""
+    about: Annotated[About, tyro.conf.arg(name="")] = About()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _BoardOptions:
+    """Write one page that compares results of one suite: tasks down, encoders across, controls first."""
+
+    files: Positional[tuple[Path, ...]]
+    """Results that `mvitac bench MODEL` wrote."""
+    out: Path = Path("board.html")
+    """The page, one file without scripts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CheckOptions:
+    """Check results: digests, the suite inside, and every score against its own sums per test group."""
+
+    files: Positional[tuple[Path, ...]]
+    """Results that `mvitac bench MODEL` wrote."""
+
+
+_MANUAL = """Score an encoder on every task of a suite, beside the same controls, and write one JSON file about it.
+
+    Suites: {suites}. `mvitac bench board FILE...` makes a page of results, `mvitac bench check FILE...` checks them.
+    """
+
+
+def bench(argv: list[str]) -> None:
+    """mvitac bench MODEL... --suite NAME [--out DIR] [--data-root DIR]"""
+    options = parse(_Options, argv, "bench", description=_MANUAL.format(suites=", ".join(shipped())))
+    if not options.models:
+        raise ValueError("name the encoder: the folder of a run or an artifact (see mvitac bench --help)")
+    suite = find_suite(options.suite)
+    if options.data_root and not options.data_root.is_dir():
+        raise ValueError(f"--data-root {options.data_root} is not a folder: give the one with the clones of real data")
+    with shown(Console(stderr=True)):
+        path = run_bench(options.models, suite, options.out, options.data_root, options.about)
+    console, result = Console(markup=False, highlight=False), read_result(path)
+    for block in result["blocks"]:
+        if "not_run" in block:
+            print(f"{block['set']}, {block['task']}: not run, {block['not_run']}")
+            continue
+        records = records_of(block, result["encoder"])
+        shown_ = {"data": block["set"], "group_by": block["group_by"], "summary": summarise(records, suite.probes[0])}
+        print_summary({**shown_, "leaks": leaks_of(records)}, console)
+    print(f"written: {path} (digest {result['digest'][:16]})")
+
+
+def board(argv: list[str]) -> None:
+    """mvitac bench board FILE... [--out FILE.html]"""
+    options = parse(_BoardOptions, argv, "bench board")
+    if not options.files:
+        raise ValueError("name the results to compare (see mvitac bench board --help)")
+    check_place(options.out)
+    print(f"written: {write_board(options.files, options.out)}")
+
+
+def check(argv: list[str]) -> None:
+    """mvitac bench check FILE..."""
+    options = parse(_CheckOptions, argv, "bench check")
+    if not options.files:
+        raise ValueError("name the results to check (see mvitac bench check --help)")
+    for path in options.files:
+        found = problems(result := read_result(path))
+        if found:
+            more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+            raise ValueError(f"{path}: {found[0]}{more}")
+        num = sum(len(block.get("records", ())) for block in result["blocks"])
+        print(f"{path}: {result['encoder']['name']} on {result['suite']['name']}, {num} scores agree with their sums")

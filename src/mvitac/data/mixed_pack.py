@@ -1,0 +1,246 @@
+"""Several packs as one: other datasets, sensors, image sizes and missing modalities. Images are not copied.
+
+This module does not import torch.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from mvitac.data.images import fit
+from mvitac.data.jpeg import Lazy
+from mvitac.data.mixed_table import MixedTasks, mixed_spec, mixed_table, renamed_columns
+from mvitac.data.pack import Images, Pack, has_difference
+from mvitac.data.row_hashes import row_hashes
+from mvitac.data.spec import MODALITIES
+from mvitac.system.files import digest
+
+
+class MixedPack(Pack):
+    """The rows of all ``parts``, one part after another.
+
+    A row has the split, labels, values and groups that it has in its part (``mixed_table``). A part without a modality has
+    no image of it.
+
+    Attributes:
+        weights: How often each part is drawn in training, relative to the others; () = by its number of rows.
+        temperature: Without weights, parts are drawn in proportion to (number of rows)^temperature.
+        one_part: Whether all rows of a batch are of one part.
+
+    Args:
+        parts: Name -> pack, at least two.
+        size: Side of the images in pixels; images of another side are resized when they are read. 0: the largest side.
+        allow_leak: Accept groups, rows and images that one part has in train and another in test.
+
+    Raises:
+        ValueError: If a part has no rows to train on, the parts differ in channels or in what touch images show, or are
+            the same data, or train of one part and test of another share groups, rows or images.
+
+    Example:
+        >>> pack = MixedPack({"tag": Pack("packs/tag"), "mine": Pack("packs/mine")})  # doctest: +SKIP
+        >>> pack.column("part")[pack.rows("train")]  # doctest: +SKIP
+    """
+
+    weights: tuple[float, ...] = ()
+    temperature: float = 1.0
+    one_part: bool = False
+
+    def __init__(self, parts: Mapping[str, Pack], *, size: int = 0, allow_leak: bool = False) -> None:
+        self.parts = dict(parts)
+        packs = list(self.parts.values())
+        channels = _check(self.parts)
+        self.path, self.meta, self.store = Path(" + ".join(str(pack.path) for pack in packs)), {}, "raw"
+        self.num, self.size = sum(pack.num for pack in packs), size or max(pack.size for pack in packs)
+        self.digests = {name: pack.digest for name, pack in self.parts.items()} | {"size": digest(self.size)}
+        columns = renamed_columns(self.parts)
+        tasks = MixedTasks(self.parts, columns)
+        self.table: pa.Table = mixed_table(self.parts, columns, tasks)
+        notes = [
+            f"{name}: images of {pack.size} px are resized to {self.size} px when they are read"
+            for name, pack in self.parts.items()
+            if pack.size != self.size
+        ]
+        if found := _shared(self.parts):
+            if not allow_leak:
+                raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
+            notes.append(found)
+        self.spec = mixed_spec(self.parts, tasks, channels, notes)
+        self.images: dict[str, Images] = {
+            m: MixedImages([_of(pack, m) for pack in packs], self.size, channels[m]) for m in self.spec.modalities
+        }
+
+    def has(self, modality: str) -> np.ndarray:
+        return self._has[modality]
+
+    @functools.cached_property
+    def _has(self) -> dict[str, np.ndarray]:
+        return {modality: self.column(f"has_{modality}") for modality in self.spec.modalities}
+
+    @functools.cached_property
+    def whole(self) -> np.ndarray:
+        return np.concatenate([pack.whole for pack in self.parts.values()])
+
+    @functools.cached_property
+    def hidden(self) -> np.ndarray:
+        return np.concatenate([pack.hidden for pack in self.parts.values()])
+
+    @functools.cached_property
+    def phased(self) -> bool:
+        return any(pack.phased for pack in self.parts.values())
+
+    @property
+    def own_ids(self) -> np.ndarray:
+        return np.concatenate([pack.own_ids for pack in self.parts.values()])
+
+    @functools.cached_property
+    def part_of(self) -> np.ndarray:
+        """int64 [N], number of each row's part."""
+        return np.repeat(np.arange(len(self.parts)), [pack.num for pack in self.parts.values()])
+
+    def shares(self, rows: np.ndarray) -> np.ndarray:
+        """Share [parts] of each part in the rows that training draws from ``rows``."""
+        sizes = np.bincount(self.part_of[rows], minlength=len(self.parts))
+        drawn = np.array(self.weights) if self.weights else sizes**self.temperature * (sizes > 0)
+        return drawn / drawn.sum()
+
+    @property
+    def weighted(self) -> bool:
+        """Whether training draws from the parts otherwise than from one pack of all rows."""
+        return bool(self.weights) or self.temperature != 1 or self.one_part
+
+    def alone(self, part: str) -> Pack:
+        """This pack with the rows of all other parts hidden, and the modalities of ``part``."""
+        made, own = copy.copy(self), self.parts[part].spec
+        made.__dict__.pop("_answers", None)  # labels by split, of all parts
+        inside = self.part_of == list(self.parts).index(part)
+        splits = pa.array(np.where(inside, self.column("split").astype(str), "hidden"))
+        made.table = self.table.set_column(self.table.schema.get_field_index("split"), "split", splits)
+        lacking = {f"{m}_channels": 0 for m in self.spec.modalities if m not in own.modalities}
+        made.spec = replace(self.spec, **lacking)
+        return made
+
+
+class MixedImages(Lazy):
+    """uint8 [N, S, S, C]: the images of several packs, one after another, resized to one side.
+
+    Args:
+        pieces: Images of each pack; a number stands for so many rows without an image, which are zeros.
+        size: Side S in pixels.
+        channels: C.
+    """
+
+    def __init__(self, pieces: Sequence[Images | int], size: int, channels: int) -> None:
+        self.pieces = pieces
+        lengths = [piece if isinstance(piece, int) else len(piece) for piece in pieces]
+        self.starts = np.cumsum([0, *lengths])
+        super().__init__((int(self.starts[-1]), size, size, channels))
+
+    def _made(self, rows: np.ndarray) -> np.ndarray:
+        numbers = np.searchsorted(self.starts, rows, side="right") - 1
+        found = np.unique(numbers)
+        if len(found) == 1:
+            return self._of(int(found[0]), rows)
+        images = np.empty((len(rows), *self.shape[1:]), np.uint8)
+        for number in found.tolist():
+            here = numbers == number
+            images[here] = self._of(number, rows[here])
+        return images
+
+    def _of(self, number: int, rows: np.ndarray) -> np.ndarray:
+        """The images of ``rows``, all of the pack ``number``."""
+        piece = self.pieces[number]
+        if isinstance(piece, int):
+            return np.zeros((len(rows), *self.shape[1:]), np.uint8)
+        images = piece[rows - self.starts[number]]
+        size = self.shape[1]
+        return images if images.shape[1] == size else np.stack([fit(image, size) for image in images])
+
+
+def _of(pack: Pack, modality: str) -> Images | int:
+    return pack.images.get(modality, pack.num)
+
+
+def _check(parts: Mapping[str, Pack]) -> dict[str, int]:
+    """Check that the parts fit together; return the channels of each modality."""
+    digests: dict[str, str] = {}
+    for name, pack in parts.items():
+        if twin := digests.get(pack.digest):
+            raise ValueError(f"parts {twin} and {name} are the same data: give each pack once, with a weight")
+        digests[pack.digest] = name
+        if not len(pack.rows("train", "unlabelled")):
+            raise ValueError(
+                f"part {name} ({pack.path}) has no rows in split train or unlabelled: leave it out, and score it with"
+                " `mvitac probe --on`"
+            )
+    channels = {}
+    for modality in MODALITIES:
+        given = {name: num for name, pack in parts.items() if (num := pack.spec.channels(modality))}
+        if len(set(given.values())) > 1:
+            counts = ", ".join(f"{num} in {name}" for name, num in given.items())
+            raise ValueError(f"{modality} channels differ: {counts}; pack them with the same number of sensors")
+        channels[modality] = next(iter(given.values()), 0)
+    minus = {name: has_difference(pack) for name, pack in parts.items() if pack.spec.touch_channels}
+    if len(set(minus.values())) > 1:
+        with_, without = (next(name for name, given in minus.items() if given == wanted) for wanted in (True, False))
+        raise ValueError(
+            f"touch is stored minus its background in {with_} and as it is in {without}: pack both alike"
+            " (--subtract-background)"
+        )
+    return channels
+
+
+def _shared(parts: Mapping[str, Pack]) -> str:
+    """Say what train (or val) of one part and test of another have in common; "" if nothing."""
+    sides = {name: _sides(pack) for name, pack in parts.items()}
+    for (a, one), (b, other) in itertools.permutations(parts.items(), 2):
+        learned, scored = sides[a][0], sides[b][1]
+        hashes = list(zip(("id", "group"), row_hashes(one), row_hashes(other), strict=True))
+        for column, ours, theirs in hashes[::-1]:
+            both = scored[np.isin(theirs[scored], ours[learned])]
+            if len(both):
+                what, num = other.column(column)[both[0]], len(np.unique(theirs[both]))
+                by = other.spec.group_by if column == "group" else "row"
+                return f"{by} {str(what)!r} is in train of part {a} and in test of part {b}, one of {num}"
+        for modality in MODALITIES:
+            if same := _same_image(one, other, modality, learned, scored):
+                i, j, num = same
+                names = [f"{p.column('id')[row]!r} ({p.column('group')[row]})" for p, row in ((one, i), (other, j))]
+                return (
+                    f"one {modality} image has two names: it is row {names[0]} in train of part {a} and row {names[1]} in"
+                    f" test of part {b}, one of {num}"
+                )
+    return ""
+
+
+def _sides(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that are learned from, and rows that are scored by at least one task."""
+    columns = {"split", *(task.split for task in pack.spec.all_tasks)}
+    scored = np.any([np.isin(pack.column(name), ["test"]) for name in columns], axis=0)
+    return pack.rows("train", "val", "unlabelled"), np.flatnonzero(scored)
+
+
+def _same_image(
+    one: Pack, other: Pack, modality: str, ours: np.ndarray, theirs: np.ndarray
+) -> tuple[int, int, int] | None:
+    """A row of each pack with the same image, and the number of such images. None if there is none.
+
+    Only images of one size and storage can be compared. An image of a single value (nothing) is not looked at.
+    """
+    sums = f"crc_{modality}"
+    packs = (one, other)
+    if not all(sums in p.table.column_names for p in packs) or len({(p.size, p.store) for p in packs}) > 1:
+        return None
+    shared, first, second = np.intersect1d(one.column(sums)[ours], other.column(sums)[theirs], return_indices=True)
+    for i, j in zip(ours[first].tolist(), theirs[second].tolist(), strict=True):
+        image = one.images[modality][i]
+        if image.min() < image.max() and np.array_equal(image, other.images[modality][j]):
+            return i, j, len(shared)
+    return None

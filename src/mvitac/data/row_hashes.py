@@ -1,0 +1,31 @@
+"""Hashes of ids and groups of rows, by which packs find rows of each other. This module does not import torch."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+from mvitac.data.pack import Pack
+
+
+def row_hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
+    """uint64 [N] hashes of the ids and of the groups of all rows, of a mix as in its parts.
+
+    Numbers, and groups that are single rows, mean nothing outside their dataset: its name is part of them.
+    """
+    if pack.parts:
+        ids, groups = zip(*map(row_hashes, pack.parts.values()), strict=True)
+        return np.concatenate(ids), np.concatenate(groups)
+    name = pack.spec.name.split(" (")[0]
+    ids, groups = pack.own_ids, pack.column("group").astype(str)
+    weak = pack.spec.group_by == "row"
+    return _hash(ids, name, False), _hash(groups, name, weak)
+
+
+def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:
+    unique, inverse = np.unique(texts, return_inverse=True)
+    named = (f"{name}/{text}" if weak or text.isdigit() else text for text in unique.tolist())
+    return np.array([int.from_bytes(hashlib.blake2b(t.encode(), digest_size=8).digest()) for t in named], np.uint64)[
+        inverse
+    ]

@@ -1,0 +1,107 @@
+"""Several packs as one training set."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from mvitac.data.build import check_request
+from mvitac.data.mixed_pack import MixedPack
+from mvitac.data.pack import SHARDED, Pack
+from mvitac.data.source import Source
+from mvitac.datasets.base import DatasetConfig
+from mvitac.datasets.pack import PackConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixConfig(DatasetConfig):
+    """Several packs as one training set: other datasets, sensors, image sizes, and parts without a camera or touch."""
+
+    name: ClassVar[str] = "mix"
+
+    parts: tuple[str, ...] = ()
+    """The packs, each as NAME=FOLDER:WEIGHT, such as tag=packs/tag:2 mine=packs/mine:1. NAME is by default the folder's.
+    WEIGHT is the part's share of the drawn rows relative to the others; by default a part's number of rows."""
+    temperature: float = 1.0
+    """Without weights: parts are drawn in proportion to (number of rows)^temperature. 1: every row equally often. Below 1,
+    small parts are drawn more often (T3, arXiv:2406.13640: .5); 0: all parts equally often."""
+    batches: Literal["mixed", "one-part"] = "mixed"
+    """mixed: every batch has rows of all parts. one-part: each batch is of one part, so that no negative differs from the
+    query by its dataset or sensor."""
+    size: int = 0
+    """Side of the images in pixels; those of another side are resized when they are read. 0: the largest of the parts."""
+    score_on: Literal["test", "val"] = "test"
+    """val: use split val as the test split and hide test, as for a pack."""
+    allow_leak: bool = False
+    """Accept groups, rows or images that one part has in train and another in test. Scores then say LEAK."""
+
+    def __post_init__(self) -> None:
+        self.frame_window()
+        check_request(self.size or 256, self.workers, store=self.store, quality=self.quality)
+        if not 0 <= self.temperature < math.inf:
+            raise ValueError(f"temperature {self.temperature}: give a number >= 0")
+        names = [name for name, _, _ in self.named_parts()]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"part {name!r} is given twice: give each part its own name, NAME=FOLDER")
+        given = {weight is not None for _, _, weight in self.named_parts()}
+        if len(given) > 1:
+            raise ValueError(f"parts {' '.join(self.parts)}: give every part a weight (NAME=FOLDER:WEIGHT), or none")
+        if True in given and self.temperature != 1:
+            raise ValueError(
+                f"temperature {self.temperature} has no effect on parts with weights: leave one of both out"
+            )
+
+    def named_parts(self) -> list[tuple[str, Path, float | None]]:
+        """Name, folder and weight of each part."""
+        found = []
+        for text in self.parts:
+            name, folder, weight = re.fullmatch(r"(?:([\w.-]+)=)?(.*?)(?::([^:/]*))?", text).groups()  # type: ignore
+            if not folder:
+                raise ValueError(f"part {text!r} names no folder: give NAME=FOLDER or NAME=FOLDER:WEIGHT")
+            found.append(
+                (name or Path(folder).resolve().name, Path(folder), None if weight is None else _weight(weight, text))
+            )
+        return found
+
+    def source(self) -> Source:
+        raise ValueError("a mix is not packed: its parts are packs already, and are read where they are")
+
+    def _frames(self, quiet: bool) -> Pack:
+        given = self.named_parts()
+        if len(given) < 2:
+            raise ValueError(f"a mix needs at least two parts, got {len(given)}: --data.parts a=packs/a b=packs/b")
+        parts = {}
+        for name, folder, _ in given:
+            file = folder / "pack.json"
+            if "://" in str(folder) or (file.is_file() and SHARDED in file.read_text()):
+                raise ValueError(f"part {name} ({folder}) is in shards: a mix reads packs on disk, copy its pack here")
+            try:
+                parts[name] = PackConfig(path=folder, score_on=self.score_on).open(quiet=quiet)
+            except ValueError as error:
+                raise ValueError(f"part {name}: {error}") from None
+        pack = MixedPack(parts, size=self.size, allow_leak=self.allow_leak)
+        pack.one_part, pack.temperature = self.batches == "one-part", self.temperature
+        pack.weights = tuple(weight for _, _, weight in given if weight is not None)
+        return pack
+
+
+def open_packs(folders: Sequence[str]) -> Pack:
+    """The pack in one folder, or those in several (FOLDER or NAME=FOLDER) as one."""
+    if not folders:
+        raise ValueError("missing PACK: Folder of the pack, or of several")
+    return Pack(folders[0]) if len(folders) == 1 else MixConfig(parts=tuple(folders)).open()
+
+
+def _weight(text: str, part: str) -> float:
+    try:
+        weight = float(text)
+    except ValueError:
+        weight = math.nan
+    if not 0 < weight < math.inf:
+        raise ValueError(f"part {part!r} has weight {text!r}: give a positive number, or leave the part out")
+    return weight

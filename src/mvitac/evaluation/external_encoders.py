@@ -1,0 +1,76 @@
+"""Probes of other people's encoders (``mvitac.external``), beside those of our runs and under the same protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import AnyTask
+from mvitac.evaluation.controls import Records
+from mvitac.evaluation.leaks import UNKNOWN
+from mvitac.evaluation.probe import probe_model, probes_of
+from mvitac.external import ExternalModel, load_external
+from mvitac.system.progress import work
+
+Bound = tuple[ExternalModel, Pack]
+"""An encoder and the data, bound to each other."""
+
+
+def open_encoders(texts: Sequence[str], pack: Pack | None) -> list[Bound]:
+    """Open the encoders that ``texts`` name, for ``pack``.
+
+    Raises:
+        ValueError: If one cannot be opened or used on this data, or two have one title and seed.
+    """
+    if texts and pack is None:
+        raise ValueError("an encoder has no data of its own: name a pack with --on PACK")
+    found: list[Bound] = []
+    for model in map(load_external, texts):
+        if any((model.title, model.seed) == (other.title, other.seed) for other, _ in found):
+            raise ValueError(
+                f"{model.text}: {model.title!r} with seed {model.seed} is given twice: give it a title=NAME"
+            )
+        assert pack is not None
+        found.append(model.on(pack))
+    return found
+
+
+def probe_encoders(
+    encoders: Sequence[Bound],
+    tasks: Sequence[AnyTask],
+    modalities: Sequence[str],
+    probes: Sequence[str],
+    *,
+    controls: bool,
+) -> Records:
+    """Records of each encoder and, with ``controls``, of the same networks with random weights."""
+    records: Records = []
+    for model, pack in encoders:
+        random = model.untrained() if controls else None
+        num = (2 if random else 1) * len(modalities) * sum(len(probes_of(task, probes)) for task in tasks)
+        with work(f"probing {model.title}", num, "probes"):
+            for each, own in ((model, {"encoder": model.text}), *(((random, {}),) if random else ())):
+                known = {"source": each.title, "seed": each.seed, **own, "leak": _leak(each)}
+                records += [{**known, **record} for record in probe_model(each, pack, tasks, modalities, probes)]
+    return records
+
+
+def _leak(model: ExternalModel) -> str:
+    """That leaks cannot be excluded, where nothing says what the encoder was trained on."""
+    return UNKNOWN if UNKNOWN in model.trained_on else ""
+
+
+def about_lines(described: Sequence[dict[str, Any]]) -> list[str]:
+    """What stands below a table about its encoders (``ExternalModel.describe``): licence, parameters, training data."""
+    senses: dict[str, list[str]] = {}
+    for model in described:
+        for modality, encoder in model["encoders"].items():
+            use = ", no commercial use" if encoder["noncommercial"] else ""
+            line = (
+                f"{encoder['title']}: {encoder['parameters'] / 1e6:.3g} M parameters; licence {encoder['licence']}{use};"
+                f" trained on {encoder['trained_on']}; {encoder['source']}; {encoder['features']} features of"
+            )
+            senses.setdefault(line, []).append(modality)
+    lines = [f"{line} {' and '.join(dict.fromkeys(found))}" for line, found in senses.items()]
+    return [*lines, *dict.fromkeys(f"{model['title']}: {note}" for model in described for note in model["notes"])]

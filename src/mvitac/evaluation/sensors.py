@@ -1,0 +1,221 @@
+"""Touch sensors: images or features of a new one in the terms of known ones, and how much features tell of the sensor.
+
+All statistics come from images without labels. Shapes: features [N, D].
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.jpeg import Lazy
+from mvitac.data.pack import Pack
+from mvitac.evaluation import diagnostics
+from mvitac.evaluation.classifiers import fit_linear
+from mvitac.evaluation.features import features, sample
+from mvitac.model import Model
+from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, learn_colours, recolour
+from mvitac.transforms.preprocess import encoder_input
+
+Standardise = Literal["colours", "batch-norm", "features"]
+NUM_STATISTICS = 256
+"""Images of a sensor that statistics are taken from, at most."""
+MIN_GALLERY = 11
+"""Least number of presses for retrieval."""
+MAX_LOOKS = 4
+"""Known sensors in whose colours a new one is shown, at most."""
+
+
+def unlabelled_rows(pack: Pack, sensor: int, num: int = NUM_STATISTICS) -> np.ndarray:
+    """Rows of ``sensor`` whose touch images say what it looks like: of train, or else of any split but test.
+
+    Test images themselves are used only if there are fewer than ``MIN_IMAGES`` others. Labels are never read.
+    """
+    own = np.flatnonzero(pack.has("touch") & (pack.sensors == sensor))
+    split = pack.column("split").astype(str)[own]
+    kinds = (np.isin(split, ("train", "unlabelled")), split != "test", np.ones(len(own), bool))
+    return sample(own[next((kind for kind in kinds if kind.sum() >= MIN_IMAGES), kinds[-1])], num)
+
+
+def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> list[str]:
+    """Sentences that say how many images of each sensor ``standardise`` used."""
+    found = []
+    for number, name in enumerate(pack.sensor_names):
+        rows = unlabelled_rows(pack, number, NUM_IMAGES if "colours" in standardise else NUM_STATISTICS)
+        tested = ", test images among them" if (pack.column("split")[rows] == "test").any() else ""
+        found.append(f"uses {len(rows)} unlabelled images of sensor {name}{tested}")
+    return found
+
+
+def touch_features(
+    model: Model, pack: Pack, modality: str, rows: np.ndarray, standardise: tuple[Standardise, ...] = (), *, maps: bool
+) -> np.ndarray:
+    """``features`` of pack rows, those of touch in the statistics of each row's own sensor.
+
+    Args:
+        model: The model.
+        pack: The data.
+        modality: vision (nothing is changed) or touch.
+        rows: Pack rows, ascending.
+        standardise: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
+            each sensor. features: each sensor's features are standardised by their own mean and standard deviation.
+            colours: those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``.
+        maps: Return the trunk's last feature maps [N, P, D] instead of features [N, D].
+    """
+    if modality != "touch" or not standardise:
+        return features(model, pack, modality, rows, maps=maps)
+    parts, sensors = [], pack.sensors[rows]
+    for number in np.unique(sensors):
+        known, own = unlabelled_rows(pack, int(number)), rows[sensors == number]
+        looks = pack.looks if isinstance(pack, RecolouredPack) and number in pack.new else [pack]
+        models = [with_statistics(model, look, known) if "batch-norm" in standardise else model for look in looks]
+
+        def mean(rows: np.ndarray, each: list[tuple[Model, Pack]]) -> np.ndarray:
+            each_look = [features(m, look, modality, rows, maps=maps) for m, look in each]
+            return np.asarray(np.mean(each_look, axis=0, dtype=np.float32))
+
+        z = mean(own, each := list(zip(models, looks, strict=True)))
+        if "features" in standardise:
+            seen = mean(known, each)
+            axes = tuple(range(seen.ndim - 1))
+            z = (z - seen.mean(axes)) / (seen.std(axes) + 1e-6)
+        parts.append(z)
+    order = np.argsort(sensors, kind="stable")  # of the rows in ``parts``
+    return np.concatenate(parts)[np.argsort(order)]
+
+
+@torch.no_grad()
+def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
+    """A copy of ``model`` whose touch encoder has the BatchNorm statistics of the touch images of ``rows``.
+
+    Source: Schneider et al., https://arxiv.org/abs/2006.16971.
+
+    Raises:
+        ValueError: If the encoder has no BatchNorm.
+    """
+    made = copy.deepcopy(model)
+    trunk = made.encoders["touch"]
+    norms = [layer for layer in trunk.modules() if isinstance(layer, nn.modules.batchnorm._BatchNorm)]
+    if not norms:
+        raise ValueError(f"trunk {model.run.encoder.trunk} has no BatchNorm: leave --standardise batch-norm out")
+    for layer in norms:
+        layer.reset_running_stats()
+        layer.momentum = None  # the plain mean over batches
+        layer.train()
+    device = next(trunk.parameters()).device
+    for chunk in np.array_split(rows, max(1, len(rows) // 64)):
+        images = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][chunk])).permute(0, 3, 1, 2).to(device)
+        trunk(encoder_input(images, model.run.augment.eval_size))
+    return made.eval()
+
+
+class _Recoloured(Lazy):
+    """Touch images, those of some sensors through a function."""
+
+    def __init__(self, pack: Pack, change: dict[int, Callable[[np.ndarray], np.ndarray]]) -> None:
+        self.images, self.sensors, self.change = pack.images["touch"], pack.sensors, change
+        super().__init__(self.images.shape)  # type: ignore[arg-type]
+
+    def _made(self, rows: np.ndarray) -> np.ndarray:
+        made = np.array(self.images[rows])
+        for number, change in self.change.items():
+            if (here := self.sensors[rows] == number).any():
+                made[here] = change(made[here])
+        return made
+
+
+class RecolouredPack(JoinedPack):
+    """A joined pack that also shows the touches of sensors that ``learn`` lacks in the colours of those that it has.
+
+    Attributes:
+        new: Numbers of the sensors that ``learn`` lacks.
+        looks: One pack for each known sensor (at most ``MAX_LOOKS``, those with the most rows), with its colours.
+
+    Raises:
+        ValueError: If ``learn`` has all sensors of ``score``, or the colours of a sensor cannot be learned.
+    """
+
+    def __init__(self, learn: Pack, score: Pack) -> None:
+        super().__init__(learn, score)
+        if self.spec.touch_channels != 3 or self.spec.frames("touch") > 1:
+            raise ValueError("--standardise colours knows single images of one gel only: leave it out")
+        self.new = {n for n, name in enumerate(self.sensor_names) if name not in learn.sensor_names}
+        if not self.new:
+            raise ValueError(
+                f"--standardise colours: all sensors of {score.path} are in {learn.path} too, leave it out"
+            )
+        rows = np.bincount(self.sensors[: learn.num], minlength=len(self.sensor_names))
+        old = np.argsort(-rows, kind="stable")[: min(len(learn.sensor_names), MAX_LOOKS)]
+        learned = {number: _colours_of(self, number) for number in self.new}
+        self.looks = [self._look(learned, number, _colours_of(self, int(number))) for number in old]
+
+    def _look(self, learned: dict[int, GelColours], number: int, target: GelColours) -> Pack:
+        look: Pack = copy.copy(self)
+        change = {n: partial(recolour, source=own, target=target) for n, own in learned.items()}
+        look.images = {**self.images, "touch": _Recoloured(self, change)}
+        look.digests = {**self.digests, "colours": self.sensor_names[number]}
+        return look
+
+
+def _colours_of(pack: Pack, number: int) -> GelColours:
+    """The colours of a sensor of ``pack``, learned from unlabelled images."""
+    try:
+        return learn_colours(pack.images["touch"][unlabelled_rows(pack, number, NUM_IMAGES)])
+    except ValueError as error:
+        raise ValueError(f"sensor {pack.sensor_names[number]!r}: {error}; or leave --standardise colours out") from None
+
+
+def sensor_records(model: Model, pack: Pack) -> list[dict[str, Any]]:
+    """How much touch features tell of the sensor: "name", "score", "chance" and "num" of up to two measures.
+
+    "which sensor": accuracy of a logistic regression on test rows, beside the share of the most common sensor. "same spot,
+    other sensor": ``cross_sensor``.
+    """
+    return [record for record in (_which_sensor(model, pack), cross_sensor(model, pack)) if record]
+
+
+def _record(name: str, hits: np.ndarray, chance: float) -> dict[str, Any]:
+    return {"name": name, "score": float(np.mean(hits)), "chance": chance, "num": len(hits)}
+
+
+def _which_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
+    """None if train has one sensor only, or test one that train lacks."""
+    train, val, test = (pack.rows(split, having=("touch",)) for split in ("train", "val", "test"))
+    val = val if len(val) else train
+    fitted = np.unique(pack.sensors[np.concatenate([train, val])])
+    right = pack.sensors[test]
+    if len(np.unique(pack.sensors[train])) < 2 or not len(test) or not np.isin(right, pack.sensors[train]).all():
+        return None
+    z = [features(model, pack, "touch", rows) for rows in (train, val, test)]
+    predict, _ = fit_linear(z[0], pack.sensors[train], z[1], pack.sensors[val])
+    common = np.bincount(pack.sensors[train]).argmax()
+    return _record("which sensor", fitted[predict(z[2]).argmax(1)] == right, float((right == common).mean()))
+
+
+def cross_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
+    """R@5 of each test touch: its press among the images of all test presses through other sensors.
+
+    Each query sees one image of every press that another sensor pressed, so chance is 5 / their number. None for packs
+    without presses through several sensors.
+    """
+    if "press" not in pack.table.column_names:
+        return None
+    rows = pack.rows("test", having=("touch",))
+    presses, sensors, hits, chances = pack.presses[rows], pack.sensors[rows], [], []
+    z = torch.from_numpy(features(model, pack, "touch", rows))
+    for number in np.unique(sensors):
+        others = np.flatnonzero(sensors != number)
+        others = others[np.unique(presses[others], return_index=True)[1]]  # one image of each press
+        queries = np.flatnonzero((sensors == number) & np.isin(presses, presses[others]))
+        if len(queries) and len(others) >= MIN_GALLERY:
+            place = torch.from_numpy(np.searchsorted(presses[others], presses[queries]))
+            hits.append(diagnostics.retrieval_ranks(z[queries], z[others], torch.arange(len(others)), place) < 5)
+            chances += [5 / len(others)] * len(queries)
+    return _record("same spot, other sensor", np.concatenate(hits), float(np.mean(chances))) if hits else None

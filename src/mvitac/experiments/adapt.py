@@ -1,0 +1,137 @@
+"""``mvitac adapt``: a model on unlabelled data of a new sensor, what it gains there and what it forgets of the old ones.
+
+First the running statistics of BatchNorm are estimated anew on the new data (arXiv:1603.04779), then the run's own method
+goes on from its weights for a few steps. The result is a run like any other, with all scores in adapted.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.controls import scratch
+from mvitac.evaluation.evaluate import check_channels, check_unseen
+from mvitac.evaluation.leaks import Scored, Source, read_sources
+from mvitac.evaluation.probe import cross_modal, probe_model, retrieved_rows, scorable, split_rows
+from mvitac.model import Model, load
+from mvitac.nn.initial import Init
+from mvitac.run import Run
+from mvitac.system.files import brief, write_json
+from mvitac.training.loop import train
+from mvitac.training.setup import check_out
+
+NEW, OLD, TRANSFER = "new data", "old data", "probes of old labels on new data"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adaptation:
+    """How far a model is adapted, and on what it is scored."""
+
+    steps: int = 200
+    """Steps of the run's own method on the new data. 0 = new statistics of BatchNorm only."""
+    lr: float | None = None
+    """Peak learning rate. Default: a tenth of that of the run."""
+    batches: int = 16
+    """Batches on which the statistics of BatchNorm are estimated anew. 0 = keep them."""
+    batch_size: int | None = None
+    """Pairs per step. Default: as in the run; at most all rows."""
+    seed: int = 0
+    """Random seed of batches and views."""
+    old: Path | None = None
+    """Pack of the old sensors, for what is forgotten. Default: the data of the run, if it is there."""
+    allow_leak: bool = False
+    """Score also on rows or groups that the model was trained on. LEAK stands beside every such score."""
+
+
+def adapt(
+    ancestor: Path,
+    data: DatasetConfig,
+    asked: Adaptation,
+    out: Path,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    say: Callable[[str], object] = print,
+) -> dict[str, Any]:
+    """Adapt the model at ``ancestor`` to ``data``, and score both models on the new and on the old data.
+
+    Args:
+        ancestor: Folder of a finished run, or of an artifact.
+        data: Data of the new sensor. Labels are only used for scores.
+        asked: How far.
+        out: Folder of the new run.
+        resume: Continue in ``out``.
+        quiet: Show no progress bar.
+        say: Called with lines of progress.
+
+    Returns:
+        The content of adapted.json: "records", each with "data" (what it was scored on), "source" (before or after), "task"
+        (R@5 for retrieval), "modality" (or direction) and its scores.
+
+    Raises:
+        ValueError: If the data does not fit the model, or the model saw what would be scored.
+    """
+    check_out(out, resume)
+    model, pack = load(ancestor), data.open(quiet=quiet)
+    check_channels(ancestor, model, pack, tuple(model.encoders))
+    packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
+    sources = {  # refuses leaks before anything is trained
+        name: check_unseen([ancestor], [model], one, scorable(one), allow_leak=asked.allow_leak)[0]
+        for name, one in packs.items()
+    }
+    train(_run_of(model, ancestor, data, pack, asked), out, resume=resume, quiet=quiet, pack=pack)
+    records, after = [], load(out)
+    for name, one in packs.items():
+        learned = read_sources(out, after.run, pack.digest, one)
+        for source, scored, known in (("before", model, sources[name]), ("after", after, learned)):
+            found = _scores(scored, one, known, retrieval=name != TRANSFER)
+            records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
+    result = {"ancestor": str(ancestor), "group_by": pack.spec.group_by, "records": records}
+    write_json(out / "adapted.json", result)
+    return result
+
+
+def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, asked: Adaptation) -> Run:
+    """The run of ``model`` on the new data, from its weights."""
+    old = scratch(model.run)
+    lr = old.optim.lr / 10 if asked.lr is None else asked.lr
+    size = asked.batch_size or max(2, min(old.batch_size, len(old.method.training_rows(pack))))
+    optim = replace(old.optim, lr=lr, schedule="cosine", warmup=0.1)
+    run = replace(old, recipe="adapt", data=data, init=Init(path=ancestor), renew_norms=asked.batches, optim=optim)
+    return replace(run, steps=asked.steps, batch_size=size, seed=asked.seed, eval_every=0, checkpoint_every=0)
+
+
+def _old_packs(model: Model, given: Path | None, new: Pack, say: Callable[[str], object]) -> dict[str, Pack]:
+    """What the model was trained on, or the pack ``given``; and, joined with ``new``, probes that are learned on it."""
+    try:
+        old = Pack(given) if given else model.open_data(quiet=True)
+    except ValueError as error:
+        if given:
+            raise
+        say(f"what is forgotten is not scored: {brief(error)} (--old PACK names data of the old sensors)")
+        return {}
+    try:
+        return {OLD: old} | ({TRANSFER: JoinedPack(old, new)} if scorable(old) and scorable(new) else {})
+    except ValueError as error:
+        say(f"{TRANSFER}: not scored ({error})")
+        return {OLD: old}
+
+
+def _scores(model: Model, pack: Pack, learned: Sequence[Source] | None, *, retrieval: bool) -> list[dict[str, Any]]:
+    """Records of linear probes of every task, and of retrieval between modalities: on test groups, or val without any."""
+    tasks, scored = {task.name: task for task in scorable(pack)}, Scored(pack)
+    modalities = [*pack.spec.modalities, *(["both"] if len(pack.spec.modalities) == 2 else [])]
+    records = []
+    for record in probe_model(model, pack, [*tasks.values()], modalities, ["linear"]) if tasks else ():
+        leak = scored.leak(learned, split_rows(pack, tasks[record["task"]]).test)
+        records += [{**record, "leak": leak}] if record["probe"] == "linear" else []
+    rows = retrieved_rows(pack)
+    rows = rows if len(rows) else pack.rows("val", having=pack.spec.modalities)
+    for record in cross_modal(model, pack, rows) if retrieval and len(rows) else ():
+        records.append({**record, "task": "R@5", "modality": record["direction"], "leak": scored.leak(learned, rows)})
+    return records

@@ -1,0 +1,284 @@
+"""``mvitac finetune``: train a model's encoders with labels, beside the frozen probe and training from scratch.
+
+    <out>/seed0/            the fine-tuned model of each seed: a run like any other, its scores in scores.json
+          scratch/seed0/    the same network from random weights, with the same labels
+          choice.json       what was tried on held-out groups, and the scores there
+          scores.json       all scores on test rows
+          10-percent/...    the same for another share of the labelled groups
+
+Settings are chosen on held-out groups of the labelled rows, never on test rows: first the learning rate, then the number of
+steps, then whether the heads start as linear probes (LP-FT, arXiv:2202.10054). The final model learns from all of these
+groups. A call that is repeated with ``resume`` continues.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import AnyTask, Task
+from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.controls import scratch
+from mvitac.evaluation.evaluate import ProbeConfig, check_channels, check_unseen, chosen
+from mvitac.evaluation.features import features
+from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
+from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split_rows
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.model import Model, load
+from mvitac.nn.finetuning import Part
+from mvitac.nn.initial import Init
+from mvitac.run import Optim, Run
+from mvitac.system.files import check_place, read_json, write_json
+from mvitac.training.loop import train
+from mvitac.transforms.random_views import Augment, ViewAugment
+
+FROZEN, SCRATCH = "frozen, linear probe", "from scratch"
+LIGHT = ViewAugment(scale=(0.8, 1.0), flip=0.0, grayscale=0.0)
+OPTIM = Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=0.05, decay_norms=False, schedule="cosine", warmup=0.1)
+Records = list[dict[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finetuning:
+    """What is trained, with which labels, and the settings that are tried on held-out groups."""
+
+    labels: tuple[str, ...] = ()
+    """Tasks with classes to learn. Default: all of the data, unless --values names some."""
+    values: tuple[str, ...] = ()
+    """Tasks with values to learn."""
+    modalities: tuple[Literal["touch", "vision"], ...] = ()
+    """Modalities to learn from. Default: all that the model and the data have."""
+    train: Part = "all"
+    """What of the encoders is trained, beside new heads. last-stage: the last stage of the trunk. lora: low-rank updates of
+    all layers, and BatchNorm. attentive: an attention over the last feature map. head: nothing."""
+    rank: int = 8
+    """Rank of the updates of lora."""
+    lr: tuple[float, ...] = (3e-4, 1e-4, 1e-3, 3e-3)
+    """Learning rates to try. The first is used where there are too few groups to choose."""
+    steps: tuple[int, ...] = (200, 600)
+    """Numbers of steps to try."""
+    batch_size: int = 32
+    """Pairs per step; at most all labelled rows."""
+    fractions: tuple[float, ...] = (100.0,)
+    """Percentages of the labelled groups to learn from, such as 1 5 10 100."""
+    seeds: int = 1
+    """Number of seeds. Each draws its own groups, batches and views."""
+    from_scratch: bool = True
+    """Also train all of the same network from random weights with the same labels. Its settings are chosen alike."""
+    allow_leak: bool = False
+    """Go on if the model, or one it started from, was trained on test rows or groups. LEAK stands beside every score."""
+
+    def __post_init__(self) -> None:
+        for name in ("lr", "steps", "fractions"):
+            if not (given := getattr(self, name)) or len(set(given)) < len(given):
+                raise ValueError(f"{name} {given}: give at least one number, and none twice")
+        if not all(0 < percent <= 100 for percent in self.fractions) or self.seeds < 1:
+            raise ValueError("give fractions in percent, above 0, at most 100, and at least 1 seed")
+
+
+def finetune(
+    ancestor: Path,
+    data: DatasetConfig,
+    asked: Finetuning,
+    out: Path,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    say: Callable[[str], object] = print,
+) -> dict[str, Any]:
+    """Fine-tune the model at ``ancestor`` on the labels of ``data``, and score it next to what it must beat.
+
+    Args:
+        ancestor: Folder of a finished run, or of an artifact.
+        data: The labelled data.
+        asked: What to train.
+        out: Folder for the runs and scores.
+        resume: Continue in ``out``.
+        quiet: Show no progress bars.
+        say: Called with lines of progress.
+
+    Returns:
+        The content of scores.json: "records", each with its "fraction"; "chosen" (fraction -> source -> settings); "models"
+        (folders of the fine-tuned models of the last fraction); "leaks".
+
+    Raises:
+        ValueError: If the labels, the data and the model do not fit together, or there are too few groups.
+    """
+    check_place(out / "scores.json")
+    if out.exists() and any(out.iterdir()) and not resume:
+        raise ValueError(f"{out} is not empty: continue it with --resume, or choose another --out")
+    model, pack = load(ancestor), data.open(quiet=quiet)
+    names = (*asked.labels, *asked.values) or tuple(task.name for task in pack.spec.tasks or pack.spec.values)
+    tasks = tuple(chosen(pack, ProbeConfig(tasks=names))[0])
+    method = _method(asked, tasks, ancestor, model, pack)
+    modality = "both" if len(method.modalities) == 2 else method.modalities[0]
+    job = _Job(asked, model, pack, _run_of(model, ancestor, data, pack, method), tasks, modality, out, say, quiet)
+    for task in tasks:
+        job.test(task)
+        _check_classes(job, task)
+    if 100 in asked.fractions and len(asked.lr) + len(asked.steps) > 2 and (why := job.too_few(100)):
+        raise ValueError(f"{why}: give one --lr and one --steps")
+    sources = check_unseen([ancestor], [model], pack, tasks, allow_leak=asked.allow_leak)[0]
+    found = {percent: _fraction(job, percent, sources) for percent in asked.fractions}
+    records = [record for own, _ in found.values() for record in own]
+    result = {
+        **{"data": pack.spec.name, "pack": pack.digest, "ancestor": str(ancestor), "group_by": pack.spec.group_by},
+        **{"notes": list(pack.spec.notes), "leaks": leaks_of(records), "records": records},
+        "chosen": {f"{percent:g}": settings for percent, (_, settings) in found.items()},
+        "models": [str(job.folder(asked.fractions[-1]) / f"seed{seed}") for seed in range(asked.seeds)],
+    }
+    write_json(out / "scores.json", result)
+    return result
+
+
+def _method(
+    asked: Finetuning, tasks: tuple[AnyTask, ...], ancestor: Path, model: Model, pack: Pack
+) -> SupervisedConfig:
+    modalities: Any = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
+    check_channels(ancestor, model, pack, modalities or tuple(model.encoders))
+    names = tuple(task.name for task in tasks)
+    return SupervisedConfig(tasks=names, modalities=modalities, train=asked.train, rank=asked.rank)
+
+
+def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
+    """Fine-tuning with all labels: light views at the size at which the frozen features are probed."""
+    side = min(model.run.augment.eval_size, pack.size)
+    run = replace(scratch(model.run), recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
+    run = replace(run, init=Init(path=ancestor, modalities=method.modalities, heads=False).resolved(), renew_norms=0)
+    run = replace(run, augment=Augment(size=side, vision=LIGHT, touch=LIGHT), sampler="shuffle", positives="same-image")
+    return replace(run, chunk=0, eval_every=0, checkpoint_every=0)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Fine-tuning of one model on one pack."""
+
+    asked: Finetuning
+    model: Model
+    pack: Pack
+    run: Run
+    """With all labels."""
+    tasks: tuple[AnyTask, ...]
+    modality: str
+    out: Path
+    say: Callable[[str], object]
+    quiet: bool
+
+    def method(self, percent: float, seed: int, **changes: Any) -> SupervisedConfig:
+        return replace(self.run.method, share=percent / 100, draw=seed + 1, **changes)  # type: ignore[call-arg]
+
+    def run_of(self, percent: float, seed: int, kind: str, settings: dict[str, Any], *, hold_out: bool = False) -> Run:
+        """The run of ``kind`` on this share of the labels with these lr, steps and start of the heads."""
+        method = self.method(percent, seed, hold_out=hold_out, heads_from=settings["heads_from"])
+        if kind == SCRATCH:
+            method = replace(method, train="all")
+        size = max(2, min(self.asked.batch_size, len(method.training_rows(self.pack))))
+        optim = replace(self.run.optim, lr=settings["lr"])
+        run = replace(self.run, method=method, seed=seed, steps=settings["steps"], optim=optim, batch_size=size)
+        return replace(run, init=Init()) if kind == SCRATCH else run
+
+    def too_few(self, percent: float, seed: int = 0) -> str:
+        """Why no groups can be held out of this share of the labels; "" if some can."""
+        try:
+            self.method(percent, seed, hold_out=True).training_rows(self.pack)
+        except ValueError as error:
+            return str(error)
+        return ""
+
+    def folder(self, percent: float) -> Path:
+        return self.out if percent == 100 else self.out / f"{percent:g}-percent"
+
+    def test(self, task: AnyTask) -> np.ndarray:
+        return split_rows(self.pack, task, self.modality).test
+
+    def named(self, found: Records, kind: str, percent: float, seed: int, learned: list[Source] | None) -> Records:
+        """Records with their source and leaks."""
+        rows, scored = {task.name: self.test(task) for task in self.tasks}, Scored(self.pack)
+        known = {"source": kind, "seed": seed, "fraction": percent}
+        return [{**known, **record, "leak": scored.leak(learned, rows[record["task"]])} for record in found]
+
+    def answered(self, task: AnyTask, rows: np.ndarray) -> np.ndarray:
+        return rows[self.pack.answered(task, "train", "val")[rows]]
+
+
+def _check_classes(job: _Job, task: AnyTask) -> None:
+    if isinstance(task, Task):
+        labels = job.pack.labels(task.name)[job.answered(task, job.run.method.training_rows(job.pack))]
+        if len(seen := {task.classes[label] for label in labels}) < 2:
+            raise ValueError(
+                f"task {task.name!r} has labels of one class only in train ({', '.join(seen)}): nothing to learn"
+            )
+
+
+def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[Records, dict[str, Any]]:
+    """Choose settings, then train and score every seed. Returns records and the chosen settings of each kind."""
+    kinds = [f"fine-tuned, {job.asked.train}", *([SCRATCH] if job.asked.from_scratch else [])]
+    settings = {kind: _choose(job, percent, kind) for kind in kinds}
+    records = []
+    for seed in range(job.asked.seeds):
+        for kind in kinds:
+            path = job.folder(percent) / ("scratch" if kind == SCRATCH else "") / f"seed{seed}"
+            run = job.run_of(percent, seed, kind, settings[kind])
+            job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
+            train(run, path, resume=True, quiet=job.quiet, pack=job.pack, validate=False)  # all groups are learned from
+            own = own_heads(load(path), job.pack, job.tasks, [job.modality])
+            own = job.named(own, kind, percent, seed, read_sources(path, run, job.pack.digest, job.pack))
+            own = [{**record, "run": str(path)} for record in own]
+            write_json(path / "scores.json", {"data": job.pack.spec.name, "pack": job.pack.digest, "records": own})
+            records += own
+        frozen = [_frozen(job, percent, seed, task) for task in job.tasks]
+        records += job.named(frozen, FROZEN, percent, seed, sources)
+    return records, settings
+
+
+def _choose(job: _Job, percent: float, kind: str) -> dict[str, Any]:
+    """The settings with the best score on held-out groups of the first seed, tried one after the other."""
+    starts = ("random",) if kind == SCRATCH else ("probe", "random")
+    tried = {"lr": job.asked.lr, "steps": job.asked.steps, "heads_from": starts}
+    best: dict[str, Any] = {name: values[0] for name, values in tried.items()}
+    if why := job.too_few(percent):
+        job.say(f"{percent:g} %: {kind}: {why}: the first of --lr and --steps is used")
+        return best
+    for name, values in tried.items():
+        if len(values) > 1:
+            scores = [_held_out_score(job, percent, kind, {**best, name: value}) for value in values]
+            best[name] = values[int(np.argmax(scores))]  # the first of equals
+    return best
+
+
+def _held_out_score(job: _Job, percent: float, kind: str, settings: dict[str, Any]) -> float:
+    """Score on held-out groups, mean over tasks; from choice.json if it was tried before."""
+    file, work = job.folder(percent) / "choice.json", job.folder(percent) / "choice"
+    tried: dict[str, float] = read_json(file, "what was tried") if file.exists() else {}
+    run = job.run_of(percent, 0, kind, settings, hold_out=True)
+    name = f"{kind}: {', '.join(f'{key} {value}' for key, value in settings.items())} ({run.digest()[:8]})"
+    if name not in tried:
+        train(run, work / run.digest()[:8], resume=True, quiet=True, pack=job.pack, validate=False)
+        learned, model = run.method.training_rows(job.pack), load(work / run.digest()[:8])
+        held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
+        found = own_heads(model, job.pack, job.tasks, [job.modality], held)
+        tried[name] = float(np.mean([record["r2" if "r2" in record else "accuracy"] for record in found]))
+        write_json(file, tried)
+        job.say(f"{percent:g} %: {name}: {100 * tried[name]:.1f} on held-out {job.pack.spec.group_by}s")
+    shutil.rmtree(work, ignore_errors=True)
+    return tried[name]
+
+
+def _frozen(job: _Job, percent: float, seed: int, task: AnyTask) -> dict[str, Any]:
+    """Test scores of a linear probe on the frozen encoders, fitted on the rows that this seed is fine-tuned on."""
+    rows = job.answered(task, job.method(percent, seed).training_rows(job.pack))
+    fitted = held = rows  # with too few groups, C or alpha is chosen on the rows that the probe is fitted on
+    if not job.too_few(percent, seed):
+        fitted = np.intersect1d(rows, job.method(percent, seed, hold_out=True).training_rows(job.pack))
+        held = np.setdiff1d(rows, fitted)
+    parts = ProbeSplit(fitted, held if len(held) else fitted, job.test(task))
+    names = job.run.method.modalities  # type: ignore[attr-defined]
+    x = np.concatenate([features(job.model, job.pack, m, parts.all) for m in names], axis=1)
+    known = {"task": task.name, "modality": job.modality, "probe": "linear"}
+    return {**known, **probe_features(x, job.pack, task, parts, "linear", seed)}

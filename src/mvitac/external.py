@@ -1,0 +1,213 @@
+"""Encoders of other people as models: ``mvitac.load("external:...")`` and ``mvitac probe --encoder external:...``.
+
+    model = mvitac.load("external:timm/vit_tiny_patch16_224,weights=random")
+    model, pack = model.on(mvitac.Pack("packs/materials"))     # for the channels, frames and backgrounds of this data
+    records = probe_model(model, pack, pack.spec.all_tasks, ["touch"], ["linear"])
+
+``nn/external`` has the adapters. Two encoders, one for each sense, are joined by "+":
+"external:sparsh:FILE+external:timm/resnet18".
+"""
+
+from __future__ import annotations
+
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor, nn
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import MODALITIES, DataSpec, Window
+from mvitac.data.windows import windowed
+from mvitac.model import Model
+from mvitac.nn.external import Layout, open_encoder
+from mvitac.nn.external.base import START, UNKNOWN, OpenEncoder
+from mvitac.registry import to_json
+from mvitac.system.files import digest_file
+
+PICTURES = DataSpec(
+    name="images", vision_channels=3, touch_channels=3, tasks=(), group_by="image", licence=UNKNOWN, source=UNKNOWN
+)
+"""What an encoder is for until it is bound to data: single images."""
+
+
+class ExternalModel(Model):
+    """Frozen encoders by modality, with the interface of ``Model`` that probes, features and ``embed`` use.
+
+    There is no run, no shared space and no own head. Images of several sensors are encoded one by one and their features
+    joined. Where an encoder needs more frames than a row has, the oldest one is repeated.
+
+    Attributes:
+        text: What named the encoders.
+        name: Their names.
+        parts: modality -> opened encoder.
+        notes: What the data lacks that an encoder wants.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        parts: dict[str, OpenEncoder],
+        spec: DataSpec = PICTURES,
+        stored: int = 0,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        nn.Module.__init__(self)
+        self.text, self.parts, self.spec, self.notes = text, parts, spec, notes
+        self.name = " + ".join(dict.fromkeys(part.loaded.title for part in parts.values()))
+        self.stored = stored or self.sides[0]
+        gains = {"touch": 2.0 if spec.difference else 0.0, "vision": 0.0}
+        if spec.window.minus_first:
+            gains |= {m: 2.0 * max(1.0, gains[m]) for m in spec.window.of}
+        self.encoders = nn.ModuleDict()
+        for modality, part in parts.items():
+            sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
+            self.encoders[modality] = part.encoder.bound(Layout(sensors, spec.frames(modality), gains[modality]))
+        self.projectors, self.classifiers, self.tasks, self.readouts = nn.ModuleDict(), nn.ModuleList(), (), {}
+        self.eval()
+
+    def __repr__(self) -> str:
+        return f"ExternalModel({self.title}: {', '.join(f'{m} {e.num_features}' for m, e in self.encoders.items())})"
+
+    @property
+    def run(self) -> NoReturn:  # type: ignore[override]
+        """External encoders have none."""
+        raise ValueError(
+            f"{self.text} was not trained here and has no run: use it with `mvitac probe --encoder` or `embed`"
+        )
+
+    @property
+    def seed(self) -> int:
+        """Seed of the probes, and of random weights."""
+        return next(iter(self.parts.values())).adapter.seed
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """The largest side of its inputs."""
+        side = max(max(part.encoder.preprocessing.size) for part in self.parts.values())
+        return side, side
+
+    @property
+    def title(self) -> str:
+        """Its name in tables; (NC): the licence allows no commercial use."""
+        return self.name + " (NC)" * any(is_noncommercial(part.loaded.licence) for part in self.parts.values())
+
+    @property
+    def trained_on(self) -> tuple[str, ...]:
+        """What its encoders were trained on, as far as it is known; ("nothing",) for random weights."""
+        return tuple(dict.fromkeys(part.loaded.trained_on for part in self.parts.values()))
+
+    def on(self, pack: Pack) -> tuple[ExternalModel, Pack]:
+        """This model and ``pack``, for each other.
+
+        The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows yet.
+
+        Raises:
+            ValueError: If the data has no image that this model reads, or the windows that were asked for are impossible.
+        """
+        parts = {m: part for m, part in self.parts.items() if m in pack.spec.modalities}
+        if not parts:
+            raise ValueError(
+                f"{self.text} reads {' and '.join(self.parts)}, {pack.spec.name!r} has {', '.join(pack.spec.modalities)}:"
+                " give reads=touch, vision or both"
+            )
+        notes = []
+        moving = {m: part for m, part in parts.items() if (p := part.encoder.preprocessing).frames > 1 and not p.still}
+        if moving and not pack.spec.window.active:
+            asked = {(p.encoder.preprocessing.frames, p.encoder.preprocessing.stride) for p in moving.values()}
+            try:
+                if len(asked) > 1:
+                    raise ValueError(
+                        "frames: the two encoders want other windows: give both the same frames and stride"
+                    )
+                frames, stride = asked.pop()
+                pack = windowed(pack, Window(frames=frames, stride=stride, of=tuple(moving)))
+            except ValueError as error:
+                if any(part.adapter.stride is not None for part in moving.values()):
+                    raise
+                notes.append(f"the current frame is repeated ({error})")
+        for modality, part in parts.items():
+            difference = (pack.spec.difference and modality == "touch") or (
+                pack.spec.window.minus_first and modality in pack.spec.window.of
+            )
+            if part.encoder.preprocessing.offset is not None and not difference:
+                notes.append(f"{modality}: its owner subtracts a background, this data has none: images as they are")
+        return ExternalModel(self.text, parts, pack.spec, pack.size, tuple(notes)), pack
+
+    def untrained(self) -> ExternalModel | None:
+        """The same networks with random weights, as a control; None where that is not possible."""
+        parts = {m: random for m, part in self.parts.items() if (random := part.untrained())}
+        if not parts:
+            return None
+        made = ExternalModel(self.text, parts, self.spec, self.stored)
+        made.name = f"{self.name}, untrained"
+        return made
+
+    def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
+        found = self.encoders[modality](images).float()
+        if not torch.isfinite(found).all():
+            raise ValueError(
+                f"{self.text} gives NaN or infinite features of {modality}: check its weights, mean and std"
+            )
+        return found
+
+    @torch.no_grad()
+    def last_map(self, modality: str, images: Tensor) -> Tensor:
+        """Tokens or map [B, P, D] before pooling, of uint8 images [B, C, H, W]."""
+        return self.encoders[modality].last_map(images)  # type: ignore[operator]
+
+    def describe(self) -> dict[str, Any]:
+        """What is needed to repeat and to judge the scores, JSON-ready."""
+        return {
+            "encoder": self.text,
+            "title": self.title,
+            "seed": self.seed,
+            "weights": self.weights_digest(),
+            "notes": list(self.notes),
+            "encoders": {modality: self._described(modality, part) for modality, part in self.parts.items()},
+        }
+
+    def _described(self, modality: str, part: OpenEncoder) -> dict[str, Any]:
+        encoder = self.encoders[modality]
+        layout: Layout = encoder.layout  # type: ignore[assignment]
+        preprocessing = part.encoder.preprocessing
+        return {
+            "title": part.loaded.title,
+            "licence": part.loaded.licence,
+            "noncommercial": is_noncommercial(part.loaded.licence),
+            "source": part.loaded.source,
+            "trained_on": part.loaded.trained_on,
+            "files": {file.name: digest_file(file) for file in part.loaded.files},
+            "parameters": sum(p.numel() for p in part.loaded.network.parameters()),
+            "features": encoder.num_features,
+            "pool": part.adapter.pool or "owner's",
+            "preprocessing": to_json(preprocessing),
+            "sensors": layout.sensors,
+            "frames_given": layout.frames,
+            "background_subtracted": bool(layout.gain) and preprocessing.offset is not None,
+        }
+
+
+def is_noncommercial(licence: str) -> bool:
+    """Whether the weights' licence forbids commercial use."""
+    return "nc" in licence.lower().split(" (")[0].replace("_", "-").split("-")
+
+
+def load_external(text: str) -> ExternalModel:
+    """Open the encoders that ``text`` names: one, or one for each sense joined by "+".
+
+    Raises:
+        ValueError: If there is no such encoder, or two encoders read the same sense.
+    """
+    texts = [START + part for part in text.removeprefix(START).split(f"+{START}")]
+    opened = [open_encoder(each) for each in texts]
+    parts: dict[str, OpenEncoder] = {}
+    taken = {part.adapter.reads for part in opened}
+    for part in opened:
+        reads = part.adapter.reads
+        given = [m for m in MODALITIES if reads in (m, "both") and (reads == m or m not in taken)]
+        if not given or set(given) & parts.keys() or len(opened) > 2:
+            raise ValueError(
+                f"{text}: each sense can have one encoder: give reads=touch to one, reads=vision to the other"
+            )
+        parts.update(dict.fromkeys(given, part))
+    return ExternalModel(text, {m: parts[m] for m in MODALITIES if m in parts})

@@ -1,0 +1,220 @@
+"""I-JEPA (Assran et al., CVPR 2023, arXiv:2301.08243), for each modality, or with the other one in view.
+
+A ViT sees a context: one large block of patches minus some small target blocks. From its output tokens a narrow predictor
+predicts, block by block, the tokens that a momentum (teacher) copy has for the target blocks when it sees the whole image:
+
+    L = smooth_L1(predictor(context, positions of a target block), layer_norm(teacher(image) at that block))
+
+averaged over blocks, patches and features. The layer norm has no weights, and smooth L1 turns at 1. The teacher follows with
+a momentum that rises linearly from .996 to 1. With ``senses both`` the predictor of touch also gets vision's context tokens,
+and that of vision touch's; each encoder still sees its own modality only. Windows: as channels of one image, or
+(``--encoder.temporal mean``) frame by frame with one set of blocks.
+
+Block sizes are drawn once per batch (per chunk, with ``--chunk``), places once per image, as in the authors' code. Different
+here, because masks are made on the device without waiting for it:
+- Contexts have a fixed length, the (1 - .15)^4 of the image that 4 blocks leave if they do not overlap much: longer ones are
+  cut at random, missing patches of shorter ones are hidden from attention. Theirs are cut to the shortest of the batch.
+- Of 8 draws, the first with ``min_context`` patches of context, else that with the most. Theirs draw until it fits.
+- A block may touch the last row and column, and cover the whole image. Theirs are drawn one short of both.
+Sources: the paper (section 3, appendix A.1); facts of https://github.com/facebookresearch/ijepa (multiblock.py, train.py,
+in1k_vith14_ep300.yaml). Not implemented: the rising weight decay (here the recipe's, for all methods).
+
+Shapes: B images, N patches, K of them context, M target blocks of at most S patches, D features.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Int
+from timm.models.vision_transformer import VisionTransformer
+from torch import Tensor, nn
+
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.nn import vit
+from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.momentum import Momentum
+
+TRIES = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class IJEPAConfig(MethodConfig):
+    """Predict a momentum tower's tokens of hidden blocks from visible patches. Needs a ViT."""
+
+    name: ClassVar[str] = "ijepa"
+    needs_vit: ClassVar[bool] = True
+
+    num_targets: int = 4
+    """Number of target blocks M (I-JEPA: 4)."""
+    target_scale: tuple[float, float] = (0.15, 0.2)
+    """Area of a target block, as a range of shares of the image (I-JEPA: .15 to .2)."""
+    target_aspect: tuple[float, float] = (0.75, 1.5)
+    """Height over width of a target block (I-JEPA: .75 to 1.5)."""
+    context_scale: tuple[float, float] = (0.85, 1.0)
+    """Area of the context block, before the targets are taken out (I-JEPA: .85 to 1)."""
+    min_context: int = 10
+    """Patches of context that an image should keep (I-JEPA: 10)."""
+    ema: float = 0.996
+    """Momentum of the teacher at the start (I-JEPA: .996)."""
+    ema_end: float | None = 1.0
+    """Value to which it rises linearly (I-JEPA: 1)."""
+    senses: vit.Senses = "own"
+    """What a predictor sees. own: the context of its modality. both: also that of the other modality."""
+    predictor_width: int | None = None
+    """Width of the predictor, a multiple of 4. Default: half of the trunk's, at most 384, in whole heads of 32 features
+    (I-JEPA: 384)."""
+    predictor_depth: int | None = None
+    """Blocks of the predictor. Default: half of the trunk's, at most 12 (I-JEPA: 6 for ViT-B, 12 for ViT-H)."""
+
+    def __post_init__(self) -> None:
+        self.check_fields(share=("ema", "ema_end"))
+        for name, most in (("num_targets", 64), ("min_context", 65536)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} {getattr(self, name)}: give 1 to {most}")
+        for name, top in (("target_scale", 1.0), ("context_scale", 1.0), ("target_aspect", 100.0)):
+            low, high = getattr(self, name)
+            if not 0 < low <= high <= top:
+                raise ValueError(f"{name} {(low, high)}: give two rising numbers above 0, at most {top:g}")
+        vit.check_predictor("predictor", self.predictor_width, self.predictor_depth)
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> IJEPA:
+        return IJEPA(self, spec, encoder)
+
+    def ema_at(self, progress: float) -> float:
+        """Momentum of the teacher at ``progress`` (0 to 1) of the run."""
+        end = self.ema if self.ema_end is None else self.ema_end
+        return self.ema + (end - self.ema) * progress
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Context and targets of each image, as patch numbers; unused places are filled with any patch."""
+
+    context: Int[Tensor, "B K"]
+    in_context: Bool[Tensor, "B K"]
+    """Which places of ``context`` are used."""
+    targets: Int[Tensor, "B M S"]
+    in_target: Bool[Tensor, "B M S"]
+
+    def each(self, num: int) -> Blocks:
+        """Every image ``num`` times in a row."""
+        found = (self.context, self.in_context, self.targets, self.in_target)
+        return self if num == 1 else Blocks(*(tensor.repeat_interleave(num, 0) for tensor in found))
+
+
+def block_sides(area: Tensor, aspect: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Height and width [2] of a block with a share ``area`` of the grid; aspect is height over width."""
+    patches = (area * grid[0] * grid[1]).floor()
+    sides = torch.stack([(patches * aspect).sqrt(), (patches / aspect).sqrt()]).round()
+    return sides.clamp(min=1).minimum(torch.tensor(grid, dtype=sides.dtype).to(sides.device))
+
+
+def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, grid: tuple[int, int]) -> Blocks:
+    """Draw the blocks of images ``rows`` [B], as a function of (seed, stream) and, for their places, of each row."""
+    (height, width), num_targets = grid, config.num_targets
+    device, num = rows.device, height * width
+
+    # Sizes, the same for all images: [M + 1, 2], targets before context.
+    draws = vit.row_uniform(seed, torch.full_like(rows[:1], -1), 3, 2 * stream)[0]
+    ranges = (config.target_scale, config.target_aspect, config.context_scale)
+    scale, aspect, context_scale = (low + (high - low) * u for (low, high), u in zip(ranges, draws, strict=True))
+    side = block_sides(scale, aspect, grid)
+    sides = torch.stack([side] * num_targets + [block_sides(context_scale, torch.ones_like(aspect), grid)])
+
+    # Places: corners [B, TRIES, M + 1, 2], and which patches are inside [B, TRIES, M + 1, N].
+    u = vit.row_uniform(seed, rows, TRIES * (num_targets + 1) * 2, 2 * stream).view(-1, TRIES, num_targets + 1, 2)
+    last = torch.tensor(grid).to(device) - sides
+    corner = (u * (last + 1)).floor().minimum(last)
+    patch = torch.arange(num, device=device)
+    place = torch.stack([patch // width, patch % width], dim=1)
+    inside = ((place >= corner[..., None, :]) & (place < (corner + sides)[..., None, :])).all(-1)
+
+    # The first try with enough context, else that with the most.
+    contexts = inside[:, :, -1] & ~inside[:, :, :-1].any(2)
+    counts = contexts.sum(2)
+    rank = torch.where(counts >= config.min_context, num + TRIES - torch.arange(TRIES, device=device), counts)
+    best = rank.argmax(1, keepdim=True)[:, :, None, None]
+    context = contexts.take_along_dim(best[..., 0], 1)[:, 0]
+    corner = corner[:, :, :-1].take_along_dim(best, 1)[:, 0].long()
+
+    # Patch numbers, in arrays whose size depends on the config only.
+    room = max(1, round(num * (1 - config.target_scale[0]) ** num_targets))
+    order = (context + vit.row_uniform(seed, rows, num, 2 * stream + 1)).argsort(dim=1, descending=True)[:, :room]
+    in_context = torch.arange(room, device=device) < context.sum(1, keepdim=True).clamp(min=1)
+    area, (low, high) = math.floor(config.target_scale[1] * num), config.target_aspect
+    most_high, most_wide = (min(grid[i], max(1, round(math.sqrt(area * (high, 1 / low)[i])))) for i in (0, 1))
+    slot = torch.arange(most_high * most_wide, device=device)
+    offset = torch.stack([slot // most_wide, slot % most_wide], dim=1)
+    row, column = (corner[:, :, None] + offset).unbind(-1)
+    targets = row.clamp(max=height - 1) * width + column.clamp(max=width - 1)
+    return Blocks(order, in_context, targets, (offset < side).all(1).expand_as(targets))
+
+
+class IJEPA(Contrastive):
+    """A ViT, its momentum copy (the teacher) and a predictor per modality."""
+
+    def __init__(self, config: IJEPAConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
+        self.teachers = nn.ModuleDict({m: Momentum(vit.vit_of(trunk)) for m, trunk in self.trunks.items()})
+        shape = (config.predictor_width, config.predictor_depth)
+        self.predictors = nn.ModuleDict()
+        for modality, trunk in self.trunks.items():
+            width = vit.vit_of(trunk).embed_dim
+            self.predictors[modality] = vit.Predictor(trunk, width, config.senses, shape, 1 / 2, (384, 12))
+
+    def blocks(self, batch: Views, modality: str) -> tuple[Blocks, tuple[int, int]]:
+        """The blocks of each image that the ViT of ``modality`` sees, and the grid of its patches."""
+        trunk, stream = self.trunks[modality], list(self.trunks).index(modality)
+        grid = vit.grid_of(trunk, batch.images[modality][0])
+        return multi_block(self.config, batch.seed, batch.rows, stream, grid).each(vit.frames_of(trunk)), grid
+
+    def queries(self, batch: Views) -> Embeddings:
+        """("predicted", modality) -> [B, M S, D], with the frames of a window one after another."""
+        found = {m: self.blocks(batch, m) for m in self.trunks}
+        seen = {
+            m: vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
+            for m, (blocks, _) in found.items()
+        }
+        result: Embeddings = {}
+        for modality, (blocks, grid) in found.items():
+            other = next((seen[m] for m in seen if m != modality), None)
+            predicted = self.predictors[modality](seen[modality], blocks.targets, grid, blocks.in_target, other)
+            result["predicted", modality] = predicted.reshape(len(batch.rows), -1, predicted.shape[-1])
+        return result
+
+    @torch.no_grad()
+    def keys(self, batch: Views) -> Embeddings:
+        """("target", modality) -> [B, M S, D], and ("weight", modality) -> [B, M S], which sums to 1 for each row."""
+        result: Embeddings = {}
+        for modality, trunk in self.trunks.items():
+            blocks, _ = self.blocks(batch, modality)
+            teacher: VisionTransformer = self.teachers[modality].module  # type: ignore[assignment]
+            tokens = teacher.forward_features(vit.each_frame(trunk, batch.images[modality][0]))
+            tokens = tokens[:, teacher.num_prefix_tokens :]
+            target = vit.take(F.layer_norm(tokens.float(), tokens.shape[-1:]), blocks.targets.flatten(1))
+            used = blocks.in_target.reshape(len(batch.rows), -1).float()
+            result["target", modality] = target.reshape(len(batch.rows), -1, target.shape[-1])
+            result["weight", modality] = used / used.sum(1, keepdim=True)
+        return result
+
+    def contrast(self, z: Embeddings) -> dict[str, Tensor]:
+        losses = {}
+        for m in self.trunks:
+            error = F.smooth_l1_loss(z["predicted", m].float(), z["target", m], reduction="none").mean(2)
+            losses[m] = (error * z["weight", m]).sum(1).mean()
+        return with_sum(losses)
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return dict(self.trunks)
+
+    def after_step(self, progress: float) -> None:
+        for modality, trunk in self.trunks.items():
+            self.teachers[modality].follow(vit.vit_of(trunk), self.config.ema_at(progress))  # type: ignore[operator]

@@ -1,0 +1,125 @@
+"""Masked autoencoder (He et al., CVPR 2022, arXiv:2111.06377), for each modality, or with the other one in view.
+
+A ViT sees a random quarter of the patches. A narrow decoder gets its output tokens, and a mask token with its position for
+each hidden patch, and predicts the hidden pixels:
+
+    L = mean over hidden patches i and their P pixels of (d_i - x_i)^2,    x_i <- (x_i - mean(x_i)) / sqrt(var(x_i) + 1e-6)
+
+The variance is the unbiased one (P - 1), as in the authors' code; Sparsh predicts plain pixels (``pixel_norm`` off). With
+``senses both`` the decoder of touch also gets the tokens of vision's visible patches, and that of vision those of touch, as
+in MultiMAE (Bachmann et al., arXiv:2204.01678). Each encoder still sees its own modality only.
+Windows: with frames as channels a patch spans all F frames, so that masks are tubes (VideoMAE, Tong et al.,
+arXiv:2203.12602, with one tubelet). With ``--encoder.temporal mean`` each frame is an image of its own, and the frames of a
+window share one mask.
+Sources: the paper (section 3, appendix A); facts of https://github.com/facebookresearch/mae (models_mae.py).
+Not implemented: the authors' optimiser (the recipe's, for all methods), and fixed positions in the encoder (here the
+trunk's own).
+
+Shapes: B images, N patches of P values (pixels x channels), K of them visible, D features.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from mvitac.data.spec import DataSpec
+from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
+from mvitac.nn import vit
+from mvitac.nn.encoders import EncoderConfig
+
+EPS = 1e-6
+"""Added to the variance of a patch, as in the authors' code."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MAEConfig(MethodConfig):
+    """Predict the pixels of hidden patches from visible ones. Needs a ViT."""
+
+    name: ClassVar[str] = "mae"
+    needs_vit: ClassVar[bool] = True
+
+    mask_ratio: float = 0.75
+    """Share of the patches that is hidden (MAE, Sparsh: .75; T3: .4)."""
+    pixel_norm: bool = True
+    """Predict each patch minus its mean and over its standard deviation (MAE, T3). Sparsh and AnyTouch: off."""
+    senses: vit.Senses = "own"
+    """What a decoder sees. own: the visible patches of its modality. both: also those of the other modality."""
+    decoder_width: int | None = None
+    """Width of the decoder, a multiple of 4. Default: two thirds of the trunk's, at most 512, in whole heads of 32
+    features (MAE: 512 for the 768 of ViT-B)."""
+    decoder_depth: int | None = None
+    """Blocks of the decoder. Default: two thirds of the trunk's, at most 8 (MAE: 8 for the 12 of ViT-B)."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.mask_ratio < 1:
+            raise ValueError(f"mask_ratio {self.mask_ratio}: give a share between 0 and 1")
+        vit.check_predictor("decoder", self.decoder_width, self.decoder_depth)
+
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MAE:
+        return MAE(self, spec, encoder)
+
+
+def split_patches(noise: Float[Tensor, "B N"], mask_ratio: float) -> tuple[Int[Tensor, "B K"], Int[Tensor, "B N-K"]]:
+    """The patches with the least noise, K = int(N (1 - mask_ratio)) of them, and the others; one at least of each."""
+    num = noise.shape[1]
+    visible = min(max(1, int(num * (1 - mask_ratio))), num - 1)
+    order = noise.argsort(dim=1)
+    return order[:, :visible], order[:, visible:]
+
+
+def pixel_targets(values: Float[Tensor, "B N P"], pixel_norm: bool) -> Float[Tensor, "B N P"]:
+    """What the decoder must predict of each patch."""
+    if not pixel_norm:
+        return values
+    variance, mean = torch.var_mean(values, dim=2, keepdim=True, correction=1)
+    return (values - mean) / (variance + EPS).sqrt()
+
+
+class MAE(Contrastive):
+    """A ViT and a decoder per modality."""
+
+    def __init__(self, config: MAEConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
+        shape = (config.decoder_width, config.decoder_depth)
+        self.decoders = nn.ModuleDict()
+        for modality, trunk in self.trunks.items():
+            pixels = vit.patches(trunk, torch.zeros(1, spec.channels(modality), 1, 1)).shape[2]
+            self.decoders[modality] = vit.Predictor(trunk, pixels, config.senses, shape, 2 / 3, (512, 8))
+
+    def queries(self, batch: Views) -> Embeddings:
+        """("loss", modality) -> [B], the loss of each row."""
+        seen, hidden = {}, {}
+        for stream, (modality, trunk) in enumerate(self.trunks.items()):
+            images = batch.images[modality][0]
+            noise = vit.row_uniform(batch.seed, batch.rows, math.prod(vit.grid_of(trunk, images)), stream)
+            visible, hidden[modality] = (
+                at.repeat_interleave(vit.frames_of(trunk), 0) for at in split_patches(noise, self.config.mask_ratio)
+            )
+            seen[modality] = vit.encode_visible(trunk, images, visible)
+        result: Embeddings = {}
+        for modality, trunk in self.trunks.items():
+            images = batch.images[modality][0]
+            other = next((seen[m] for m in seen if m != modality), None)
+            decoder = self.decoders[modality]
+            predicted = decoder(seen[modality], hidden[modality][:, None], vit.grid_of(trunk, images), other=other)[
+                :, 0
+            ]
+            with torch.autocast(images.device.type, enabled=False):
+                values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
+                error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2
+                result["loss", modality] = error.view(len(batch.rows), -1).mean(1)
+        return result
+
+    def contrast(self, z: Embeddings) -> dict[str, Tensor]:
+        return with_sum({m: z["loss", m].mean() for m in self.trunks})
+
+    def encoders(self) -> dict[str, nn.Module]:
+        return dict(self.trunks)

@@ -1,0 +1,66 @@
+"""Any model of timm: DINOv2, CLIP, ImageNet trunks, or random weights. Licences are those that timm states.
+
+Preprocessing is that of the model's ``pretrained_cfg`` (huggingface/pytorch-image-models @aa4b585).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from timm.data.config import resolve_data_config
+from torch import nn
+
+from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
+from mvitac.nn.external.preprocessing import Preprocessing
+from mvitac.system.files import brief
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timm(Adapter):
+    """A model of timm."""
+
+    name: ClassVar[str] = "timm"
+    expects: ClassVar[str] = "the name of a timm model"
+    reads: Literal["touch", "vision", "both"] = "both"
+    weights: str = "pretrained"
+    """pretrained (timm downloads them), random, or a file."""
+
+    def load(self) -> Loaded:
+        if self.place.endswith(".openai") and "quickgelu" not in self.place:
+            raise ValueError(
+                f"{self.place}: OpenAI's weights need QuickGELU: {self.place.replace('_clip_', '_clip_quickgelu_')}"
+            )
+        known = {"pretrained": IMAGENET, "random": SCRATCH}
+        try:
+            network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)
+        except ValueError as error:  # in the words of this option
+            text = str(error).replace("--encoder.weights ", "weights=").replace("weights=scratch", "weights=random")
+            raise ValueError(text.replace("another --encoder.trunk", "the name of another")) from None
+        cfg: dict[str, Any] = getattr(network, "pretrained_cfg", None) or {}
+        usual = resolve_data_config(pretrained_cfg={"name": self.place, **cfg})
+        random, file = self.weights == "random", Path(self.weights)
+        named = self.weights in known
+        return Loaded(
+            network=network,
+            preprocessing=Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
+            title=f"{self.place}, {self.weights if named else file.name}",
+            files=() if named else (file,),
+            licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
+            source=f"https://huggingface.co/{cfg.get('hf_hub_id')}" if named and not random else self.weights,
+            trained_on=NOTHING if random else UNKNOWN,
+        )
+
+    def _built(self, weights: str) -> nn.Module:
+        trunk = build_trunk(EncoderConfig(trunk=self.place, weights=weights), 3 * (self.frames or 1))
+        if self.size and hasattr(trunk, "set_input_size"):
+            try:
+                trunk.set_input_size(img_size=self.sides((224, 224)))  # type: ignore[operator]
+            except Exception as error:  # each model has its own rules
+                raise ValueError(f"{self.place} cannot take size {self.size} ({brief(error)})") from None
+        if grid := getattr(getattr(trunk, "patch_embed", None), "grid_size", None):
+            trunk.grid = (1, *grid)  # type: ignore[assignment]
+        return trunk

@@ -1,0 +1,214 @@
+"""A vision transformer and a ResNet as checkpoint files describe them, and the reading of such files.
+
+Widths and depths are taken from the file. A head has 64 channels in every transformer here, as in ViT-Ti, S, B and L.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from timm.models.resnet import BasicBlock, Bottleneck, ResNet
+from timm.models.vision_transformer import Block
+from torch import Tensor, nn
+
+from mvitac.nn.external.base import Adapter
+from mvitac.nn.weights import read_safetensors
+from mvitac.system.files import brief
+
+Tensors = dict[str, Tensor]
+HEAD = 64
+"""Channels of an attention head."""
+
+
+def read_tensors(file: Path) -> Tensors:
+    """The tensors of a checkpoint, those under "model" or "state_dict" if it has such an entry. Never unpickles objects."""
+    if file.suffix == ".safetensors":
+        return read_safetensors(file)[1]
+    try:
+        with torch.serialization.safe_globals([argparse.Namespace]):  # TVL and AnyTouch keep their options in the file
+            found: Any = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises several types
+        raise ValueError(f"{file} cannot be read as weights without running code from it ({brief(error)})") from None
+    for key in ("model", "state_dict"):
+        found = found[key] if isinstance(found, dict) and isinstance(found.get(key), dict) else found
+    if not isinstance(found, dict):
+        raise ValueError(f"{file} holds a {type(found).__name__}, not named weights")
+    return {str(name): value for name, value in found.items() if isinstance(value, Tensor)}
+
+
+def under(tensors: Tensors, start: str, names: Mapping[str, str] = {}) -> Tensors:
+    """Tensors whose name begins with ``start``, without it; leading parts of names are exchanged as in ``names``."""
+    found = {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
+    for old, new in names.items():
+        found = {re.sub(rf"^{re.escape(old)}(?=\.|$)", new, name): value for name, value in found.items()}
+    return found
+
+
+def depth(tensors: Tensors, start: str = "blocks.") -> int:
+    """Number of blocks: one more than the largest number after ``start``."""
+    return 1 + max(
+        (int(found[1]) for n in tensors if (found := re.match(rf"{re.escape(start)}(\d+)\.", n))), default=-1
+    )
+
+
+def shape(adapter: Adapter, tensors: Tensors, name: str, dims: int) -> tuple[int, ...]:
+    """Shape of a tensor of ``dims`` dimensions; refused if it is missing."""
+    if name not in tensors or tensors[name].ndim != dims:
+        raise adapter.refuse(f"it has no {name!r} of {dims} dimensions")
+    return tuple(tensors[name].shape)
+
+
+def fill(adapter: Adapter, network: nn.Module, tensors: Tensors) -> nn.Module:
+    """``network`` with exactly ``tensors`` as its weights; refused if names or shapes differ."""
+    expected = network.state_dict()
+    for name in sorted(expected.keys() ^ tensors.keys()):
+        raise adapter.refuse(f"tensor {name!r} {'is missing' if name in expected else 'does not belong'}")
+    for name, tensor in expected.items():
+        if tensor.shape != tensors[name].shape:
+            raise adapter.refuse(f"{name!r} is {list(tensors[name].shape)}, expected {list(tensor.shape)}")
+    network.load_state_dict(tensors)
+    return network
+
+
+def from_clip(tensors: Tensors) -> Tensors:
+    """Layers of Hugging Face's CLIP (``encoder.layers.N.self_attn.q_proj``) under the names of timm's blocks."""
+    found: Tensors = {}
+    for name, value in tensors.items():
+        name = re.sub(r"^encoder\.layers\.", "blocks.", name)
+        name = re.sub(r"\.layer_norm([12])\.", r".norm\1.", name).replace(".self_attn.out_proj.", ".attn.proj.")
+        found[name.replace(".self_attn.", ".attn.")] = value
+    for name in [name for name in found if ".attn.q_proj." in name]:
+        parts = [found.pop(name.replace("q_proj", f"{part}_proj"), None) for part in "qkv"]
+        if any(part is None for part in parts):
+            continue  # reported as missing
+        found[name.replace("q_proj", "qkv")] = torch.cat(parts)  # type: ignore[arg-type]
+    return found
+
+
+class Tower(nn.Module):
+    """A vision transformer with the interface of timm's: a patch embedding, tokens in front, blocks, a head.
+
+    Its tensors are ``embed``, ``front`` (class, registers, sensor), ``positions``, ``pre_norm``, ``blocks`` (timm's),
+    ``norm`` and ``head``. All sizes are those of given tensors.
+
+    Args:
+        tensors: Weights under these names.
+        grid: Steps of time, rows and columns of the patches.
+        placed: The first tokens in front that have a position.
+        fixed: Positions [1, places, D] that are computed. None: learned.
+        eps: Of every normalisation.
+        mean: Features are the mean of the places, not the first token.
+        head: Applied to the features.
+        scale: If given, features have this length.
+        block: Makes a block; default: timm's.
+    """
+
+    def __init__(
+        self,
+        tensors: Tensors,
+        grid: tuple[int, int, int],
+        *,
+        placed: int = 1,
+        fixed: Tensor | None = None,
+        eps: float = 1e-6,
+        mean: bool = False,
+        head: nn.Module | None = None,
+        scale: float | None = None,
+        block: Any = None,
+    ) -> None:
+        super().__init__()
+        width, channels, *kernel = tensors["embed.weight"].shape
+        conv = nn.Conv3d if len(kernel) == 3 else nn.Conv2d
+        self.embed = conv(channels, width, tuple(kernel), tuple(kernel), bias="embed.bias" in tensors)  # type: ignore[arg-type]
+        self.grid, self.patch, self.placed, self.mean, self.scale = grid, kernel[-1], placed, mean, scale
+        self.num_features = width
+        self.num_prefix_tokens = tensors["front"].shape[1] if "front" in tensors else 0
+        if self.num_prefix_tokens:
+            self.front = nn.Parameter(torch.zeros(1, self.num_prefix_tokens, width))
+        if fixed is None:
+            self.positions = nn.Parameter(torch.zeros(1, placed + math.prod(grid), width))
+        else:
+            self.register_buffer("positions", fixed, persistent=False)
+        norm: Any = partial(nn.LayerNorm, eps=eps)
+        start = 1.0 if "blocks.0.ls1.gamma" in tensors else None
+        usual = partial(Block, width, max(1, width // HEAD), qkv_bias=True, init_values=start, norm_layer=norm)
+        self.pre_norm = norm(width) if "pre_norm.weight" in tensors else nn.Identity()
+        self.blocks = nn.ModuleList((block or usual)() for _ in range(depth(tensors)))
+        self.norm = norm(width) if "norm.weight" in tensors else nn.Identity()
+        self.head = head or nn.Identity()
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of its images."""
+        return self.patch * self.grid[1], self.patch * self.grid[2]
+
+    def forward_features(self, images: Tensor) -> Tensor:
+        """Tokens [B, front + places, D]."""
+        x = self.embed(images).flatten(2).mT + self.positions[:, self.placed :]
+        if self.num_prefix_tokens:
+            placed = F.pad(self.positions[:, : self.placed], (0, 0, 0, self.num_prefix_tokens - self.placed))
+            x = torch.cat([(self.front + placed).expand(len(x), -1, -1), x], dim=1)
+        x = self.pre_norm(x)
+        for block in self.blocks:
+            x = block(x)
+        return self.norm(x)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Features [B, D]."""
+        tokens = self.forward_features(images)
+        z = self.head(tokens[:, self.num_prefix_tokens :].mean(1) if self.mean else tokens[:, 0])
+        return z if self.scale is None else self.scale * F.normalize(z, dim=1)
+
+    def resize(self, size: tuple[int, int]) -> Tower:
+        """This tower for images of another size: learned positions are interpolated."""
+        places = self.positions[0, self.placed :].unflatten(0, self.grid).permute(0, 3, 1, 2)
+        grid = patches(size, self.patch)
+        places = F.interpolate(places, grid, mode="bicubic", antialias=True).permute(0, 2, 3, 1).flatten(0, 2)
+        self.positions = nn.Parameter(torch.cat([self.positions[:, : self.placed], places[None]], dim=1).detach())
+        self.grid = (self.grid[0], *grid)
+        return self
+
+
+def patches(size: tuple[int, int], patch: int) -> tuple[int, int]:
+    """Rows and columns of patches in an image."""
+    if size[0] % patch or size[1] % patch:
+        raise ValueError(f"size {size[0]}x{size[1]}: give multiples of {patch}, the side of a patch")
+    return size[0] // patch, size[1] // patch
+
+
+def tower(adapter: Adapter, tensors: Tensors, *, time: int = 1, **options: Any) -> Tower:
+    """The ``Tower`` of ``tensors`` with learned positions over a square grid, at the size that ``adapter`` asks for."""
+    shape(adapter, tensors, "embed.weight", 5 if tensors.get("embed.weight", torch.zeros(0)).ndim == 5 else 4)
+    num = shape(adapter, tensors, "positions", 3)[1] - 1
+    side = math.isqrt(num // time)
+    if num < 1 or side * side * time != num:
+        raise adapter.refuse(f"it has positions for {num} places, which is no square grid at {time} steps of time")
+    made = Tower(tensors, (time, side, side), **options)
+    fill(adapter, made, tensors)
+    return made if (size := adapter.sides(made.size)) == made.size else made.resize(size)
+
+
+def projection(tensors: Tensors, eps: float) -> nn.Sequential:
+    """A normalisation and a linear layer, of the sizes of ``head.0`` and ``head.1``."""
+    out, width = tensors["head.1.weight"].shape if "head.1.weight" in tensors else (1, 1)
+    return nn.Sequential(nn.LayerNorm(width, eps=eps), nn.Linear(width, out, bias="head.1.bias" in tensors))
+
+
+def resnet(adapter: Adapter, tensors: Tensors) -> nn.Module:
+    """timm's ResNet that has ``tensors`` under its names, without a classifier."""
+    layers = tuple(depth(tensors, f"layer{i}.") for i in range(1, 5))
+    if 0 in layers:
+        raise adapter.refuse("it is no ResNet of four stages")
+    kind: Any = Bottleneck if "layer1.0.conv3.weight" in tensors else BasicBlock
+    channels = tuple(shape(adapter, tensors, f"layer{i}.0.conv1.weight", 4)[0] for i in range(1, 5))
+    stem = shape(adapter, tensors, "conv1.weight", 4)
+    network = ResNet(kind, layers, num_classes=0, in_chans=stem[1], channels=channels)
+    return fill(adapter, network, tensors)

@@ -1,0 +1,141 @@
+"""Start weights from another model: what to take (``Init``), and loading a trunk or a head from a state dict.
+
+Shapes: O filters, C channels, h x w pixels of a kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from jaxtyping import Float
+from timm.models import adapt_input_conv
+from torch import Tensor, nn
+
+from mvitac.nn.encoders import PerFrame, stem_names
+from mvitac.nn.finetuning import AttentivePool
+from mvitac.nn.weights import read_safetensors, safetensors_digest
+
+MODEL = "model.safetensors"
+"""The file with the weights in the folder of a run or an artifact."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Init:
+    """Start weights from another model. Heads and modalities that are not taken start as the other settings say."""
+
+    path: Path | None = None
+    """Folder of a finished run or of an artifact, or a .safetensors file with weights. `--init X` is short for
+    `--init.path X`. Adapted where the number of channels differs."""
+    modalities: tuple[Literal["vision", "touch"], ...] = ()
+    """Encoders to take. Default: all that fit, and at least one."""
+    heads: bool = True
+    """Also take the heads into the space shared by both modalities, where they fit."""
+    digest: tyro.conf.Suppress[str] = ""
+    """sha256 of the weights. Training records it."""
+
+    def __post_init__(self) -> None:
+        if not (self.path or self.digest) and (self.modalities or not self.heads):
+            raise ValueError("init modalities and heads say what to take of other weights: name them, --init RUN")
+
+    def __bool__(self) -> bool:
+        return self.path is not None
+
+    @property
+    def file(self) -> Path:
+        """The file with the weights.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        assert self.path is not None
+        if self.path.is_file():
+            return self.path
+        if not self.path.is_dir():
+            raise ValueError(
+                f"init {self.path} does not exist: give the folder of a run or artifact, or a .safetensors"
+            )
+        if not (self.path / MODEL).is_file():
+            unfinished = (self.path / "checkpoint.pt").exists()
+            why = "its run is not finished, continue it with --resume" if unfinished else "give that of a finished run"
+            raise ValueError(f"init {self.path} is a folder without {MODEL}: {why}")
+        return self.path / MODEL
+
+    def resolved(self) -> Init:
+        """The same with ``digest``.
+
+        Raises:
+            ValueError: If there are no such weights, or they are others than those of ``digest``.
+        """
+        if not self:
+            return self
+        found = _digest(self.file, self.file.stat().st_mtime_ns)
+        if self.digest not in ("", found):
+            raise ValueError(f"init {self.path} now holds other weights than this run was recorded with: restore them")
+        return replace(self, digest=found)
+
+
+@cache
+def _digest(file: Path, changed: int) -> str:
+    return safetensors_digest(read_safetensors(file)[1])
+
+
+def load_trunk(trunk: nn.Module, state: dict[str, Tensor]) -> None:
+    """Load the weights of a trunk from ``build_trunk`` or timm into another one.
+
+    The first convolution is adapted to the number of channels. A trunk that sees a window's frames one by one, and one that
+    sees a single image, take each other's weights.
+
+    Args:
+        trunk: The trunk, changed in place.
+        state: State dict of the other one.
+
+    Raises:
+        ValueError: If they are different networks; ``trunk`` is then unchanged.
+    """
+    inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
+    if isinstance(trunk, AttentivePool) or "query" in state:  # a learned pooling starts anew
+        single = trunk.trunk if isinstance(trunk, AttentivePool) else trunk
+        return load_trunk(single, inner if "query" in state else state)
+    single = trunk.trunk if isinstance(trunk, PerFrame) else trunk
+    _load_single(single, inner or state)
+    if isinstance(trunk, PerFrame) and inner and fits(trunk, state):
+        trunk.load_state_dict(state)  # the weights of the frames, too
+
+
+def _load_single(trunk: nn.Module, state: dict[str, Tensor]) -> None:
+    expected = trunk.state_dict()
+    classifier = (getattr(trunk, "pretrained_cfg", None) or {}).get("classifier") or ()
+    ends = tuple(f"{name}." for name in ([classifier] if isinstance(classifier, str) else classifier))
+    state = {name: value for name, value in state.items() if name in expected or not name.startswith(ends or "\0")}
+    state |= {n: v for n, v in expected.items() if n.endswith("num_batches_tracked") and n not in state}
+    for name in stem_names(trunk):
+        own, other = expected.get(f"{name}.weight"), state.get(f"{name}.weight")
+        if own is not None and other is not None and own.ndim == other.ndim == 4 and not other.shape[1] % 3:
+            state[f"{name}.weight"] = adapt_stem(other, own.shape[1])
+    for name in sorted(expected.keys() ^ state.keys()):
+        raise ValueError(f"tensor {name!r} {'is missing' if name in expected else 'has no place in this trunk'}")
+    for name, value in expected.items():
+        if value.shape != state[name].shape:
+            raise ValueError(f"{name!r} is {tuple(state[name].shape)}, this trunk needs {tuple(value.shape)}")
+    trunk.load_state_dict(state)
+
+
+def adapt_stem(weight: Float[Tensor, "O C h w"], channels: int) -> Float[Tensor, "O channels h w"]:
+    """Filters of a first convolution for another number of channels, both multiples of three.
+
+    Three to more: repeated and rescaled, as timm does. More to three: summed over the images on the channels. Either way the
+    response to the same picture in all places stays the same. An equal number is left as it is.
+    """
+    if weight.shape[1] == channels:
+        return weight
+    return adapt_input_conv(channels, weight.unflatten(1, (-1, 3)).sum(1))
+
+
+def fits(module: nn.Module, state: dict[str, Tensor]) -> bool:
+    """Whether ``state`` has the names and shapes of the module's state dict."""
+    shapes = {name: value.shape for name, value in module.state_dict().items()}
+    return shapes == {name: value.shape for name, value in state.items()}

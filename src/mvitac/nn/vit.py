@@ -1,0 +1,250 @@
+"""Masked Vision Transformers: random numbers of each row, encoding a part of the patches, predicting the others.
+
+Shapes: B images, F prefix tokens (class, registers), N patches of a grid [rows, columns], K of them visible, T predicted,
+D features.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from timm.layers import PatchEmbed  # pyright: ignore[reportPrivateImportUsage]
+from timm.models.vision_transformer import Block, VisionTransformer
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from mvitac.data.spec import DataSpec
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, PerFrame, build_trunk
+from mvitac.nn.positions import sin_cos_positions
+
+Senses = Literal["own", "both"]
+"""Whether a predictor sees tokens of its own modality, or of both."""
+Shape = tuple[int | None, int | None]
+_GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
+"""The constants of SplitMix64 (Steele et al., OOPSLA 2014) as signed numbers."""
+
+
+def row_uniform(seed: Tensor, rows: Int[Tensor, " B"], num: int, stream: int) -> Float[Tensor, "B {num}"]:
+    """Uniform numbers in [0, 1) that are a function of (seed, row, stream), on the device of ``rows``.
+
+    They are the same in whatever chunk, process or order a row is read. SplitMix64 hashes the numbers.
+
+    Args:
+        seed: Integer of the step, ``Views.seed``.
+        rows: Number of each row.
+        num: How many to draw for each row.
+        stream: Number of this use. Different uses draw different numbers.
+    """
+    row_key = _hash(_hash(_hash(seed) + stream) + rows)
+    key = _hash(row_key[:, None] + torch.arange(num, device=rows.device) * _GOLDEN)
+    return ((key >> 40) & 0xFFFFFF).float() / (1 << 24)
+
+
+def _hash(x: Tensor) -> Tensor:
+    """SplitMix64's finaliser; products wrap around, and shifts bring in zeros."""
+    x = x + _GOLDEN
+    for shift, multiplier in zip((30, 27), _MULTIPLIERS, strict=True):
+        x = (x ^ ((x >> shift) & ((1 << (64 - shift)) - 1))) * multiplier
+    return x ^ ((x >> 31) & ((1 << 33) - 1))
+
+
+def check_vit(config: EncoderConfig, method: str, size: int) -> None:
+    """Raise ValueError unless ``config`` names a plain ViT that cuts views of ``size`` px into 2 x 2 patches or more."""
+    with torch.device("meta"):
+        vit = _plain(build_trunk(EncoderConfig(trunk=config.trunk, weights=SCRATCH), 3), config.trunk, method)
+    if size <= vit.patch_embed.patch_size[0]:
+        raise ValueError(
+            f"views of {size} px are a single patch of trunk {config.trunk}, and method {method!r} hides patches from"
+            f" others: give --augment.size {size * 2} or more"
+        )
+
+
+def _plain(trunk: nn.Module, name: str, method: str) -> VisionTransformer:
+    if not (isinstance(trunk, VisionTransformer) and isinstance(trunk.patch_embed, PatchEmbed)):
+        raise ValueError(
+            f"method {method!r} needs a plain ViT, and trunk {name} is a {type(trunk).__name__}: give e.g."
+            " --encoder.trunk mvitac_vit --encoder.weights scratch"
+        )
+    return trunk
+
+
+def build_vits(config: EncoderConfig, spec: DataSpec, method: str, senses: Senses) -> nn.ModuleDict:
+    """A ViT per modality of ``spec``, or ``PerFrame`` of one, whose features are the mean over its patches.
+
+    The mean because no class token is trained here.
+
+    Raises:
+        ValueError: If the trunk is no plain ViT, or ``senses`` or ``config.temporal`` do not fit the data.
+    """
+    if senses == "both" and len(spec.modalities) < 2:
+        raise ValueError(
+            f"senses both: dataset {spec.name!r} has {', '.join(spec.modalities)} only, give --method.senses own"
+        )
+    trunks = nn.ModuleDict()
+    for modality in spec.modalities:
+        windows = spec.frames(modality) > 1
+        if windows and config.temporal == "attention":
+            raise ValueError(
+                f"method {method!r} does not train temporal attention: give --encoder.temporal mean or stack"
+            )
+        if windows and config.temporal == "mean" and senses == "both":
+            raise ValueError("senses both reads the frames of a window together: give --encoder.temporal stack")
+        trunks[modality] = build_trunk(config, spec.channels(modality), spec.frames(modality))
+        _plain(vit_of(trunks[modality]), config.trunk, method).reset_classifier(0, "avg")
+    return trunks
+
+
+def vit_of(trunk: nn.Module) -> VisionTransformer:
+    """The ViT of a trunk from ``build_vits``."""
+    return trunk.trunk if isinstance(trunk, PerFrame) else trunk  # type: ignore[return-value]
+
+
+def frames_of(trunk: nn.Module) -> int:
+    """Number of frames that a trunk from ``build_vits`` reads one by one. B images are then rows x frames."""
+    return trunk.frames if isinstance(trunk, PerFrame) else 1
+
+
+def each_frame(trunk: nn.Module, images: Tensor) -> Tensor:
+    """The images that the ViT of a trunk sees: [R, F C, H, W] to [R F, C, H, W]."""
+    return images.unflatten(1, (frames_of(trunk), -1)).flatten(0, 1)
+
+
+def grid_of(trunk: nn.Module, images: Tensor) -> tuple[int, int]:
+    """Rows and columns of the patches of ``images``."""
+    side = vit_of(trunk).patch_embed.patch_size[0]
+    return -(-images.shape[2] // side), -(-images.shape[3] // side)
+
+
+def patches(trunk: nn.Module, images: Tensor) -> Float[Tensor, "B N P"]:
+    """The pixels of each patch, P = C x side x side. Like timm's ViT, images are padded at the bottom and the right."""
+    side = vit_of(trunk).patch_embed.patch_size[0]
+    padding = (0, -images.shape[3] % side, 0, -images.shape[2] % side)
+    return F.unfold(F.pad(each_frame(trunk, images), padding), side, stride=side).mT
+
+
+def take(tokens: Float[Tensor, "B N D"], at: Int[Tensor, "B K"]) -> Float[Tensor, "B K D"]:
+    """The tokens at the places ``at`` of each row."""
+    return tokens.gather(1, at[:, :, None].expand(-1, -1, tokens.shape[2]))
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """Output tokens of a ViT that saw a part of the patches: its prefix tokens, then those patches."""
+
+    values: Float[Tensor, "B F+K D"]
+    at: Int[Tensor, "B K"]
+    """The patch of each token after the prefix."""
+    live: Bool[Tensor, "B F+K"] | None = None
+    """Which of them count. None = all."""
+
+
+def encode_visible(
+    trunk: nn.Module, images: Tensor, at: Int[Tensor, "B K"], live: Bool[Tensor, "B K"] | None = None
+) -> Tokens:
+    """The normalised output tokens of a ViT that sees only the patches ``at``, each with its own position.
+
+    ``live`` says which of ``at`` count; no token attends to the others.
+    """
+    vit = vit_of(trunk)
+    tokens = vit.norm_pre(vit._pos_embed(vit.patch_embed(each_frame(trunk, images))))
+    front = vit.num_prefix_tokens
+    tokens = torch.cat([tokens[:, :front], take(tokens[:, front:], at)], dim=1)
+    live = None if live is None else F.pad(live, (front, 0), value=True)
+    return Tokens(vit.norm(_pass(vit.blocks, tokens, live, recompute=vit.grad_checkpointing)), at, live)
+
+
+def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None, *, recompute: bool = False) -> Tensor:
+    """``tokens`` [B, L, D] through transformer blocks, in which no token attends to one that is not ``live`` [B, L]."""
+    mask = None
+    if live is not None:
+        mask = torch.zeros(live.shape, device=live.device).masked_fill(~live, -torch.inf)[:, None, None]
+    for block in blocks:
+        if recompute and torch.is_grad_enabled():
+            tokens = checkpoint(block, tokens, mask, use_reentrant=False)  # type: ignore[assignment]
+        else:
+            tokens = block(tokens, attn_mask=mask)
+    return tokens
+
+
+def check_predictor(name: str, width: int | None, depth: int | None) -> None:
+    """Raise ValueError for an impossible width or depth of a ``Predictor`` that the config calls ``name``."""
+    if width is not None and not (4 <= width <= 4096 and width % 4 == 0):
+        raise ValueError(f"{name}_width {width}: give a multiple of 4, at most 4096")
+    if depth is not None and not 1 <= depth <= 64:
+        raise ValueError(f"{name}_depth {depth}: give 1 to 64")
+
+
+class Predictor(nn.Module):
+    """A narrow ViT that predicts something about hidden patches from visible ones (MAE's decoder, I-JEPA's predictor).
+
+    A hidden patch is a learned mask token plus the fixed sine-cosine embedding of its position.
+
+    Args:
+        trunk: The trunk whose tokens it reads.
+        out: Width of the predictions.
+        senses: Whether it also reads tokens of the other modality.
+        shape: Width and number of blocks. None = ``share`` of the trunk's, in whole heads of 32 features, up to ``most``.
+    """
+
+    def __init__(
+        self, trunk: nn.Module, out: int, senses: Senses, shape: Shape, share: float, most: tuple[int, int]
+    ) -> None:
+        super().__init__()
+        vit = vit_of(trunk)
+        width = shape[0] or min(most[0], 32 * max(1, round(vit.embed_dim * share / 32)))
+        depth = shape[1] or min(most[1], max(1, round(len(vit.blocks) * share)))
+        self.embed = nn.Linear(vit.embed_dim, width)
+        self.other = nn.Linear(vit.embed_dim, width) if senses == "both" else None
+        self.mask_token = nn.Parameter(torch.zeros(1, 1, 1, width))
+        norm: Any = partial(nn.LayerNorm, eps=1e-6)
+        heads = max(1, width // 32) if width % 32 == 0 else 1
+        self.blocks = nn.Sequential(*(Block(width, heads, qkv_bias=True, norm_layer=norm) for _ in range(depth)))
+        self.norm = norm(width)
+        self.out = nn.Linear(width, out)
+        nn.init.normal_(self.mask_token, std=0.02)
+        for layer in self.modules():
+            if isinstance(layer, nn.Linear):
+                nn.init.trunc_normal_(layer.weight, std=0.02)
+                nn.init.zeros_(layer.bias)
+
+    def forward(
+        self,
+        seen: Tokens,
+        hidden: Int[Tensor, "B M T"],
+        grid: tuple[int, int],
+        live: Bool[Tensor, "B M T"] | None = None,
+        other: Tokens | None = None,
+    ) -> Float[Tensor, "B M T O"]:
+        """Predict each of M sets of hidden patches on its own.
+
+        Args:
+            seen: The visible tokens, seen with every set.
+            hidden: The patches to predict.
+            grid: Rows and columns of the patches.
+            live: Which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the others.
+            other: Visible tokens of the other modality, if there is one.
+        """
+        positions = sin_cos_positions(*grid, self.mask_token.shape[3], hidden.device)
+        known, known_live = _placed(self.embed(seen.values), seen.at, positions), seen.live
+        if self.other is not None and other is not None:
+            known = torch.cat([known, _placed(self.other(other.values), other.at, positions)], dim=1)
+            known_live = None if seen.live is None or other.live is None else torch.cat([seen.live, other.live], dim=1)
+        num_sets, length = hidden.shape[1:]
+        masked = (self.mask_token + positions[hidden]).to(known.dtype)
+        tokens = torch.cat([known[:, None].expand(-1, num_sets, -1, -1), masked], dim=2).flatten(0, 1)
+        shown = None
+        if live is not None:
+            assert known_live is not None
+            shown = torch.cat([known_live[:, None].expand(-1, num_sets, -1), live], dim=2).flatten(0, 1)
+        predicted = _pass(self.blocks, tokens, shown)[:, -length:]
+        return self.out(self.norm(predicted)).unflatten(0, (-1, num_sets))
+
+
+def _placed(tokens: Float[Tensor, "B F+K D"], at: Int[Tensor, "B K"], positions: Float[Tensor, "N D"]) -> Tensor:
+    """``tokens`` plus the position of each that is a patch."""
+    return tokens + F.pad(positions[at], (0, 0, tokens.shape[1] - at.shape[1], 0))

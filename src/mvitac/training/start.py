@@ -1,0 +1,140 @@
+"""Start weights from another model (``Run.init``): read them, load what fits, and say what that model learned from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from mvitac.data.pack import Pack
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, read_sources, unknown_source
+from mvitac.methods.base import Method
+from mvitac.model import FORMAT, load
+from mvitac.nn.initial import MODEL, Init, fits, load_trunk
+from mvitac.nn.momentum import Momentum
+from mvitac.nn.weights import read_safetensors
+from mvitac.run import read_record
+
+State = dict[str, Tensor]
+ANY = "any"
+"""Key of a trunk's weights in a file that does not say which modality they are for."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a run starts from."""
+
+    init: Init
+    trunks: dict[str, State]
+    """Modality, or ``ANY``, -> state dict."""
+    heads: dict[str, State]
+    """Modality -> state dict of the head into the shared space."""
+    trunk: str
+    """timm name of the trunks; "" if it is not known."""
+    sources: list[Source]
+    """What its weights were trained on."""
+
+
+def read_start(init: Init, pack: Pack) -> Start | None:
+    """Read the weights of ``init``; None if it names none.
+
+    Args:
+        init: What to take.
+        pack: The data of the new run.
+
+    Raises:
+        ValueError: If there are no such weights, or they are damaged.
+    """
+    if not init:
+        return None
+    header, tensors = read_safetensors(init.file)
+    if header.get("format") == FORMAT:
+        model = load(init.file)
+        trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
+        heads = {m: head.state_dict() for m, head in model.projectors.items()}
+        return Start(init, trunks, heads, model.run.encoder.trunk, _learned(init.file, pack))
+    trunks = {m: _below(f"encoders.{m}.", tensors) for m in ("vision", "touch")}
+    heads = {m: state for m in trunks if (state := _below(f"projectors.{m}.", tensors))}
+    trunks = {m: state for m, state in trunks.items() if state} or {ANY: tensors}
+    return Start(init, trunks, heads, "", [unknown_source(init.file.name)])
+
+
+def _below(prefix: str, tensors: State) -> State:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _learned(file: Path, pack: Pack) -> list[Source]:
+    """What the model in ``file`` learned from. Only its own folder knows: a copied file is unknown."""
+    folder = file.parent
+    if not file.name.startswith(MODEL.split(".")[0]) or not (folder / "run.json").exists():
+        return [unknown_source(file.name)]
+    run, record = read_record(folder / "run.json")
+    found = read_sources(folder, run, record.get("pack"), pack)
+    return [unknown_source(folder.name)] if found is None else found
+
+
+def load_start(start: Start, method: Method) -> dict[str, Any]:
+    """Load start weights into a new method, by modality, and into its momentum copies.
+
+    Returns:
+        What was taken, for the record: name, digest, modality -> parts, and names of what the weights were trained on.
+
+    Raises:
+        ValueError: If nothing fits, or a modality that was asked for does not.
+    """
+    init, taken, reasons = start.init, {}, {}
+    trunks, heads = method.encoders(), method.projectors()
+    for modality in init.modalities or trunks:
+        try:
+            _load_encoder(start, trunks, modality)
+        except ValueError as error:
+            reasons[modality] = str(error)
+            continue
+        taken[modality] = ["trunk"]
+        if init.heads and modality in heads and fits(heads[modality], start.heads.get(modality, {})):
+            heads[modality].load_state_dict(start.heads[modality])
+            taken[modality].append("head")
+    if reasons and (init.modalities or not taken):
+        why = "; ".join(f"{modality}: {reason}" for modality, reason in reasons.items())
+        hint = (
+            "give other --init.modalities, or another --init" if taken else "give weights of the same --encoder.trunk"
+        )
+        raise ValueError(f"init {init.path} does not fit this run ({why}): {hint}")
+    for module in method.modules():
+        if isinstance(module, Momentum):
+            module.restart()
+    names = list(dict.fromkeys(source.name for source in start.sources))
+    assert init.path
+    return {"name": init.path.name, "digest": init.digest, "taken": taken, "trained_on": names}
+
+
+def _load_encoder(start: Start, trunks: dict[str, Any], modality: str) -> None:
+    if modality not in trunks:
+        raise ValueError("this run has no such encoder")
+    state = start.trunks.get(modality, start.trunks.get(ANY))
+    if state is None:
+        raise ValueError(f"it has {' and '.join(start.trunks)} only")
+    try:
+        load_trunk(trunks[modality], state)
+    except ValueError as error:
+        raise ValueError(f"its trunk is {start.trunk}, {error}" if start.trunk else str(error)) from None
+
+
+def describe(record: dict[str, Any]) -> str:
+    """One line about the record of ``load_start``."""
+    parts = [f"{modality} {' and '.join(names)}" for modality, names in record["taken"].items()]
+    return f"starts from {record['name']} (sha256 {record['digest'][:12]}): {', '.join(parts)}"
+
+
+def warning(start: Start, pack: Pack) -> str:
+    """A line on rows of split test that the start weights were trained on, or may have been; "" if there are none."""
+    tasks = pack.spec.all_tasks
+    tested = [pack.rows("test", only=task.only, by=task.split) for task in tasks] or [pack.rows("test")]
+    rows = np.unique(np.concatenate(tested))
+    leak = Scored(pack).leak(start.sources, rows) if len(rows) else ""
+    if leak == UNKNOWN:
+        return f"nothing says what {start.init.path} was trained on: leaks of test rows cannot be excluded"
+    return leak and f"{start.init.path} has seen what this data tests: {leak}; `mvitac probe` will need --allow-leak"

@@ -1,0 +1,78 @@
+"""Touch images of one sensor in the colours of another, learned from unlabelled images of both.
+
+An optical gel shows slope as colour, I(x, y) = I0 + rx gx + ry gy, and ``gel_flip.slope_colours`` finds rx, ry without
+calibration. What it leaves open are a factor and the sign: (r, g) and (-r, -g) give the same images, so peaks may be
+taken for pits. The factor follows from the presses, whose slopes have the same spread on all sensors. The sign follows
+from the gel: it is a membrane that bridges gaps, so an imprint has sharp ridges and smooth valleys, and the curvature of
+its height is skewed, with the same sign on all gels that press the same kind of things (docs/results/sensors.md).
+
+Shapes: N images of H x W pixels, levels 0 to 255.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.stats import skew
+
+from mvitac.transforms.gel_flip import slope_colours
+
+MIN_IMAGES, NUM_IMAGES = 32, 400
+"""Least number of images of a sensor, and the number that is used."""
+SMOOTH, SURE = 36, 3.0
+"""Curvature is that of slopes blurred by this fraction of the side: of 0, 1, 2 and 3 pixels of 72, 2 told the sign of the
+four known simulated sensors best (t 5.1 to 5.9 with 100 images, 2.1 to 2.9 without blur). Below ``SURE`` it is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class GelColours:
+    """How one sensor shows slopes."""
+
+    level: np.ndarray
+    """[3], mean colour."""
+    rest: np.ndarray
+    """[H, W, 3], mean image minus ``level``."""
+    colours: np.ndarray
+    """[3, 2], change of level per slope along x and y, in units of the root mean square of the slopes."""
+    mixtures: np.ndarray
+    """[3, 2], where ``d @ mixtures`` are the slopes of a change of level ``d``."""
+
+
+def learn_colours(images: np.ndarray) -> GelColours:
+    """Learn the colours of slope of one sensor from images [N, H, W, 3] of different presses.
+
+    Raises:
+        ValueError: If there are too few images, their colours do not follow slopes, or the sign remains unclear.
+    """
+    if len(images) < MIN_IMAGES:
+        raise ValueError(f"{len(images)} images: learning the colours of a gel needs {MIN_IMAGES} of different presses")
+    mean = images.mean(0, dtype=np.float64)
+    level = mean.mean((0, 1))
+    colours, mixtures, _ = slope_colours(images - mean)
+    slopes = _without_light(images, mean - level) @ mixtures
+    factor = np.sqrt((slopes**2).mean())
+    height, width = images.shape[1:3]
+    smooth = gaussian_filter(slopes, (0, height / SMOOTH, width / SMOOTH, 0))
+    curvature = np.gradient(smooth[..., 0], axis=2) + np.gradient(smooth[..., 1], axis=1)
+    inner = curvature[:, height // 8 : -(height // 8), width // 8 : -(width // 8)]
+    bend = np.tanh(skew(inner.reshape(len(images), -1), axis=1))
+    if abs(t := bend.mean() / bend.std() * len(images) ** 0.5) < SURE:
+        raise ValueError(
+            f"{len(images)} images do not tell peaks from pits (t {t:.1f}): give more, of different presses"
+        )
+    factor = -factor if t > 0 else factor
+    return GelColours(level=level, rest=mean - level, colours=colours * factor, mixtures=mixtures / factor)
+
+
+def recolour(images: np.ndarray, source: GelColours, target: GelColours) -> np.ndarray:
+    """Show images uint8 [N, H, W, 3] of the sensor ``source`` as the sensor ``target`` would show the same slopes."""
+    slopes = _without_light(images, source.rest) @ (source.mixtures @ target.colours.T)
+    return np.clip(np.rint(target.level + target.rest + slopes), 0, 255).astype(np.uint8)
+
+
+def _without_light(images: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """``images`` minus the sensor's lamps ``rest`` and minus their own mean colour: LEDs and tint drift."""
+    levels = images.astype(np.float64)
+    return levels - levels.mean((1, 2), keepdims=True) - rest

@@ -1,0 +1,418 @@
+"""The bench: one protocol for any encoder, results that cannot be changed unseen, and a page that compares them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvitac.bench import score, suite
+from mvitac.bench.board import gather, order_of, write_board
+from mvitac.bench.encoder import About, describe, run_bench
+from mvitac.bench.result import FORMAT, VOLATILE, problems, read_result, records_of, write_result
+from mvitac.bench.score import Reader, misfit
+from mvitac.bench.suite import find_suite, open_set, shipped
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.deploy.artifact import load
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.features import features
+from mvitac.evaluation.value_scores import r_squared
+from mvitac.model import fresh
+from mvitac.system.files import digest
+from support.toy import toy_pack
+
+RANDOM = "external:timm/test_resnet,weights=random,size=32,seed={}"
+SUITE = f"""
+name = "toys"
+title = "Striped pairs"
+probes = ["linear"]
+seed = 0
+untrained = ["{RANDOM.format(0)}", "{RANDOM.format(1)}"]
+[[sets]]
+name = "stripes"
+names = ["Toy Stripes"]
+tasks = [
+    {{ name = "pattern", modalities = ["touch", "both"], labels = [0.3] }},
+    {{ name = "light", modalities = ["touch"] }},
+]
+[[sets.forms]]
+name = "pack"
+at = {{ path = "stripes" }}
+data = {{ name = "pack" }}
+[[sets]]
+name = "folded"
+folds = 3
+tasks = [{{ name = "pattern", modalities = ["touch"] }}]
+[[sets.forms]]
+name = "clone"
+at = {{ path = "clone" }}
+data = {{ name = "pack" }}
+[[sets.forms]]
+name = "copy"
+at = {{ path = "stripes" }}
+data = {{ name = "pack" }}
+[[sets]]
+name = "elsewhere"
+tasks = [{{ name = "pattern", modalities = ["vision"] }}]
+[[sets.forms]]
+name = "pack"
+at = {{ path = "elsewhere" }}
+data = {{ name = "pack" }}
+"""
+BOARD = Path(__file__).parents[2] / "benchmarks" / "board"
+GOLDEN = {
+    "calandra-v1": "b9de4eee4353",
+    "real-small-v1": "2f37d58dc5b5",
+    "sim-v1": "12dcfc5478c1",
+    "tag-v1": "9d8e494c2c50",
+}
+"""First digits of the digests. A definition that changes needs another name, or old results would be compared with new."""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A --data-root with the striped pairs, with values, and the suite's file."""
+    root = tmp_path_factory.mktemp("bench")
+    toy_pack(root / "stripes", values=True)
+    (root / "toys.toml").write_text(SUITE)
+    return root
+
+
+@pytest.fixture(scope="module")
+def results(root: Path, smoke_run: Path) -> list[Path]:
+    """Results of a trained run and of a random trunk."""
+    toys, out = find_suite(str(root / "toys.toml")), root / "results"
+    places = [str(smoke_run)], [RANDOM.format(5)]
+    return [run_bench(place, toys, out, root, About()) for place in places]
+
+
+def changed(file: Path, out: Path, change: Any, *, signed: bool) -> Path:
+    """A copy of a result after ``change``; ``signed`` again, as someone would who wants to hide it."""
+    value = json.loads(file.read_text())
+    change(value)
+    if signed:
+        value["digest"] = digest({key: part for key, part in value.items() if key not in VOLATILE})
+    write_result(out, value)
+    return out
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The one line of an error of the command line, after progress."""
+    assert main([str(word) for word in words]) == 2
+    *progress, error = capsys.readouterr().err.splitlines()
+    assert error.startswith("mvitac: error: ") and not any("rror" in line for line in progress)
+    return error
+
+
+def test_scores_are_those_of_probe(results: list[Path], smoke_run: Path, root: Path) -> None:
+    value = read_result(results[0])
+    block = value["blocks"][0]
+    found = {(r["source"], r["modality"], r["probe"]): r for r in records_of(block, value["encoder"])}
+    asked = ProbeConfig(tasks=("pattern", "light"), modalities=("touch", "both"))
+    expected = probe_runs([smoke_run], asked, Pack(root / "stripes"), allow_leak=True)["records"]
+    name = value["encoder"]["name"]
+    assert name == "mvitac (smoke, mvitac_tiny)"
+    for record in expected:
+        mine = {"mvitac": name, "noise only": "noise only"}.get(record["source"], record["source"])
+        if record["task"] == "pattern" and record["source"] != "untrained":
+            given = found[mine, record["modality"], "linear"]
+            assert given["group_correct"] == record["group_correct"] and given["accuracy"] == record["accuracy"]
+    (force,) = (r for r in expected if r["task"] == "light" and r["source"] == "mvitac" and r["modality"] == "touch")
+    (given,) = (r for r in records_of(value["blocks"][1], value["encoder"]) if r["source"] == name)
+    assert given["r2"] == force["r2"] and np.allclose(given["group_sums"]["error"], force["group_sums"]["error"])
+    assert {r["seed"] for r in block["records"] if r["source"] == "untrained"} == {0, 1}
+    few = found[name, "touch", "30 % of labels"]
+    assert few["num_test"] == found[name, "touch", "linear"]["num_test"] and few["group_correct"]
+
+
+def test_the_result_says_what_it_is_of(results: list[Path], smoke_run: Path, root: Path) -> None:
+    value = read_result(results[0])
+    encoder, model = value["encoder"], load(smoke_run)
+    assert encoder["images_seen"] == 8 * 16 and encoder["trained_on"] == "toy" and encoder["licence"] is None
+    assert encoder["weights"] == [model.weights_digest()]
+    assert encoder["parameters"]["touch"] == sum(p.numel() for p in model.encoders["touch"].parameters())
+    assert "torch" in value["versions"] and "machine" in value["about"] and "time" in value["about"]
+    assert not problems(value)
+    by_hand = {key: part for key, part in json.loads(results[0].read_text()).items() if key not in ("digest", "about")}
+    assert value["digest"] == digest(by_hand) and value["format"] == FORMAT
+    other = read_result(results[1])["encoder"]
+    assert other["images_seen"] == 0 and other["trained_on"] == "nothing" and "random" in other["name"]
+    assert not any(leak for block in read_result(results[1])["blocks"] for leak in block.get("leaks", ()))
+    given = describe([model], [str(smoke_run)], About(name="mine", licence="MIT", images_seen=7))
+    assert (given["name"], given["licence"], given["images_seen"]) == ("mine", "MIT", 7)
+
+
+def test_the_same_suite_twice_gives_the_same_digest_and_continues(
+    results: list[Path], smoke_run: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toys, whole, done = find_suite(str(root / "toys.toml")), Reader.score, []
+
+    def dying(self: Reader, *given: Any) -> Any:
+        if given[3] == "" and len(done) == 2:
+            raise KeyboardInterrupt
+        done.extend([given[2].name] * (given[3] == ""))
+        return whole(self, *given)
+
+    monkeypatch.setattr(Reader, "score", dying)
+    with pytest.raises(KeyboardInterrupt):
+        run_bench([str(smoke_run)], toys, tmp_path, root, About())
+    assert done == ["pattern", "light"] and not list(tmp_path.glob("*.json"))
+    again: list[str] = []
+    monkeypatch.setattr(Reader, "score", lambda self, *given: again.append(given[3]) or whole(self, *given))
+    path = run_bench([str(smoke_run)], toys, tmp_path, root, About())
+    assert again == [""]  # the third task; its controls were kept
+    assert read_result(path)["digest"] == read_result(results[0])["digest"]
+    assert {part.name.partition("-")[0] for part in (tmp_path / "parts").iterdir()} == {"controls"}
+
+
+def test_what_is_not_there_is_said(results: list[Path], root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    blocks = read_result(results[0])["blocks"]
+    assert blocks[3]["not_run"].endswith("elsewhere is not there") and blocks[2]["form"] == "copy"
+    toys = find_suite(str(root / "toys.toml"))
+    assert open_set(toys.sets[0], None) == "no --data-root was given, where stripes would be"
+    assert "choose from calandra-v1" in said(capsys, "bench", "external:timm/test_resnet", "--suite", "sim-v2")
+    nowhere = "bench", RANDOM.format(0), "--suite", root / "toys.toml", "--data-root", root / "nowhere"
+    assert "is not a folder" in said(capsys, *nowhere)
+    empty = "bench", RANDOM.format(0), "--suite", root / "toys.toml", "--out", root / "nothing"
+    assert "was scored on no task of toys: no --data-root was given" in said(capsys, *empty)
+    assert not list((root / "nothing").glob("*.json"))
+
+
+def test_folds_test_every_group_once(root: Path, results: list[Path]) -> None:
+    opened = open_set(find_suite(str(root / "toys.toml")).sets[1], root)
+    assert not isinstance(opened, str) and len(opened.packs) == 3
+    tested = [set(view.column("group")[view.rows("test")].tolist()) for view in opened.packs]
+    assert sum(map(len, tested)) == len(set().union(*tested)) == 60
+    for view in opened.packs:
+        sides = [set(view.column("group")[view.rows(side)].tolist()) for side in ("train", "val", "test")]
+        assert all(sides) and not sides[0] & sides[2] and not sides[1] & sides[2]
+    block = read_result(results[0])["blocks"][2]
+    assert len(block["groups"]) == 60 and set(block["groups"]) == set().union(*tested)
+    with pytest.raises(ValueError, match=r"has 60 labelled groups, the suite asks for 61 folds"):
+        open_set(replace(find_suite(str(root / "toys.toml")).sets[1], folds=61), root)
+
+
+def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(results: list[Path], tmp_path: Path) -> None:
+    """The run learned from the train split, whose groups the folds test."""
+    read = {r["encoder"]["name"]: r for r in map(read_result, results)}
+    blocks = next(iter(read.values()))["blocks"]
+    assert blocks[0]["leaks"] == [""] and "72 of 120 test rows and 36 of 60 test instances" in blocks[2]["leaks"][0]
+    board = gather(read)
+    leaked, clean = list(read)
+    text = {row.task: order_of(row, board.encoders) for row in board.rows}
+    assert text["folded: pattern (copy)"].endswith(f"not ordered because of LEAK: {leaked}")
+    assert leaked in text["stripes: light"] and "LEAK" not in text["stripes: light"]
+    page = write_board(results, tmp_path / "board.html").read_text()
+    assert "LEAK: 72 of 120 test rows" in page and " LEAK</td>" in page.replace("&nbsp;", " ")
+    assert "none found" in page and clean in page
+
+
+def test_what_its_owner_says_of_the_training_data_is_a_leak_too(root: Path) -> None:
+    toys = find_suite(str(root / "toys.toml"))
+    entry = score.Entry([], [], "x", "ImageNet; toy stripes, 2022")
+    assert entry._declared(toys.sets[0].names) == "Toy Stripes was in its owner's training, which rows is not known"
+    assert entry._declared(("Touch and Go",)) == "" and score.Entry([], [], "x", None)._declared(()) == "unknown"
+
+
+def test_the_board(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "board", *map(str, results), "--out", str(tmp_path / "board.html")]) == 0
+    page = (tmp_path / "board.html").read_text()
+    board = gather({r["encoder"]["name"]: r for r in map(read_result, results)})
+    assert board.controls == ["majority or mean", "noise only", "border", "pixels", "untrained"]
+    assert page.index(">majority or mean<") < page.index(">untrained<") < page.index(f">{board.encoders[0]}<")
+    for text in ("stripes: pattern", "12 test instances", "touch, R2", "2 tasks that were not run", "levels", "30"):
+        assert text in page, text
+    assert page.count("<svg") == 3 + 2  # touch of three tasks against parameters, two modalities against labels
+    assert (
+        "≈" in page
+        and "<script" not in page
+        and "http" not in page.replace("http-equiv", "").replace("http://www.w3", "")
+    )
+    (light,) = (row for row in board.rows if row.task == "stripes: light")
+    first, *_ = sorted(board.results, key=lambda name: -light.cells[name]["mean"])
+    assert order_of(light, board.encoders).startswith(f"{first} ")
+
+
+def test_a_changed_result_is_refused(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "check", *map(str, results)]) == 0
+    assert "scores agree with their sums" in capsys.readouterr().out
+
+    def better(value: dict[str, Any]) -> None:
+        value["blocks"][0]["records"][0]["accuracy"] += 0.01
+
+    bad = changed(results[0], tmp_path / "a.json", better, signed=False)
+    for command in ("check", "board"):
+        assert "does not match its digest" in said(capsys, "bench", command, bad)
+    hidden = changed(results[0], tmp_path / "b.json", better, signed=True)
+    for command in ("check", "board"):
+        assert "its sums per group give" in said(capsys, "bench", command, hidden)
+
+    def error(value: dict[str, Any]) -> None:
+        value["blocks"][1]["records"][0]["targets"][0]["mae"] /= 2
+
+    assert "mae of level" in said(
+        capsys, "bench", "check", changed(results[0], tmp_path / "c.json", error, signed=True)
+    )
+
+    def more(value: dict[str, Any]) -> None:
+        value["blocks"][0]["records"][0]["group_correct"][0] = 1000
+
+    assert "more correct rows" in said(
+        capsys, "bench", "check", changed(results[0], tmp_path / "d.json", more, signed=True)
+    )
+
+    def fewer(value: dict[str, Any]) -> None:
+        del value["blocks"][3]
+
+    assert "the suite asks for" in said(
+        capsys, "bench", "check", changed(results[0], tmp_path / "e.json", fewer, signed=True)
+    )
+
+    def alone(value: dict[str, Any]) -> None:
+        records = value["blocks"][0]["records"]
+        value["blocks"][0]["records"] = [record for record in records if record["source"] != "pixels"]
+
+    assert "lacks the controls pixels" in said(
+        capsys, "bench", "check", changed(results[0], tmp_path / "f.json", alone, signed=True)
+    )
+    (tmp_path / "g.json").write_text('{"format": "else"}')
+    assert "is not a result of the bench" in said(capsys, "bench", "board", tmp_path / "g.json")
+
+
+def test_results_of_other_suites_are_refused(
+    results: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def older(value: dict[str, Any]) -> None:
+        value["suite"]["seed"] = 1
+
+    assert "does not have the digest" in said(
+        capsys, "bench", "check", changed(results[0], tmp_path / "a.json", older, signed=True)
+    )
+
+    def resigned(value: dict[str, Any]) -> None:
+        value["suite"]["seed"] = 1
+        value["suite_digest"] = suite.from_json(suite.Suite, value["suite"], "suite").digest()
+
+    other = changed(results[1], tmp_path / "b.json", resigned, signed=True)
+    assert "is of another suite" in said(capsys, "bench", "board", results[0], other)
+    assert "bench one of them with --name" in said(capsys, "bench", "board", results[0], results[0])
+    monkeypatch.setattr(suite, "SUITES", tmp_path)
+    (tmp_path / "toys.toml").write_text(SUITE)
+    assert main(["bench", "check", str(results[0])]) == 0
+    capsys.readouterr()
+    (tmp_path / "toys.toml").write_text(SUITE.replace("seed = 0\nuntrained", "seed = 7\nuntrained"))
+    assert "is of another version of toys" in said(capsys, "bench", "check", results[0])
+
+
+def test_encoders_that_cannot_be_scored_are_refused(
+    smoke_run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = load(smoke_run)
+    run, spec = model.run, model.spec
+    bench = "--suite", root / "toys.toml", "--data-root", root, "--out", tmp_path / "out"
+    broken = shutil.copytree(smoke_run, tmp_path / "nan")
+    with torch.no_grad():
+        next(model.encoders["touch"].parameters()).fill_(float("nan"))
+    model.save(broken / "model.safetensors")
+    error = said(capsys, "bench", broken, *bench)
+    assert "gives NaN or infinite features of touch for 120 of 120 images" in error
+    (tmp_path / "six").mkdir()
+    fresh(run, replace(spec, touch_channels=6, vision_channels=0), 32).save(tmp_path / "six" / "model.safetensors")
+    assert "takes 6 channels of touch, the data has 3" in said(capsys, "bench", tmp_path / "six", *bench)
+    assert "no trained model" in said(capsys, "bench", tmp_path / "nothing", *bench)
+    assert not list((tmp_path / "out").glob("*.json"))
+    window, difference = replace(spec.window, frames=3), fresh(run, replace(spec, difference=True), 32)
+    pack = Pack(root / "stripes")
+    assert "windows of 3 frames" in misfit(fresh(run, replace(spec, window=window), 32), pack, "touch")
+    assert "minus its background" in misfit(difference, pack, "touch") and not misfit(difference, pack, "vision")
+
+
+def test_another_encoder_does_not_replace_a_result(results: list[Path], smoke_run: Path, root: Path) -> None:
+    toys, name = find_suite(str(root / "toys.toml")), read_result(results[0])["encoder"]["name"]
+    with pytest.raises(ValueError, match="is the result of other weights"):
+        run_bench([RANDOM.format(6)], toys, results[0].parent, root, About(name=name))
+    with pytest.raises(ValueError, match="not seeds of one encoder"):
+        run_bench([RANDOM.format(6), RANDOM.format(6)], toys, results[0].parent, root, About())
+
+
+def test_stacked_sensors_are_read_one_by_one(tmp_path: Path, smoke_run: Path, root: Path) -> None:
+    toy_pack(tmp_path / "stripes", touch_channels=6)
+    opened = open_set(find_suite(str(root / "toys.toml")).sets[1], tmp_path)
+    assert not isinstance(opened, str)
+    model, pack, rows = load(smoke_run), opened.packs[0], np.array([0, 5, 9])
+    found = Reader(model, opened, "x").read("touch", rows)
+    images = torch.from_numpy(pack.images["touch"][rows]).permute(0, 3, 1, 2)
+    expected = torch.cat([model.features("touch", images[:, :3]), model.features("touch", images[:, 3:])], dim=1)
+    assert np.allclose(found, expected.numpy(), atol=1e-5)
+    left, right = (features(model, view, "touch", rows) for view in score.sensors(pack, "touch", 3))
+    assert not np.allclose(left, right)
+    (note,) = Reader(
+        load(f"{RANDOM.format(0)},frames=2"), opened, "x"
+    ).notes  # of an encoder of others: it is in the result
+    assert "the current frame is repeated" in note and Reader(model, opened, "x").notes == []
+
+
+def test_data_is_compared_with_the_pins(root: Path) -> None:
+    one = find_suite(str(root / "toys.toml")).sets[0]
+    opened = open_set(one, root)
+    assert (
+        not isinstance(opened, str)
+        and opened.pinned == "not pinned"
+        and set(opened.digests) == {"rows", "touch", "vision"}
+    )
+
+    def pinned(**changes: str) -> Any:
+        return open_set(replace(one, forms=(replace(one.forms[0], pins={**opened.digests, **changes}),)), root)
+
+    assert pinned().pinned == "same" and pinned(touch="0").pinned == "other pixels"
+    with pytest.raises(ValueError, match="other rows, labels or splits than the suite"):
+        pinned(rows="0")
+    form = one.forms[0]  # made here: another processor may give other rows, which are another row of the board
+    made = replace(form, at={}, data={**form.data, "path": str(root / "stripes")}, pins={**opened.digests, "rows": "0"})
+    found = open_set(replace(one, forms=(made,)), None)
+    assert not isinstance(found, str) and found.pinned == "other rows"
+
+
+def test_shipped_suites_keep_their_definitions() -> None:
+    found = {name: find_suite(name) for name in shipped()}
+    assert {name: one.name for name, one in found.items()} == {name: name for name in GOLDEN}
+    assert {name: one.digest()[:12] for name, one in found.items()} == GOLDEN
+    sim = found["sim-v1"]
+    without = replace(sim, sets=tuple(replace(s, forms=tuple(replace(f, pins={}) for f in s.forms)) for s in sim.sets))
+    assert without.digest() == sim.digest() and replace(sim, seed=1).digest() != sim.digest()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("name = ", "is not a suite"),
+        (SUITE.replace("linear", "quadratic"), "unknown value of suite.probes"),
+        (SUITE.replace('"folded"', '"stripes"'), "two sets have one name"),
+        (SUITE.replace('name = "pack" }', 'name = "packs" }', 1), "unknown dataset"),
+    ],
+)
+def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "suite.toml").write_text(text)
+    with pytest.raises(ValueError, match=expected):
+        find_suite(str(tmp_path / "suite.toml"))
+
+
+@pytest.mark.parametrize("path", sorted(BOARD.rglob("*.json")), ids=lambda path: path.stem)
+def test_results_in_the_repository(path: Path) -> None:
+    """What a pull request that adds a result is checked by."""
+    value = read_result(path)
+    assert problems(value) == [] and path.parent.name == value["suite"]["name"] and path.stat().st_size < 200_000
+
+
+def test_r2_in_a_result_is_that_of_its_sums(results: list[Path]) -> None:
+    value = read_result(results[0])
+    for record in records_of(value["blocks"][1], value["encoder"]):
+        total = {name: np.array(each).sum(1) for name, each in record["group_sums"].items()}
+        assert record["r2"] == pytest.approx(float(np.mean(r_squared(total))), abs=1e-6)

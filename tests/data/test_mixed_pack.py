@@ -1,0 +1,266 @@
+"""Several packs as one: rows, images, tasks and splits are those of the parts, and what cannot be mixed is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mvitac.cli.main import main
+from mvitac.data.images import fit
+from mvitac.data.mixed_pack import MixedPack
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec, Target, ValueTask, Window
+from mvitac.data.windows import windowed
+from mvitac.datasets.mix import MixConfig
+from mvitac.evaluation.leaks import Scored, source_of
+from support.mixes import Gel, Slice, built
+from support.toy import Toy
+
+
+@pytest.fixture(scope="module")
+def gel(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return built(Gel(num=60), tmp_path_factory.mktemp("gel") / "pack", size=24)
+
+
+def test_rows_are_those_of_the_parts(pack: Pack, gel: Pack) -> None:
+    mix = MixedPack({"toy": pack, "gel": gel})
+    assert (mix.num, mix.size) == (pack.num + gel.num, 32)
+    assert mix.column("part").tolist() == ["toy"] * pack.num + ["gel"] * gel.num
+    assert mix.column("sensor").tolist() == ["toy"] * pack.num + ["mini"] * gel.num
+    assert mix.column("split").tolist() == pack.column("split").tolist() + gel.column("split").tolist()
+    for name in ("id", "group", "touch_group"):
+        assert mix.column(name)[-1] == f"gel/{gel.column(name)[-1]}" and len(set(mix.column("id"))) == mix.num
+    assert mix.own_ids.tolist() == pack.own_ids.tolist() + gel.own_ids.tolist()
+    assert mix.has("touch").all() and mix.has("vision").tolist() == [True] * pack.num + [False] * gel.num
+    assert mix.whole.all() and len(mix.rows("train", having=("vision",))) == len(pack.rows("train"))
+    rows = np.array([pack.num + 3, 5, pack.num + 3, 0])
+    small, large = gel.images["touch"][3], pack.images["touch"]
+    expected = [fit(small, 32), large[5], fit(small, 32), large[0]]
+    np.testing.assert_array_equal(mix.images["touch"][rows], expected)
+    np.testing.assert_array_equal(mix.images["touch"][pack.num + 3], fit(small, 32))
+    assert not mix.images["vision"][rows[0]].any() and mix.images["vision"][5].any()
+    assert "gel: images of 24 px are resized to 32 px when they are read" in mix.spec.notes
+    assert mix.spec.licence == "toy: none; gel: none"
+    assert MixedPack({"toy": pack, "gel": gel}, size=16).images["touch"].shape[1:] == (16, 16, 3)
+
+
+def test_the_digest_is_of_parts_and_size(pack: Pack, gel: Pack) -> None:
+    one = MixedPack({"a": pack, "b": gel})
+    others = [
+        MixedPack({"a": gel, "b": pack}),
+        MixedPack({"a": pack, "c": gel}),
+        MixedPack({"a": pack, "b": gel}, size=24),
+    ]
+    assert MixedPack({"a": pack, "b": gel}).digest == one.digest
+    assert len({one.digest, *(other.digest for other in others)}) == 4
+
+
+def test_one_task_if_classes_agree_else_two(pack: Pack, gel: Pack) -> None:
+    mix = MixedPack({"toy": pack, "gel": gel})
+    assert [task.name for task in mix.spec.tasks] == ["pattern", "toy/bright", "gel/bright"]
+    assert mix.spec.tasks[0].classes == pack.spec.tasks[0].classes
+    expected = np.concatenate([pack.labels("pattern"), (gel.labels("pattern") - 1) % 3])
+    np.testing.assert_array_equal(mix.labels("pattern"), expected, "classes go by name")
+    for name, part, first in (("toy/bright", pack, 0), ("gel/bright", gel, pack.num)):
+        expected = np.full(mix.num, -1)
+        expected[first : first + part.num] = part.labels("bright")
+        np.testing.assert_array_equal(mix.labels(name), expected)
+    assert mix.spec.controls == {"noise only": ("toy/noise",)}  # a column of this name is no control in gel
+    np.testing.assert_array_equal(np.isfinite(mix.column("toy/noise")), mix.column("part") == "toy")
+
+
+@dataclass
+class Pressed(Slice):
+    """The stripes with a force, in ``unit``, of one phase, and a split of their own for it."""
+
+    unit: str = "N"
+    kind: Any = 1
+    own_split: bool = False
+
+    def spec(self) -> DataSpec:
+        split = "split_force" if self.own_split else "split"
+        task = ValueTask(name="force", targets=(Target(name="force", unit=self.unit),), only={"kind": "1"}, split=split)
+        return replace(super().spec(), values=(task,))
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {**super().fingerprint(), "pressed": [self.unit, self.kind, self.own_split]}
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        extra = {"force": item / 2, "kind": self.kind, **({"split_force": "test"} if self.own_split else {})}
+        return [replace(sample, columns={**sample.columns, **extra})]
+
+
+@pytest.mark.parametrize("other", [{"unit": "mN"}, {"own_split": True}, {"kind": "1"}, {}])
+def test_values_keep_their_unit_rows_and_split(gel: Pack, tmp_path: Path, other: dict[str, Any]) -> None:
+    """``kind`` is a number here and a text there: the filter is of each part's own column."""
+    a = built(Pressed(num=30), tmp_path / "a")
+    b = built(Pressed(num=30, first=60, **other), tmp_path / "b")
+    mix = MixedPack({"a": a, "b": b, "gel": gel})
+    names = [task.name for task in mix.spec.values]
+    assert names == (["a/force", "b/force"] if other else ["force"])
+    for task in mix.spec.values:
+        values = mix.values(task)[:, 0]
+        there = np.isin(mix.column("part"), ["a", "b"] if not other else [task.name[0]])
+        np.testing.assert_array_equal(np.isfinite(values), there)
+        np.testing.assert_array_equal(values[there], np.tile(np.arange(30) / 2, there.sum() // 30))
+        if task.split != "split":
+            assert (mix.column(task.split)[~there] == "hidden").all()
+    if "unit" in other:
+        assert [task.targets[0] for task in mix.spec.values] == [
+            Target(name="a/force", unit="N"),
+            Target(name="b/force", unit="mN"),
+        ]
+
+
+def test_rows_are_hidden_as_in_their_part(pack: Pack, tmp_path: Path) -> None:
+    """A part whose tasks all have splits of their own hides no row, though the other part has tasks of the common split."""
+
+    @dataclass
+    class Listed(Slice):
+        prefix: str = "listed "
+
+        def spec(self) -> DataSpec:
+            return replace(super().spec(), tasks=(replace(super().spec().tasks[1], split="split_bright"),))
+
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            return [replace(sample, columns={**sample.columns, "split_bright": sample.columns["split"]})]
+
+    listed = built(Listed(num=60), tmp_path / "p", size=16)
+    mix = MixedPack({"toy": pack, "listed": listed})
+    assert [task.name for task in mix.spec.tasks] == ["pattern", "toy/bright", "listed/bright"]
+    assert not mix.hidden.any() and not listed.hidden.any()
+    assert len(mix.rows("test")) == len(pack.rows("test")) + len(listed.rows("test"))
+
+
+def test_windows_of_a_mix_stay_within_a_touch_of_a_part(measured: Pack, tmp_path: Path) -> None:
+    other = built(Slice(num=30, values=True, prefix="other "), tmp_path / "p")
+    window = Window(frames=2)
+    mix = windowed(MixedPack({"a": measured, "b": other}), window)
+    for rows, part in ((np.arange(measured.num), measured), (measured.num + np.arange(30), other)):
+        np.testing.assert_array_equal(mix.images["touch"][rows], windowed(part, window).images["touch"][:])
+
+
+def test_one_part_alone(pack: Pack, gel: Pack) -> None:
+    mix = MixedPack({"toy": pack, "gel": gel})
+    alone = mix.alone("gel")
+    np.testing.assert_array_equal(alone.rows("train"), pack.num + gel.rows("train"))
+    assert alone.spec.modalities == ("touch",) and mix.spec.modalities == ("vision", "touch")
+    assert len(mix.rows("train")) > len(gel.rows("train"))
+
+
+class Turned(Slice):
+    """Train is test here."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        split = {"train": "test", "test": "train", "val": "val"}[sample.columns["split"]]
+        return [replace(sample, columns={**sample.columns, "split": split})]
+
+
+def test_a_group_on_two_sides_is_refused_or_marked(pack: Pack, tmp_path: Path) -> None:
+    turned = built(Turned(num=60), tmp_path / "p")
+    with pytest.raises(
+        ValueError, match=r"instance '0-6' is in train of part b and in test of part a, one of \d+: pack"
+    ):
+        MixedPack({"b": turned, "a": pack})
+    mix = MixedPack({"a": pack, "b": turned}, allow_leak=True)
+    assert mix.spec.notes[0].startswith("instance")
+    assert "test instances were trained on" in Scored(mix).leak([source_of(mix, mix.rows("train"))], mix.rows("test"))
+
+
+def test_a_leak_between_a_mix_and_a_pack_is_found(pack: Pack, gel: Pack) -> None:
+    """Groups of a mix are those of its parts, whatever prefix they have in it."""
+    mix = MixedPack({"toy": pack, "gel": gel})
+    learned = source_of(mix, mix.rows("train"))
+    assert Scored(pack).leak([learned], pack.rows("train")).startswith(f"{len(pack.rows('train'))} of ")
+    assert Scored(pack).leak([learned], pack.rows("test")) == ""
+
+
+def test_an_image_on_two_sides_under_two_names_is_refused(pack: Pack, tmp_path: Path) -> None:
+    turned = built(Turned(num=60, prefix="copy "), tmp_path / "p")
+    expected = r"one vision image has two names: it is row '0\d+' \(\S+\) in train of part a and row 'copy 0\d+' \(copy"
+    with pytest.raises(ValueError, match=expected):
+        MixedPack({"a": pack, "b": turned})
+    small = built(Turned(num=60, prefix="copy "), tmp_path / "small", size=16)
+    MixedPack({"a": pack, "b": small})  # images of other sizes cannot be compared
+
+
+def test_what_cannot_be_mixed_is_refused(pack: Pack, tmp_path: Path) -> None:
+    class Scores(Slice):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            return [replace(sample, columns={**sample.columns, "split": "test"})]
+
+    class Minus(Slice):
+        def spec(self) -> DataSpec:
+            return replace(super().spec(), difference=True)
+
+    cases: list[tuple[Toy, str]] = [
+        (Scores(num=12), "part b .* has no rows in split train or unlabelled: leave it out"),
+        (Slice(num=12, touch_channels=6), "touch channels differ: 3 in a, 6 in b; pack them"),
+        (Minus(num=12), "touch is stored minus its background in b and as it is in a: pack both alike"),
+        (Toy(), "parts a and b are the same data: give each pack once, with a weight"),
+    ]
+    for number, (source, message) in enumerate(cases):
+        other = built(source, tmp_path / str(number))
+        with pytest.raises(ValueError, match=message):
+            MixedPack({"a": pack, "b": other})
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["a=x", "a=y"], "part 'a' is given twice"),
+        (["x/a", "y/a"], "part 'a' is given twice"),
+        (["a=x:2", "b=y"], r"parts a=x:2 b=y: give every part a weight \(NAME=FOLDER:WEIGHT\), or none"),
+        (["a=x:0", "b=y:1"], "part 'a=x:0' has weight '0': give a positive number"),
+        (["a=x:-1", "b=y:1"], "has weight '-1': give a positive number"),
+        (["a=x:nan", "b=y:1"], "has weight 'nan'"),
+        (["a=x:much", "b=y:1"], "has weight 'much'"),
+        (["a=:1", "b=y:1"], "part 'a=:1' names no folder"),
+        (["a=x:1", "b=y:1", "--data.temperature", "0.5"], "temperature 0.5 has no effect on parts with weights"),
+        (["a=x", "b=y", "--data.temperature", "-1"], "temperature -1.0: give a number >= 0"),
+        (["a=x"], "a mix needs at least two parts, got 1"),
+        (["a=x", "b=y"], "part a: no pack at x"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    given: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    import re
+
+    asked = ["pretrain", "--data", "mix", "--recipe", "smoke", "--out", str(tmp_path / "run"), "--data.parts", *given]
+    assert main(asked) == 2
+    said = capsys.readouterr().err
+    assert re.search(message, said) and said.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+def test_names_folders_and_weights() -> None:
+    config = MixConfig(parts=("tag=packs/tag:2", "packs/mine:.5"))
+    assert config.named_parts() == [("tag", Path("packs/tag"), 2.0), ("mine", Path("packs/mine"), 0.5)]
+    assert MixConfig(parts=("a=b=c", "d:e/f")).named_parts() == [("a", Path("b=c"), None), ("f", Path("d:e/f"), None)]
+
+
+def test_a_mix_is_described_shown_and_checked(
+    pack: Pack, gel: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts = [f"toy={pack.path}", f"gel={gel.path}"]
+    assert main(["data", "info", *parts, "--json", str(tmp_path / "info.json")]) == 0
+    found = json.loads((tmp_path / "info.json").read_text())
+    assert (found["rows"], found["rows_without"]) == (
+        pack.num + gel.num,
+        {"vision": gel.num},
+    )
+    assert main(["data", "show", *parts, "--by", "part", "--num", "2", "--out", str(tmp_path / "x.png")]) == 0
+    assert "2 of 2 strips" in capsys.readouterr().out
+    assert main(["data", "check", *parts, "--json", str(tmp_path / "check.json")]) in (0, 1)
+    assert main(["data", "pack", "--data", "mix", "--out", str(tmp_path / "p")]) == 2
+    assert "a mix is not packed" in capsys.readouterr().err

@@ -1,0 +1,223 @@
+"""Sensors in probes: statistics from unlabelled images, colours of known sensors, what features tell of the sensor."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.evaluation import sensors as module
+from mvitac.evaluation.features import features
+from mvitac.evaluation.sensors import (
+    RecolouredPack,
+    cross_sensor,
+    describe_statistics,
+    sensor_records,
+    touch_features,
+    unlabelled_rows,
+    with_statistics,
+)
+from mvitac.model import Model, load
+from mvitac.transforms.preprocess import encoder_input
+from support.toy import Toy
+
+
+class Others(Toy):
+    """The striped pairs through two sensors, by turns; the second inverts touch."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        assert sample.touch is not None
+        touch = 255 - sample.touch if item % 2 else sample.touch
+        columns = {**sample.columns, "sensor": "negative" if item % 2 else "plain"}
+        return [replace(sample, touch=touch, columns=columns)]
+
+
+def with_columns(pack: Pack, **columns: np.ndarray) -> Pack:
+    """``pack`` with other columns in its table, in memory."""
+    made = copy.copy(pack)
+    made.__dict__ = {
+        k: v for k, v in pack.__dict__.items() if k not in ("sensors", "sensor_names", "presses", "_rows_by")
+    }
+    kept = pack.table.drop_columns([name for name in columns if name in pack.table.column_names])
+    for name, values in columns.items():
+        kept = kept.append_column(name, pa.array(values.tolist()))
+    made.table = kept
+    return made
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    return build(Others(), tmp_path_factory.mktemp("others") / "pack", size=32, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def model(smoke_run: Path) -> Model:
+    return load(smoke_run)
+
+
+def test_sensors_are_numbered_by_name(pack: Pack, others: Pack) -> None:
+    assert others.sensor_names == ("negative", "plain")
+    assert [others.sensor_names[n] for n in others.sensors[:3]] == ["plain", "negative", "plain"]
+    assert pack.sensor_names == ("toy",) and not pack.sensors.any()
+
+
+def test_statistics_never_take_test_images_while_there_are_others(others: Pack) -> None:
+    split = others.column("split").astype(str)
+    rows = unlabelled_rows(others, 0)
+    assert set(split[rows]) == {"train"} and set(others.sensors[rows]) == {0}
+    many = with_columns(others, sensor=np.full(others.num, "one"))
+    assert set(split[unlabelled_rows(many, 0)]) == {"train"} and len(unlabelled_rows(many, 0)) == 72
+    assert len(unlabelled_rows(many, 0, 40)) == 40
+    few = with_columns(others, sensor=np.where(split == "test", "one", "two"))
+    assert set(split[unlabelled_rows(few, 0)]) == {"test"}
+    used = describe_statistics(few, ("features",))
+    assert "test images among them" in used[0] and "test" not in used[1]
+
+
+def test_joined_packs_take_statistics_from_hidden_rows(pack: Pack, others: Pack) -> None:
+    """Of the scored pack: its train rows, which a joined pack hides, and no test row."""
+    both = JoinedPack(
+        with_columns(pack, sensor=np.full(pack.num, "old")), with_columns(others, sensor=np.full(120, "new"))
+    )
+    assert both.sensor_names == ("new", "old")
+    new, old = (unlabelled_rows(both, number) for number in (0, 1))
+    assert (new >= pack.num).all() and set(both.column("split")[new]) == {"hidden"}
+    assert (old < pack.num).all() and set(both.column("split")[old]) == {"train"}
+
+
+def test_features_are_standardised_by_each_sensors_own_images(model: Model, others: Pack) -> None:
+    rows = others.rows("test")
+    found = touch_features(model, others, "touch", rows, ("features",), maps=False)
+    for number in (0, 1):
+        seen = features(model, others, "touch", unlabelled_rows(others, number))
+        own = others.sensors[rows] == number
+        expected = (features(model, others, "touch", rows[own]) - seen.mean(0)) / (seen.std(0) + 1e-6)
+        np.testing.assert_allclose(found[own], expected, rtol=1e-5, atol=1e-5)
+    for modality, kinds in (
+        ("vision", ("features",)),
+        ("touch", ()),
+        ("touch", ("colours",)),
+    ):  # colours: no new sensor here
+        plain = touch_features(model, others, modality, rows, kinds, maps=False)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(plain, features(model, others, modality, rows))
+    maps = touch_features(model, others, "touch", rows, ("features",), maps=True)
+    assert maps.ndim == 3 and np.abs(maps.mean((0, 1))).mean() < 0.3
+
+
+def test_batch_norm_takes_the_statistics_of_the_given_images(model: Model, others: Pack) -> None:
+    rows, trunk = np.arange(48), model.encoders["touch"]
+    before = copy.deepcopy(trunk.state_dict())
+    made = with_statistics(model, others, rows)
+    names = [n for n, layer in trunk.named_modules() if isinstance(layer, torch.nn.BatchNorm2d)]
+    first = made.encoders["touch"].get_submodule(names[0])
+    inputs: list[torch.Tensor] = []
+    hook = trunk.get_submodule(names[0]).register_forward_hook(lambda _, given, out: inputs.append(given[0]))
+    images = torch.from_numpy(others.images["touch"][rows]).permute(0, 3, 1, 2)
+    with torch.no_grad():
+        trunk(encoder_input(images, model.run.augment.eval_size))
+    hook.remove()
+    torch.testing.assert_close(first.running_mean, inputs[0].mean((0, 2, 3)))
+    assert not made.encoders["touch"].training
+    for name, value in trunk.state_dict().items():
+        assert torch.equal(value, before[name]), name  # the model itself is as it was
+        if "running" not in name and "num_batches" not in name:
+            assert torch.equal(made.encoders["touch"].state_dict()[name], value), name
+    found = touch_features(model, others, "touch", others.rows("test"), ("batch-norm",), maps=False)
+    own = others.sensors[others.rows("test")] == 1
+    anew = with_statistics(model, others, unlabelled_rows(others, 1))
+    np.testing.assert_allclose(found[own], features(anew, others, "touch", others.rows("test")[own]), rtol=1e-5)
+
+
+def test_new_sensors_are_shown_as_each_known_one(
+    pack: Pack, others: Pack, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only they change, and their features are the mean over the known sensors."""
+    monkeypatch.setattr(module, "learn_colours", lambda images: float(images.mean()))
+    monkeypatch.setattr(module, "recolour", lambda images, source, target: (images // 2 + int(target)).astype(np.uint8))
+    learn = with_columns(pack, sensor=np.where(pack.labels("bright"), "lit", "dim"))
+    both = RecolouredPack(learn, with_columns(others, sensor=np.full(120, "new")))
+    assert both.sensor_names == ("dim", "lit", "new") and both.new == {2} and len(both.looks) == 2
+    for look in both.looks:
+        np.testing.assert_array_equal(look.images["touch"][:120], pack.images["touch"])
+        assert (look.images["touch"][120:] != others.images["touch"]).mean() > 0.9
+        np.testing.assert_array_equal(look.images["vision"][120:], others.images["vision"])
+    assert len({both.digest, *(look.digest for look in both.looks)}) == 3  # features are cached by it
+    rows = np.concatenate([both.rows("val"), both.rows("test")])
+    found = touch_features(model, both, "touch", rows, ("colours",), maps=False)
+    each = [features(model, look, "touch", rows) for look in both.looks]
+    np.testing.assert_allclose(found, (each[0] + each[1]) / 2, rtol=1e-4, atol=1e-5)
+    both_kinds = touch_features(model, both, "touch", rows, ("features", "colours"), maps=False)
+    seen = np.mean([features(model, look, "touch", unlabelled_rows(both, 2)) for look in both.looks], axis=0)
+    new = rows >= 120
+    np.testing.assert_allclose(
+        both_kinds[new], (found[new] - seen.mean(0)) / (seen.std(0) + 1e-6), rtol=1e-3, atol=1e-3
+    )
+    with pytest.raises(ValueError, match=r"all sensors of .* are in"):
+        RecolouredPack(learn, with_columns(others, sensor=np.full(120, "lit")))
+
+
+def test_stripes_have_no_slope_colours(pack: Pack, others: Pack) -> None:
+    with pytest.raises(ValueError, match=r"'(negative|plain|toy)'.*leave --standardise colours out"):
+        RecolouredPack(pack, others)
+
+
+def test_a_probe_for_the_sensor(model: Model, others: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Features that hold the sensor's number tell it, those that hold noise do not."""
+    noise = np.random.default_rng(0).normal(size=(120, 8)).astype(np.float32)
+    z = np.concatenate([noise, others.sensors[:, None]], axis=1)
+    monkeypatch.setattr(module, "features", lambda *args: z[args[3]])
+    (record,) = sensor_records(model, others)  # no presses here
+    assert record == {"name": "which sensor", "score": 1.0, "chance": 0.5, "num": len(others.rows("test"))}
+    monkeypatch.setattr(module, "features", lambda *args: noise[args[3]])
+    assert sensor_records(model, others)[0]["score"] < 0.75
+    assert sensor_records(model, with_columns(others, sensor=np.full(120, "one"))) == []
+
+
+def test_cross_sensor_retrieval_counts_presses(others: Pack, model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows 2 i and 2 i + 1 are one press: equal features find it, one feature for all does not."""
+    press = np.array([f"{i // 2:03d}" for i in range(120)])
+    pressed = with_columns(others, press=press, split=np.full(120, "test"))
+    z = np.random.default_rng(0).normal(size=(60, 64)).astype(np.float32)
+
+    def same(model: Model, pack: Pack, modality: str, rows: np.ndarray) -> np.ndarray:
+        return z[rows // 2]
+
+    monkeypatch.setattr(module, "features", same)
+    found = cross_sensor(model, pressed)
+    assert found == {"name": "same spot, other sensor", "score": 1.0, "chance": pytest.approx(5 / 60), "num": 120}
+    monkeypatch.setattr(module, "features", lambda *args: z[args[3] // 6])  # three presses alike: third, not first
+    assert cross_sensor(model, pressed)["score"] == 1  # type: ignore[index]
+    monkeypatch.setattr(module, "features", lambda *args: np.ones((len(args[3]), 4), np.float32))
+    assert cross_sensor(model, pressed)["score"] == 0  # type: ignore[index]  # ties count against it
+    monkeypatch.setattr(module, "features", lambda *args: z[np.random.default_rng(1).permutation(120)[args[3]] // 2])
+    assert cross_sensor(model, pressed)["score"] < 0.3  # type: ignore[index]
+    assert cross_sensor(model, others) is None
+
+
+def test_probe_command_says_what_it_used(
+    smoke_run: Path, pack: Pack, others: Pack, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    on = ["--on", str(others.path), "--learn-on", str(pack.path), "--tasks", "pattern", "--modalities", "touch"]
+    out = tmp_path / "scores.json"
+    arguments = ["probe", str(smoke_run), *on, "--no-controls", "--allow-leak", "--json", str(out)]
+    assert main([*arguments, "--standardise", "features", "--sensors"]) == 0
+    printed = capsys.readouterr().out
+    assert "unlabelled images of sensor toy" in printed
+    result = json.loads(out.read_text())
+    assert result["asked"]["standardise"] == ["features"] and "sensor negative" in " ".join(result["statistics"])
+    assert main(["probe", str(smoke_run), "--standardise", "colours"]) == 2
+    assert "name that pack as well" in capsys.readouterr().err
+    assert main(["probe", str(smoke_run), "--standardise", "features", "features"]) == 2
+    assert "given twice" in capsys.readouterr().err

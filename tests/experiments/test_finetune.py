@@ -1,0 +1,312 @@
+"""Fine-tuning and adaptation: settings from held-out groups of train alone, exact resumes, ancestors in the leaks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.probe import probe_model
+from mvitac.experiments.adapt import NEW, OLD, TRANSFER, Adaptation, adapt
+from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
+from mvitac.model import load
+from mvitac.run import load_run
+from mvitac.training.loop import train
+from support.toy import Toy, toy_pack
+from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+
+ASKED = Finetuning(labels=("pattern",), lr=(1e-3, 3e-3), steps=(3,), batch_size=16)
+
+
+@pytest.fixture(scope="module")
+def ancestor(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(smoke(pack, eval_every=0), tmp_path_factory.mktemp("ancestor") / "run", quiet=True)
+
+
+def tune(ancestor: Path, pack: Pack, out: Path, asked: Finetuning = ASKED, **options: Any) -> dict[str, Any]:
+    options = {"quiet": True, "say": lambda text: None, **options}
+    return finetune(ancestor, PackConfig(path=pack.path), asked, out, **options)
+
+
+@pytest.fixture(scope="module")
+def tuned(ancestor: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("tuned") / "out"
+    tune(ancestor, pack, out, replace(ASKED, fractions=(40.0, 100.0)))
+    return out
+
+
+def test_the_result_is_a_model_like_any_other(ancestor: Path, pack: Pack, tuned: Path) -> None:
+    result = json.loads((tuned / "scores.json").read_text())
+    found = {(r["source"], r["fraction"]): r for r in result["records"]}
+    assert set(found) == {(s, f) for s in ("fine-tuned, all", SCRATCH, FROZEN) for f in (40.0, 100.0)}
+    model = load(tuned / "seed0")
+    (own,) = [r for r in probe_model(model, pack, pack.spec.tasks[:1], ["both"], []) if r["probe"] == "own"]
+    assert found["fine-tuned, all", 100.0]["group_correct"] == own["group_correct"]
+    assert result["models"] == [str(tuned / "seed0")] and result["leaks"] == []
+    run, record = load_run(tuned / "seed0")
+    assert run.init.path == ancestor and record["start"]["taken"] == {"vision": ["trunk"], "touch": ["trunk"]}
+    assert json.loads((tuned / "seed0" / "scores.json").read_text())["records"][0]["accuracy"] == own["accuracy"]
+    assert not load_run(tuned / "scratch" / "seed0")[0].init
+    assert not (tuned / "choice").exists()  # what was only tried takes no room
+
+
+def test_the_command_continues_a_finished_one_and_prints_one_table(
+    ancestor: Path, pack: Pack, tuned: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    before = (tuned / "scores.json").read_text()
+    words = (
+        f"--labels pattern --lr 1e-3 3e-3 --steps 3 --batch-size 16 --fractions 40 100 --out {tuned} --resume --quiet"
+    )
+    with power_cut(0):  # nothing is trained again
+        assert main(["finetune", str(ancestor), "--data", "pack", "--data.path", str(pack.path), *words.split()]) == 0
+    assert (tuned / "scores.json").read_text() == before
+    said = capsys.readouterr().out
+    rows = {line.split("│")[1].strip(): line.split("│")[2:4] for line in said.splitlines() if line.count("│") == 4}
+    gains = [f"gain over {SCRATCH}", f"gain over {FROZEN}"]
+    assert list(rows) == ["fine-tuned, all", SCRATCH, FROZEN, *gains]
+    assert "40 % of instances" in said and "100 % of instances" in said and f"mvitac publish {tuned / 'seed0'}" in said
+    numbers = {name: float(cells[1].split()[0]) for name, cells in rows.items()}
+    assert numbers[gains[0]] == pytest.approx(numbers["fine-tuned, all"] - numbers[SCRATCH], abs=0.11)
+
+
+def tried_in(folder: Path) -> dict[str, float]:
+    """Score by settings, without the digest of the run."""
+    return {name.split(" (")[0]: score for name, score in json.loads((folder / "choice.json").read_text()).items()}
+
+
+def test_settings_are_the_best_on_held_out_groups(tuned: Path) -> None:
+    chosen = json.loads((tuned / "scores.json").read_text())["chosen"]
+    for fraction, folder in (("40", tuned / "40-percent"), ("100", tuned)):
+        assert len(tried := tried_in(folder)) == 5  # two rates and random heads; two rates from scratch
+        for kind, best in chosen[fraction].items():
+            name = f"{kind}: lr {best['lr']}, steps {best['steps']}, heads_from {best['heads_from']}"
+            assert tried[name] == max(score for other, score in tried.items() if other.startswith(kind))
+            run, _ = load_run(folder / ("scratch/seed0" if kind == SCRATCH else "seed0"))
+            assert (run.optim.lr, run.steps) == (best["lr"], best["steps"])
+            assert run.method.heads_from == best["heads_from"] and not run.method.hold_out  # type: ignore[attr-defined]
+
+
+def edited(pack: Pack, to: Path, **columns: Any) -> Path:
+    """A pack of the same images, with other values in some columns: functions of an item's own columns."""
+
+    class Other(Toy):
+        def read(self, item: int) -> Any:
+            (sample,) = super().read(item)
+            sample.columns.update({name: value(dict(sample.columns)) for name, value in columns.items()})
+            return [sample]
+
+    return build(Other(), to, size=pack.size, workers=1, quiet=True).path
+
+
+def next_class_in_test(row: dict[str, Any]) -> int:
+    return (row["label_pattern"] + (row["split"] == "test")) % 3
+
+
+def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path) -> None:
+    other = Pack(edited(pack, tmp_path / "other", label_pattern=next_class_in_test))
+    assert other.digest != pack.digest
+    result = tune(ancestor, other, tmp_path / "out", replace(ASKED, from_scratch=False))
+    assert len(tried := tried_in(tmp_path / "out")) == 3 and tried.items() <= tried_in(tuned).items()
+    assert_equal_weights(tmp_path / "out" / "seed0", tuned / "seed0")
+    before = json.loads((tuned / "scores.json").read_text())["records"]
+    right = [
+        next(r["accuracy"] for r in rs if r["source"] == FROZEN and r["fraction"] == 100)
+        for rs in (before, result["records"])
+    ]
+    assert right[1] <= 1 - right[0] + 1e-9  # the rows that were right are wrong now
+
+
+@pytest.mark.parametrize("after", [4, 10])  # while settings are tried, and in the final run
+def test_killed_and_resumed_equals_straight(
+    ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, after: int
+) -> None:
+    asked = replace(ASKED, from_scratch=False)
+    with power_cut(after), pytest.raises(RuntimeError, match="power cut"):
+        tune(ancestor, pack, tmp_path / "out", asked)
+    assert (tmp_path / "out" / "choice").exists() == (after == 4)
+    with pytest.raises(ValueError, match=r"out is not empty: continue it with --resume"):
+        tune(ancestor, pack, tmp_path / "out", asked)
+    result = tune(ancestor, pack, tmp_path / "out", asked, resume=True)
+    assert_equal_weights(tmp_path / "out" / "seed0", tuned / "seed0")
+    straight = [r for r in json.loads((tuned / "scores.json").read_text())["records"] if r["fraction"] == 100]
+    for record in result["records"]:
+        same = next(r for r in straight if r["source"] == record["source"])
+        assert record["group_correct"] == same["group_correct"]
+
+
+def test_the_frozen_probe_is_that_of_mvitac_probe_with_all_labels(ancestor: Path, pack: Pack, tuned: Path) -> None:
+    result = json.loads((tuned / "scores.json").read_text())
+    frozen = next(r for r in result["records"] if r["source"] == FROZEN and r["fraction"] == 100)
+    (probed,) = probe_model(load(ancestor), pack, pack.spec.tasks[:1], ["both"], ["linear"])
+    assert (
+        frozen["num_test"] == 24 and abs(frozen["accuracy"] - probed["accuracy"]) < 0.2
+    )  # C is chosen on other groups
+    few = next(r for r in result["records"] if r["source"] == FROZEN and r["fraction"] == 40)
+    assert few["group_correct"] != frozen["group_correct"]
+
+
+def refuse(capsys: pytest.CaptureFixture[str], command: list[str], *words: str) -> None:
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and all(word in said for word in words), said
+
+
+def test_bad_input_is_refused_before_anything_is_written(
+    ancestor: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, run = tmp_path / "out", str(ancestor)
+
+    def command(path: Path, *more: str) -> list[str]:
+        return ["finetune", run, "--data", "pack", "--data.path", str(path), "--out", str(out), *more]
+
+    refuse(capsys, ["finetune", run, "--out", str(out)], "name the data: --data")
+    refuse(capsys, command(pack.path)[:1] + command(pack.path)[2:], "name the model")
+    refuse(capsys, command(pack.path, "--labels", "x"), "unknown task 'x': choose from pattern, bright")
+    refuse(capsys, command(pack.path, "--values", "force"), "unknown task 'force'")
+    refuse(capsys, command(pack.path, "--lr", "1e-3", "1e-3"), "at least one number, and none twice")
+    refuse(capsys, command(pack.path, "--fractions", "0"), "in percent, above 0")
+    refuse(capsys, command(pack.path, "--rank", "0"), "rank 0: give 1 to 65536")
+    single = edited(
+        pack, tmp_path / "single", label_pattern=lambda row: 0 if row["split"] != "test" else row["label_pattern"]
+    )
+    refuse(capsys, command(single, "--labels", "pattern"), "labels of one class only in train (columns)")
+    few = edited(
+        pack, tmp_path / "few", group=lambda row: row["split"] + str(row["label_pattern"]) * (row["split"] == "train")
+    )
+    refuse(capsys, command(few, "--labels", "pattern"), "too few to hold some out", "give one --lr and one --steps")
+    six = toy_pack(tmp_path / "six", touch_channels=6)
+    refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
+    seen = edited(
+        pack, tmp_path / "seen", split=lambda row: {"test": "train", "train": "test"}.get(row["split"], row["split"])
+    )
+    refuse(capsys, command(seen, "--labels", "pattern"), "has seen what", "--allow-leak")
+    assert not out.exists()
+
+
+def test_a_leak_of_the_ancestor_stands_beside_the_score(ancestor: Path, pack: Pack, tmp_path: Path) -> None:
+    seen = edited(
+        pack, tmp_path / "seen", split=lambda row: {"test": "train", "train": "test"}.get(row["split"], row["split"])
+    )
+    asked = replace(ASKED, lr=(1e-3,), allow_leak=True)
+    records = tune(ancestor, Pack(seen), tmp_path / "out", asked)["records"]
+    leaks = {r["source"]: r["leak"] for r in records}
+    assert "72 of 72 test rows" in leaks["fine-tuned, all"] and "72 of 72" in leaks[FROZEN] and leaks[SCRATCH] == ""
+
+
+# -- adapt --------------------------------------------------------------------------------------------------------------
+
+
+def adapted(ancestor: Path, new: Pack, out: Path, asked: Adaptation, **options: Any) -> dict[str, Any]:
+    options = {"quiet": True, "say": lambda text: None, **options}
+    return adapt(ancestor, PackConfig(path=new.path), asked, out, **options)
+
+
+@pytest.fixture(scope="module")
+def darker(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """A sensor with half the brightness, the same objects."""
+
+    class Darker(Toy):
+        def read(self, item: int) -> Any:
+            (sample,) = super().read(item)
+            assert sample.touch is not None
+            return [replace(sample, touch=sample.touch // 2)]
+
+    return build(Darker(), tmp_path_factory.mktemp("darker") / "pack", size=32, workers=1, quiet=True)
+
+
+def test_statistics_alone_change_statistics_alone(
+    ancestor: Path, pack: Pack, bare: Pack, darker: Pack, tmp_path: Path
+) -> None:
+    result = adapted(ancestor, darker, tmp_path / "out", Adaptation(steps=0, batches=4))
+    old, new = weights(ancestor), weights(tmp_path / "out")
+    changed = {name for name, value in new.items() if not torch.equal(value, old[name])}
+    assert changed == {name for name in new if "running_" in name or name.endswith("num_batches_tracked")}
+    adapted(ancestor, bare, tmp_path / "same", Adaptation(steps=0, batches=4, old=bare.path))
+    same = weights(tmp_path / "same")
+    means = [name for name in new if name.endswith("running_mean")]
+    assert all(torch.equal(new[name], same[name]) == ("vision" in name) for name in means)  # the camera is the same
+    cells = {(r["data"], r["task"], r["modality"], r["source"]) for r in result["records"]}
+    assert {d for d, *_ in cells} == {NEW, OLD, TRANSFER} and len(cells) == len(result["records"])
+    assert (NEW, "R@5", "touch -> vision", "after") in cells and (TRANSFER, "pattern", "both", "before") in cells
+    before = {
+        r["task"]: r for r in result["records"] if (r["data"], r["modality"], r["source"]) == (OLD, "both", "before")
+    }
+    for record in probe_model(load(ancestor), pack, pack.spec.tasks, ["both"], ["linear"]):
+        assert before[record["task"]]["group_correct"] == record["group_correct"]
+
+
+@pytest.fixture(scope="module")
+def bare(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """The same images without labels."""
+    return Pack(edited(pack, tmp_path_factory.mktemp("bare") / "pack", label_pattern=no_label, label_bright=no_label))
+
+
+def no_label(row: dict[str, Any]) -> int:
+    return -1
+
+
+def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tmp_path: Path) -> None:
+    asked = Adaptation(steps=4, batches=3, old=bare.path)
+    straight = adapted(ancestor, bare, tmp_path / "straight", asked)
+    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+        adapted(ancestor, bare, tmp_path / "cut", asked)
+    assert (tmp_path / "cut" / "checkpoint.pt").exists()
+    result = adapted(ancestor, bare, tmp_path / "cut", asked, resume=True)
+    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+    assert result["records"] == straight["records"]
+    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):  # among the statistics
+        adapted(ancestor, bare, tmp_path / "early", asked)
+    assert not (tmp_path / "early").exists() or not list((tmp_path / "early").iterdir())
+    old, _ = load_run(ancestor)
+    run, record = load_run(tmp_path / "straight")
+    assert run.method == old.method and run.optim.lr == pytest.approx(old.optim.lr / 10)
+    assert record["start"]["taken"] == {"vision": ["trunk", "head"], "touch": ["trunk", "head"]}
+
+
+def test_unlabelled_data_is_scored_by_retrieval(
+    ancestor: Path, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "adapt",
+        str(ancestor),
+        "--data",
+        "pack",
+        "--data.path",
+        str(bare.path),
+        "--steps",
+        "0",
+        "--batches",
+        "2",
+        "--quiet",
+    ]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    records = json.loads((tmp_path / "out" / "adapted.json").read_text())["records"]
+    assert {(r["data"], r["task"]) for r in records if r["data"] == NEW} == {(NEW, "R@5")}
+    assert {r["data"] for r in records} == {NEW, OLD}
+    said = capsys.readouterr().out
+    assert "new data: test instances" in said and "R@5, vision" in said and "pattern, both" in said
+
+
+def test_bad_input_of_adapt(ancestor: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+
+    def command(path: Path, *more: str) -> list[str]:
+        return ["adapt", str(ancestor), "--data", "pack", "--data.path", str(path), "--out", str(out), *more]
+
+    six = toy_pack(tmp_path / "six", touch_channels=6)
+    refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
+    single = toy_pack(tmp_path / "single", vision_channels=0)
+    refuse(capsys, command(single.path), "cannot embed this data's vision (0 channels)")
+    refuse(capsys, command(pack.path, "--steps", "0", "--batches", "0"), "steps 0: give at least 1")
+    refuse(capsys, command(pack.path, "--lr", "0"), "optim lr 0")
+    refuse(capsys, command(pack.path, "--old", str(tmp_path / "none")), "no pack at")
+    assert not out.exists()

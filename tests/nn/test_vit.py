@@ -1,0 +1,107 @@
+"""ViTs of any size, with a part of their patches, and the random numbers that choose it."""
+
+from __future__ import annotations
+
+import pytest
+import timm
+import torch
+from timm.models.vision_transformer import VisionTransformer
+
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk, last_map
+from mvitac.nn.positions import sin_cos_positions
+from mvitac.nn.vit import encode_visible, patches, row_uniform
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+def test_a_vit_takes_images_of_any_size(channels: int) -> None:
+    """At its own size it is timm's; at others its positions are interpolated, and the last patches padded."""
+    vit = build_trunk(EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH), channels).eval()
+    assert isinstance(vit, VisionTransformer)
+    images = torch.randn(2, channels, 72, 72)
+    for size, places in ((64, 49), (72, 49), (48, 36), (50, 49), (16, 4)):
+        assert vit(images[:, :, :size, :size]).shape == (2, 64)
+        assert last_map(vit, images[:, :, :size, :size]).shape == (2, places, 64)
+    fixed = VisionTransformer(64, 8, channels, 0, "avg", 64, 2, 2, class_token=False, fc_norm=False).eval()
+    fixed.load_state_dict(vit.state_dict())
+    torch.testing.assert_close(vit(images[:, :, :64, :64]), fixed(images[:, :, :64, :64]))
+    fixed.set_input_size((48, 48))
+    torch.testing.assert_close(vit(images[:, :, :48, :48]), fixed(images[:, :, :48, :48]))
+
+
+def test_timms_vits_take_images_of_any_size_and_keep_their_weights() -> None:
+    trunk = build_trunk(EncoderConfig(trunk="vit_tiny_patch16_224", weights=SCRATCH), 3)
+    assert trunk(torch.randn(1, 3, 48, 80)).shape == (1, 192)
+    names = timm.create_model("vit_tiny_patch16_224", num_classes=0).state_dict()
+    assert {k: v.shape for k, v in trunk.state_dict().items()} == {k: v.shape for k, v in names.items()}
+
+
+@pytest.mark.parametrize("registers", [0, 4])
+def test_visible_patches_keep_their_positions_behind_class_token_and_registers(registers: int) -> None:
+    vit = VisionTransformer(
+        32, 8, 3, 0, embed_dim=64, depth=2, num_heads=2, reg_tokens=registers, dynamic_img_size=True
+    )
+    vit.eval()
+    images, order = torch.randn(2, 3, 32, 32), torch.stack([torch.randperm(16) for _ in range(2)])
+    whole, seen = vit.forward_features(images), encode_visible(vit, images, order).values
+    front = 1 + registers
+    assert seen.shape == (2, front + 16, 64)
+    for i in range(2):
+        torch.testing.assert_close(seen[i, :front], whole[i, :front], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(seen[i, front:], whole[i, front:][order[i]], rtol=1e-4, atol=1e-5)
+
+
+def test_absent_patches_are_not_attended_to() -> None:
+    vit = build_trunk(EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH), 3).eval()
+    assert isinstance(vit, VisionTransformer)
+    images, at = torch.randn(2, 3, 32, 32), torch.arange(6).expand(2, -1)
+    live = torch.tensor([[True] * 6, [True] * 4 + [False] * 2])
+    seen = encode_visible(vit, images, at, live).values
+    torch.testing.assert_close(seen[1, :4], encode_visible(vit, images, at[:, :4]).values[1])
+    vit.set_grad_checkpointing(True)
+    torch.testing.assert_close(encode_visible(vit, images, at, live).values, seen)
+
+
+def test_patches_are_those_that_the_vit_embeds() -> None:
+    """Pixels of each patch times the kernel = its embedding, also where the image is padded."""
+    vit = build_trunk(EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH), 3)
+    assert isinstance(vit, VisionTransformer)
+    images, kernel = torch.randn(2, 3, 20, 12), vit.patch_embed.proj
+    found = patches(vit, images)
+    assert found.shape == (2, 6, 192)
+    embedded = found @ kernel.weight.flatten(1).mT + kernel.bias  # type: ignore[operator]
+    torch.testing.assert_close(embedded, vit.patch_embed(images).flatten(1, 2), rtol=1e-4, atol=1e-5)
+
+
+def slow(seed: int, stream: int, row: int, i: int) -> float:
+    """SplitMix64 in Python's integers."""
+    golden, mask = 0x9E3779B97F4A7C15, (1 << 64) - 1
+
+    def mixed(x: int) -> int:
+        x = (x + golden) & mask
+        x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & mask
+        x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & mask
+        return x ^ (x >> 31)
+
+    key = mixed(mixed(mixed(seed) + stream) + row)
+    return (mixed(key + i * golden) >> 40 & 0xFFFFFF) / (1 << 24)
+
+
+def test_numbers_of_rows_are_uniform_and_a_function_of_seed_stream_and_row() -> None:
+    rows = torch.arange(200)
+    u = row_uniform(torch.tensor(5), rows, 500, 0)
+    assert u.shape == (200, 500) and float(u.min()) >= 0 and float(u.max()) < 1
+    counts = torch.histc(u, 10, 0, 1)
+    assert float(((counts - 10000) ** 2 / 10000).sum()) < 30  # chi-squared with 9 degrees of freedom: p .0004
+    for a, b in ((u[:, :-1], u[:, 1:]), (u[:-1], u[1:]), (u, row_uniform(torch.tensor(6), rows, 500, 0))):
+        assert abs(float(torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1])) < 0.015
+    assert torch.equal(row_uniform(torch.tensor(5), rows[7:9], 500, 0), u[7:9])
+    assert not torch.equal(row_uniform(torch.tensor(5), rows, 500, 1), u)
+    assert row_uniform(torch.tensor(2**62), rows[3:4], 2, 1).tolist()[0] == [slow(2**62, 1, 3, i) for i in (0, 1)]
+
+
+def test_positions_are_sines_and_cosines_of_row_and_column() -> None:
+    found = sin_cos_positions(2, 3, 8)
+    row, column = torch.tensor(1.0), torch.tensor(2.0)
+    rates = torch.tensor([1.0, 0.01])
+    expected = torch.cat([(row * rates).sin(), (row * rates).cos(), (column * rates).sin(), (column * rates).cos()])
+    torch.testing.assert_close(found[5], expected)

@@ -1,0 +1,270 @@
+"""Training on several packs: what is drawn, that a stop changes nothing, and losses of rows that lack a modality."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvitac.cli.main import main
+from mvitac.data.mixed_pack import MixedPack
+from mvitac.data.pack import Pack
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.methods.base import MethodConfig, Views
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.methods.supervised import SupervisedConfig
+from mvitac.nn.losses import info_nce
+from mvitac.recipes import with_method
+from mvitac.registry import default
+from mvitac.system.distributed import World
+from mvitac.training.loader import Feed
+from mvitac.training.loop import train
+from mvitac.training.sampler import Batches, batches
+from mvitac.training.views import make_views
+from support.mixes import Gel, Slice, built, mix_run
+from support.small_methods import build, small
+from support.training_runs import assert_equal_weights, power_cut, smoke
+
+MISSING = sorted(name for name, config in MethodConfig.choices.items() if config.takes_missing)
+PAIRED = ("cmc", "mct", "ssvtp")
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The stripes in two packs, and 60 rows of another gel without a camera."""
+    folder = tmp_path_factory.mktemp("parts")
+    built(Slice(num=72), folder / "a")
+    built(Slice(num=48, first=72), folder / "b")
+    built(Gel(num=60), folder / "gel", size=24)
+    return {name: f"{name}={folder / name}" for name in ("a", "b", "gel")}
+
+
+def drawn(run: Any, epochs: int = 1) -> tuple[Any, np.ndarray]:
+    """The pack of a run, and the part of each row [steps, batch_size] of its first epochs."""
+    pack = run.data.open()
+    rows = run.method.training_rows(pack)
+    found = np.stack(list(batches(run, pack, rows, 0, epochs * run.steps_per_epoch(len(rows)))))
+    assert np.isin(found, rows).all()
+    return pack, found
+
+
+def test_a_plain_mix_trains_as_one_pack_of_the_same_rows(pack: Pack, parts: dict[str, str], tmp_path: Path) -> None:
+    whole = train(smoke(pack, steps=4), tmp_path / "whole", quiet=True)
+    run = mix_run(parts["a"], parts["b"], steps=4)
+    assert_equal_weights(whole, train(run, tmp_path / "mix", quiet=True))
+
+
+def test_weights_decide_what_is_drawn(parts: dict[str, str]) -> None:
+    run = mix_run(f"{parts['a']}:1", f"{parts['b']}:3", batch_size=8)
+    pack, found = drawn(run, epochs=40)
+    assert pack.shares(pack.rows("train")).tolist() == [0.25, 0.75]
+    assert np.mean(pack.part_of[found] == 1) == pytest.approx(0.75, abs=0.03)
+    rows = pack.rows("train")
+    for part in (0, 1):  # every row of a part equally often, give or take the pass that goes on
+        times = np.bincount(found.ravel(), minlength=pack.num)[rows[pack.part_of[rows] == part]]
+        assert times.max() - times.min() <= 1
+    assert np.mean([len(set(batch)) for batch in found.tolist()]) > 7.5  # a row is hardly its own negative
+
+
+def test_temperature(parts: dict[str, str]) -> None:
+    pack = mix_run(parts["a"], parts["b"], data={"temperature": 0.5}).data.open()
+    assert isinstance(pack, MixedPack)
+    sizes = np.bincount(pack.part_of[pack.rows("train")])
+    assert sizes[0] != sizes[1]
+    np.testing.assert_allclose(pack.shares(pack.rows("train")), np.sqrt(sizes) / np.sqrt(sizes).sum())
+    even = mix_run(parts["a"], parts["b"], data={"temperature": 0.0}).data.open()
+    assert isinstance(even, MixedPack) and even.shares(even.rows("train")).tolist() == [0.5, 0.5]
+
+
+@pytest.mark.parametrize("sampler", ["shuffle", "one-per-touch", "spread"])
+def test_batches_of_one_part(parts: dict[str, str], sampler: Any) -> None:
+    run = mix_run(f"{parts['a']}:1", f"{parts['gel']}:1", batch_size=6, sampler=sampler, data={"batches": "one-part"})
+    pack, found = drawn(run, epochs=20)
+    kinds = pack.part_of[found]
+    assert (kinds == kinds[:, :1]).all() and 0.35 < kinds[:, 0].mean() < 0.65
+    if sampler != "shuffle":
+        assert np.mean([len(set(pack.touch_groups[batch])) for batch in found]) > 5.5
+
+
+def test_processes_share_the_batch_of_one(parts: dict[str, str]) -> None:
+    run = mix_run(f"{parts['a']}:1", f"{parts['b']}:3", batch_size=8)
+    pack, found = drawn(run)
+    order = [Batches(run, pack, run.method.training_rows(pack), World(rank, 2)) for rank in (0, 1)]
+    for step, batch in enumerate(found):
+        np.testing.assert_array_equal(np.concatenate([own.own(step) for own in order]), batch)
+
+
+def test_the_order_is_a_function_of_seed_and_step(parts: dict[str, str]) -> None:
+    run = mix_run(f"{parts['a']}:1", f"{parts['b']}:3", batch_size=8)
+    pack, found = drawn(run, epochs=3)
+    rows = run.method.training_rows(pack)
+    later = list(batches(run, pack, rows, 11, len(found)))
+    np.testing.assert_array_equal(later, found[11:])
+    assert not np.array_equal(drawn(replace(run, seed=1))[1], drawn(run)[1])
+
+
+@pytest.mark.parametrize("kind", ["mixed", "one-part"])
+def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Path, kind: Any) -> None:
+    """With a part that lacks the camera; across a change of epoch; scores of every part are logged."""
+    given = (f"{parts['a']}:1", f"{parts['gel']}:2")
+    run = mix_run(*given, data={"batches": kind}, steps=8, checkpoint_every=2, log_every=1)
+    straight = train(run, tmp_path / "straight", quiet=True)
+    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "cut", quiet=True)
+    train(run, tmp_path / "cut", resume=True, quiet=True)
+    assert_equal_weights(straight, tmp_path / "cut")
+    lines = [json.loads(line) for line in (straight / "log.jsonl").read_text().splitlines()]
+    values = next(line["eval"] for line in reversed(lines) if "eval" in line)
+    assert {
+        "a vision/knn pattern",
+        "a touch/knn a/bright",
+        "a vision->touch R@5",
+        "gel touch/knn pattern",
+    } <= values.keys()
+    assert not any(name.startswith("gel") and "vision" in name for name in values)
+    seen = {frozenset(line) & {"vv", "tt", "vt", "tv"} for line in lines if "loss" in line}
+    assert seen == ({frozenset(("vv", "tt", "vt", "tv")), frozenset(("tt",))} if kind == "one-part" else seen)
+    other = mix_run(f"{parts['a']}:1", f"{parts['gel']}:3", data={"batches": kind}, steps=8)
+    with pytest.raises(ValueError, match="holds a different run"):
+        train(other, tmp_path / "cut", resume=True, quiet=True)
+
+
+def views_of(run: Any, pack: Pack, rows: np.ndarray, num_views: int = 2) -> Views:
+    cpu = torch.device("cpu")
+    return make_views(run, pack, rows, num_views, torch.Generator().manual_seed(0), cpu, Feed(pack, cpu))
+
+
+def test_views_are_of_the_rows_that_have_the_modality(parts: dict[str, str]) -> None:
+    run = mix_run(parts["a"], parts["gel"], positives="same-touch")
+    pack = run.data.open()
+    rows = np.array([*pack.rows("train")[[2, 0]], *pack.rows("train")[-3:], pack.rows("train")[4]])
+    made = views_of(run, pack, rows)
+    assert {m: [len(view) for view in found] for m, found in made.images.items()} == {"vision": [3, 3], "touch": [6, 6]}
+    assert {m: found.tolist() for m, found in made.both.items()} == {"vision": [0, 1, 2], "touch": [0, 1, 5]}
+    few = views_of(run, pack, rows[:5][[0, 2, 3, 4]])  # a single camera image has no negative
+    assert few.images.keys() == {"touch"} and not few.both
+    whole = views_of(run, pack, rows[:2])
+    assert whole.images.keys() == {"vision", "touch"} and not whole.both
+
+
+def ragged(method: Any, vision: int = 5, touch: int = 8) -> Views:
+    """``touch`` rows, of which ``vision`` have a camera image, and one row with the camera alone."""
+    generator = torch.Generator().manual_seed(3)
+    num = {"vision": vision + 1, "touch": touch}
+    images = {m: [torch.randn(n, 3, 32, 32, generator=generator) for _ in range(method.views)] for m, n in num.items()}
+    both = {"vision": torch.arange(vision), "touch": torch.arange(touch - vision, touch)}
+    return Views(images=images, labels={}, rows=torch.arange(3, touch + 4), both=both)
+
+
+@pytest.mark.parametrize("name", MISSING)
+def test_a_loss_is_of_the_rows_that_have_its_modality(name: str) -> None:
+    """Each intra-modal loss equals that of a batch of these rows alone, and so do the methods' updates."""
+    method = build(name)
+    batch = ragged(method)
+    losses = method(batch)
+    assert losses["loss"].isfinite()
+    losses["loss"].backward()
+    method.after_step(0.5)
+    own = {"vision": "vv", "touch": "tt"} if name == "mvitac" else {"vision": "vision", "touch": "touch"}
+    for modality, loss in own.items():
+        other = build(name)
+        alone = other(Views(images={modality: batch.images[modality]}, labels={}, rows=batch.rows))
+        assert alone.keys() == {"loss", loss}
+        torch.testing.assert_close(alone[loss], losses[loss])
+        other.after_step(0.5)
+        state = method.state_dict()
+        for key, value in other.state_dict().items():
+            if f".{modality}." in f".{key}.":
+                torch.testing.assert_close(value, state[key], msg=key)
+
+
+def test_inter_modal_losses_are_of_whole_pairs() -> None:
+    for changes in ({}, {"keys": "end-to-end", "pairs": "all"}):
+        method: Any = build("mvitac", config=replace(small("mvitac"), **changes))
+        batch = ragged(method)
+        losses = method(batch)
+        z = method.queries(batch) | method.keys(batch)
+        keys = "q" if changes else "k"
+        at = batch.both
+        for part, (x, y) in {"vt": ("vision", "touch"), "tv": ("touch", "vision")}.items():
+            expected = torch.stack(
+                [
+                    info_nce(z["q", x, i, "inter"][at[x]], z[keys, y, j, "inter"][at[y]], 0.07)
+                    for i, j in method.view_pairs("inter")
+                ]
+            ).mean()
+            torch.testing.assert_close(losses[part], expected)
+    few = ragged(method, vision=1)
+    assert method(few).keys() == {"loss", "vv", "tt"}  # a single pair has no negative
+
+
+@pytest.mark.parametrize("name", [*PAIRED, "supervised"])
+def test_a_method_that_needs_whole_pairs_names_the_rows(parts: dict[str, str], name: str, tmp_path: Path) -> None:
+    run = with_method(mix_run(parts["a"], parts["gel"]), name)
+    message = rf"method '{name}' needs vision and touch of every row, but \d+ rows of part gel have no vision: leave"
+    with pytest.raises(ValueError, match=message):
+        train(run, tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+    whole = with_method(mix_run(parts["a"], parts["b"], steps=1, eval_every=0), name)
+    train(whole, tmp_path / "whole", quiet=True)
+
+
+def test_supervised_on_touch_takes_parts_without_a_camera(parts: dict[str, str]) -> None:
+    config = SupervisedConfig(modalities=("touch",), tasks=("pattern",))
+    pack = mix_run(parts["a"], parts["gel"]).data.open()
+    assert np.array_equal(config.training_rows(pack), pack.rows("train", "val"))
+
+
+def test_rows_without_a_loss_are_not_drawn(parts: dict[str, str], tmp_path: Path) -> None:
+    run = mix_run(parts["a"], parts["gel"])
+    pack = run.data.open()
+    assert isinstance(pack, MixedPack)
+    cases: Any = ((("vv",), 1), (("tt",), 2), (("vt", "tv"), 1), (("vv", "tt"), 2))
+    for losses, num in cases:
+        rows = MViTacConfig(losses=losses).training_rows(pack)
+        assert set(pack.part_of[rows]) == set(range(num))
+    with pytest.raises(
+        ValueError, match="method 'mvitac' with its settings learns from no row of part gel: leave it out"
+    ):
+        train(replace(run, method=MViTacConfig(losses=("vv",))), tmp_path / "run", quiet=True)
+
+
+def test_what_a_mix_cannot_do_is_refused(parts: dict[str, str], tmp_path: Path) -> None:
+    ragged = (parts["a"], parts["gel"])
+    many = r"part b has 24 rows to train on, but 32 of a batch of 36 are to be of it"
+    cases: list[tuple[Any, str]] = [
+        (mix_run(*ragged, batch_size=8, chunk=4), "in mixed batches, support neither several processes nor --chunk"),
+        (mix_run(*ragged, batch_size=2), "batch_size 2: parts that lack a modality need at least 3"),
+        (mix_run(f"{parts['a']}:1", f"{parts['b']}:8", batch_size=36), many),
+    ]
+    for run, message in cases:
+        with pytest.raises(ValueError, match=message):
+            train(run, tmp_path / "run", quiet=True)
+    train(mix_run(*ragged, batch_size=8, chunk=4, steps=1, data={"batches": "one-part"}), tmp_path / "run", quiet=True)
+
+
+def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path) -> None:
+    """A task of one part is of its rows alone, a common one of all rows with the modality; a control where it is known."""
+    run = mix_run(parts["a"], parts["gel"], steps=1, eval_every=0)
+    out = train(run, tmp_path / "run", quiet=True)
+    result = probe_runs([out], ProbeConfig())
+    pack = run.data.open()
+    records = [r for r in result["records"] if r["source"] == "mvitac"]
+    own = {r["task"]: r["num_test"] for r in records if r["modality"] == "touch"}
+    num = [len(part.rows("test")) for part in pack.parts.values()]
+    assert own == {"pattern": sum(num), "a/bright": num[0], "gel/bright": num[1]}
+    assert {r["task"] for r in result["records"] if r["source"] == "noise only"} == {"a/bright"}
+    assert {r["modality"] for r in records if r["task"] == "gel/bright"} == {"touch"}
+    assert {(r["modality"], r["num_test"]) for r in records if r["task"] == "pattern"} >= {("both", num[0])}
+    assert not result["leaks"]
+    assert main(["report", str(out), "--out", str(tmp_path / "report.html")]) == 0
+
+
+def test_every_method_says_what_it_takes() -> None:
+    assert set(MISSING) | set(PAIRED) | {"supervised", "calandra"} <= set(MethodConfig.choices)
+    assert not any(default(MethodConfig, name).takes_missing for name in PAIRED)

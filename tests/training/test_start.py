@@ -1,0 +1,273 @@
+"""Start weights from another model: what is taken, what is recorded, and what the new run inherits of leaks."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+
+import mvitac
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.datasets.pack import PackConfig
+from mvitac.deploy.publish import publish
+from mvitac.evaluation.leaks import read_sources
+from mvitac.experiments.plan import Plan, Row
+from mvitac.methods.byol import BYOLConfig
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.model import fresh, load
+from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
+from mvitac.nn.initial import Init, adapt_stem, load_trunk
+from mvitac.nn.momentum import Momentum
+from mvitac.run import Run, load_run
+from mvitac.training.loop import train
+from mvitac.training.start import load_start, read_start
+from support.toy import Toy, toy_pack
+from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+
+TINY = EncoderConfig(trunk="mvitac_tiny", weights="scratch")
+
+
+def started(pack: Pack, init: Init, **changes: object) -> tuple[Run, torch.nn.Module, dict[str, list[str]]]:
+    """A method before its first step, which starts from ``init``, and what it took."""
+    run = smoke(pack, seed=5, init=init.resolved(), **changes)
+    start = read_start(run.init, pack)
+    torch.manual_seed(run.seed)
+    method = run.method.build(pack.spec, run.encoder)
+    assert start
+    return run, method, load_start(start, method)["taken"]
+
+
+def assert_equal_states(a: torch.nn.Module, b: torch.nn.Module) -> None:
+    first, second = a.state_dict(), b.state_dict()
+    assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+def differ(a: torch.nn.Module, b: torch.nn.Module) -> bool:
+    return not all(torch.equal(p, q) for p, q in zip(a.parameters(), b.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("keys", ["momentum", "end-to-end"])
+def test_takes_trunks_and_heads_and_copies_them_to_the_keys(pack: Pack, smoke_run: Path, keys: str) -> None:
+    config = MViTacConfig(hidden=32, out=16, keys=keys)  # type: ignore[arg-type]
+    _, method, taken = started(pack, Init(path=smoke_run), method=config)
+    assert taken == {"vision": ["trunk", "head"], "touch": ["trunk", "head"]}
+    source = load(smoke_run)
+    for m in ("vision", "touch"):
+        assert_equal_states(method.encoders()[m], source.encoders[m])  # type: ignore[operator]
+        assert_equal_states(method.projectors()[m], source.projectors[m])  # type: ignore[operator]
+        assert differ(method.query[m].intra, fresh(smoke(pack), pack.spec, 32).projectors[m])  # type: ignore[index]
+        for key in (module for module in method.key.values() if isinstance(module, Momentum)):  # type: ignore[operator]
+            assert_equal_states(key.module, key._query[0])
+    assert len(method.key) == (2 if keys == "momentum" else 0)  # type: ignore[arg-type]
+
+
+def test_takes_what_fits_and_what_was_asked_for(pack: Pack, smoke_run: Path) -> None:
+    source = load(smoke_run)
+    run, method, taken = started(pack, Init(path=smoke_run, modalities=("touch",), heads=False))
+    assert taken == {"touch": ["trunk"]}
+    start = fresh(run, pack.spec, 32)
+    assert_equal_states(method.encoders()["touch"], source.encoders["touch"])  # type: ignore[operator]
+    assert_equal_states(method.encoders()["vision"], start.encoders["vision"])  # type: ignore[operator]
+    assert_equal_states(method.projectors()["touch"], start.projectors["touch"])  # type: ignore[operator]
+    # Heads of another width are not taken; another method's trunks are, and so are its momentum copies.
+    _, _, taken = started(pack, Init(path=smoke_run), method=MViTacConfig(hidden=40, out=16))
+    assert taken == {"vision": ["trunk"], "touch": ["trunk"]}
+    _, method, _ = started(pack, Init(path=smoke_run), method=BYOLConfig(out=8, hidden=8))
+    assert_equal_states(method.target["touch"].module.trunk, source.encoders["touch"])  # type: ignore[index]
+
+
+def test_a_bare_file_and_one_modality(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
+    """A trunk's state dict goes to every encoder, one with names of encoders to its own; a timm classifier is left out."""
+    trunk = build_trunk(TINY, 3)
+    state = {**trunk.state_dict(), "vision.weight": torch.zeros(2)}
+    bare, named = tmp_path / "bare.safetensors", tmp_path / "named.safetensors"
+    safetensors.torch.save_file(trunk.state_dict(), bare)
+    _, method, taken = started(pack, Init(path=bare))
+    assert taken == {"vision": ["trunk"], "touch": ["trunk"]}
+    for encoder in method.encoders().values():  # type: ignore[operator]
+        assert_equal_states(encoder, trunk)
+    safetensors.torch.save_file({f"encoders.touch.{k}": v for k, v in trunk.state_dict().items()}, named)
+    assert started(pack, Init(path=named))[2] == {"touch": ["trunk"]}
+    safetensors.torch.save_file(state, bare)
+    with pytest.raises(ValueError, match=r"'vision\.weight' has no place in this trunk"):
+        started(pack, Init(path=bare))
+
+
+@pytest.mark.parametrize(("channels", "wanted"), [(3, 6), (6, 3), (6, 9), (3, 3)])
+def test_stem_is_adapted_to_the_channels(channels: int, wanted: int) -> None:
+    """The same picture in all places gives the same features, whatever their number."""
+    torch.manual_seed(0)
+    before, after = build_trunk(TINY, channels).eval(), build_trunk(TINY, wanted).eval()
+    load_trunk(after, before.state_dict())
+    picture = torch.randn(2, 3, 32, 32)
+    expected = before(picture.repeat(1, channels // 3, 1, 1))
+    assert torch.allclose(after(picture.repeat(1, wanted // 3, 1, 1)), expected, atol=1e-5)
+    weight = torch.arange(12.0).view(1, 3, 2, 2)
+    assert torch.equal(adapt_stem(weight, 6), torch.cat([weight, weight], 1) / 2)  # as timm does
+
+
+def test_trunks_of_windows_and_of_single_images_take_each_other() -> None:
+    torch.manual_seed(0)
+    single = build_trunk(TINY, 3)
+    frames = build_trunk(replace(TINY, temporal="attention"), 9, 3)
+    assert isinstance(frames, PerFrame)
+    load_trunk(frames, single.state_dict())
+    assert_equal_states(frames.trunk, single)
+    frames.age.data += 1
+    other = build_trunk(replace(TINY, temporal="attention"), 9, 3)
+    load_trunk(other, frames.state_dict())
+    assert_equal_states(other, frames)
+    again = build_trunk(TINY, 3)
+    load_trunk(again, frames.state_dict())
+    assert_equal_states(again, single)
+
+
+def test_digest_is_that_of_the_content(pack: Pack, smoke_run: Path, artifact: Path, tmp_path: Path) -> None:
+    copied = shutil.copy(smoke_run / "model.safetensors", tmp_path / "copy.safetensors")
+    without = smoke(pack)
+    digests = {smoke(pack, init=Init(path=Path(p))).digest() for p in (smoke_run, artifact, copied)}
+    assert len(digests) == 1 and without.digest() not in digests
+    assert smoke(pack, init=Init(path=smoke_run, heads=False)).digest() not in digests
+    state = weights(smoke_run)
+    state["encoders.touch.conv1.0.weight"][0, 0, 0, 0] += 1e-6
+    safetensors.torch.save_file(state, tmp_path / "copy.safetensors")
+    assert smoke(pack, init=Init(path=Path(copied))).digest() not in digests
+    record = json.loads((smoke_run / "run.json").read_text())["run"]
+    assert record.pop("init")["path"] is None
+    assert Run.load(record).digest() == load_run(smoke_run)[0].digest()  # runs from before the field
+
+
+def test_killed_and_resumed_equals_straight(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
+    run = smoke(pack, init=Init(path=smoke_run), checkpoint_every=1, seed=3, steps=4, eval_every=0)
+    train(run, tmp_path / "straight", quiet=True)
+    for name, cut in (("early", 1), ("late", 3)):
+        with power_cut(cut), pytest.raises(RuntimeError, match="power cut"):
+            train(run, tmp_path / name, quiet=True)
+        train(run, tmp_path / name, resume=True, quiet=True)
+        assert_equal_weights(tmp_path / "straight", tmp_path / name)
+    train(replace(run, init=Init()), tmp_path / "scratch", quiet=True)
+    assert not torch.equal(*(weights(tmp_path / n)["encoders.touch.conv1.0.weight"] for n in ("straight", "scratch")))
+
+
+def test_other_weights_are_refused_at_resume(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
+    source = shutil.copytree(smoke_run, tmp_path / "source")
+    run = smoke(pack, init=Init(path=source), steps=1, eval_every=0)
+    out = train(run, tmp_path / "r", quiet=True)
+    shutil.copy(
+        train(smoke(pack, seed=9, steps=1, eval_every=0), tmp_path / "x", quiet=True) / "model.safetensors", source
+    )
+    with pytest.raises(ValueError, match="holds a different run"):
+        train(run, out, resume=True, quiet=True)
+    with pytest.raises(ValueError, match=r"source now holds other weights than this run was recorded with"):
+        train(load_run(out)[0], tmp_path / "again", quiet=True)
+
+
+@dataclass
+class Turned(Toy):
+    """The same samples with train and test the other way round."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        turned = {"train": "test", "test": "train"}
+        return [replace(sample, columns={**sample.columns, "split": turned.get(s := sample.columns["split"], s)})]
+
+
+@pytest.fixture(scope="module")
+def chain(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """b learned from the rows that the striped pairs test; c started from b, and d from the artifact of c."""
+    folder = tmp_path_factory.mktemp("chain")
+    turned = build(Turned(), folder / "turned", size=32, quiet=True)
+    run = smoke(pack, steps=1, eval_every=0)
+    runs = {"b": train(replace(run, data=PackConfig(path=turned.path)), folder / "b", quiet=True)}
+    runs["c"] = train(replace(run, init=Init(path=runs["b"])), folder / "c", quiet=True)
+    runs["art"] = publish(runs["c"], folder / "art", allow_leak=True)
+    runs["d"] = mvitac.train(replace(run, init=mvitac.Init(path=runs["art"])), folder / "d", quiet=True)
+    return runs
+
+
+def test_leaks_through_ancestors_are_refused_and_marked(
+    pack: Pack, chain: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("c", "d"):
+        found = read_sources(chain[name], *load_run(chain[name])[:1], None, pack)
+        assert found and [len(source.ids) for source in found] == [len(pack.rows("train")), len(pack.rows("test"))]
+        asked = ["probe", str(chain[name]), "--tasks", "pattern", "--modalities", "touch", "--no-controls"]
+        if name == "c":
+            assert main(asked) == 2
+            error = capsys.readouterr().err
+            assert "24 of 24 test rows" in error and "--allow-leak" in error and error.count("\n") == 1
+        else:
+            assert main([*asked, "--allow-leak"]) == 0
+            assert " LEAK" in capsys.readouterr().out
+    card = " ".join((chain["art"] / "README.md").read_text().split())
+    assert "Started from the weights of b " in card and " LEAK" in card
+
+
+def test_pretrain_warns_of_seen_test_rows(
+    pack: Pack, chain: dict[str, Path], smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = smoke(pack, steps=1, eval_every=0)
+    for name, init in (("seen", chain["d"]), ("clean", smoke_run), ("copy", tmp_path / "copy.safetensors")):
+        shutil.copy(smoke_run / "model.safetensors", tmp_path / "copy.safetensors")
+        train(replace(run, init=Init(path=init)), tmp_path / name, quiet=True)
+        said = capsys.readouterr().err
+        if name == "clean":
+            assert said == ""
+        else:
+            expected = {
+                "seen": "has seen what this data tests: 24 of 24",
+                "copy": "leaks of test rows cannot be excluded",
+            }
+            assert said.startswith("mvitac: warning: ") and expected[name] in said and said.count("\n") == 1
+    # A copied file, of which nothing is known
+    assert main(["probe", str(tmp_path / "copy"), "--tasks", "pattern", "--no-controls"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert " LEAK?" in shown and "start weights were trained on is unknown" in shown, shown
+    start = load_run(tmp_path / "seen")[1]["start"]
+    assert start["taken"] == {"vision": ["trunk", "head"], "touch": ["trunk", "head"]}
+    assert start["trained_on"] == ["toy"] and len(start["digest"]) == 64
+
+
+def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.safetensors").write_text("no tensors")
+    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
+        train(smoke(pack, checkpoint_every=1, eval_every=0), tmp_path / "unfinished", quiet=True)
+    touch = toy_pack(tmp_path / "touch", vision_channels=0)
+    only_touch = train(smoke(touch, steps=1, eval_every=0), tmp_path / "only touch", quiet=True)
+    capsys.readouterr()
+    data = ["pretrain", "--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path), "--steps", "1", "--quiet"]
+    cases = [
+        (["--init", str(tmp_path / "none")], "none does not exist: give the folder of a run"),
+        (["--init", str(tmp_path / "empty")], "is a folder without model.safetensors: give that of a finished run"),
+        (["--init", str(tmp_path / "unfinished")], "its run is not finished, continue it with --resume"),
+        (["--init", str(tmp_path / "text.safetensors")], "cannot be read as safetensors"),
+        (
+            [f"--init={smoke_run}", "--encoder.trunk", "resnet10t"],
+            "does not fit this run (vision: its trunk is mvitac_tiny",
+        ),
+        (["--init", str(only_touch), "--init.modalities", "vision"], "(vision: it has touch only)"),
+        (["--init.modalities", "vision"], "name them, --init RUN"),
+    ]
+    for words, expected in cases:
+        assert main([*data, *words, "--out", str(tmp_path / "out")]) == 2, words
+        error = capsys.readouterr().err
+        assert expected in error and error.count("\n") == 1, error
+        assert not (tmp_path / "out" / "run.json").exists()
+    # One that fits in part is taken in part.
+    assert main([*data, "--init", str(only_touch), "--eval-every", "0", "--out", str(tmp_path / "out")]) == 0
+    assert load_run(tmp_path / "out")[1]["start"]["taken"] == {"touch": ["trunk", "head"]}
+
+
+def test_a_plan_has_rows_with_start_weights(pack: Pack, smoke_run: Path) -> None:
+    row = Row(label="MViTac", set={"init": str(smoke_run), "init.heads": False})
+    run = Plan(name="p", rows=(row,), recipe="smoke").run(row, PackConfig(path=pack.path), seed=2)
+    assert run == replace(smoke(pack, seed=2), init=Init(path=smoke_run, heads=False))

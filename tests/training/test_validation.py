@@ -1,0 +1,168 @@
+"""Validation while training: the start is the line to beat, the best weights are kept, one sentence says how it ended."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from scipy.stats import ttest_rel
+
+import mvitac
+from mvitac.cli.main import main
+from mvitac.data.pack import Pack
+from mvitac.evaluation.evaluate import stored_result
+from mvitac.model import Model, fresh
+from mvitac.registry import from_json
+from mvitac.report.report import write_report
+from mvitac.run import Optim
+from mvitac.system.files import read_json
+from mvitac.training import validation
+from mvitac.training.checkpoint import CHECKPOINT, seal
+from mvitac.training.loop import train
+from mvitac.training.validation import Cells, evaluate, validate, verdict
+from support.training_runs import power_cut, smoke
+
+LINEAR = tuple(f"{m}/linear {task}" for m in ("vision", "touch", "both") for task in ("pattern", "bright"))
+
+
+def log_of(run: Path) -> list[dict]:
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+def mean_of(entry: dict) -> float:
+    return float(np.mean([entry["eval"][name] for name in LINEAR]))
+
+
+@pytest.fixture(scope="module")
+def run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Learns fast enough to get better or worse at every evaluation."""
+    changes = {"steps": 8, "eval_every": 2, "checkpoint_every": 2, "optim": Optim(name="adamw", lr=0.01)}
+    return train(smoke(pack, **changes), tmp_path_factory.mktemp("validation") / "run", quiet=True)
+
+
+def test_the_start_is_evaluated_first(pack: Pack, run: Path) -> None:
+    settings = mvitac.load(run).run
+    evaluations = [entry for entry in log_of(run) if "eval" in entry]
+    assert [entry["step"] for entry in evaluations] == [0, 2, 4, 6, 8]
+    assert evaluations[0]["eval"] == evaluate(fresh(settings, pack.spec, pack.size), pack, settings)
+    assert set(LINEAR) < evaluations[0]["eval"].keys()
+    assert [entry for entry in log_of(run) if "verdict" in entry] == evaluations[-1:]
+
+
+def test_the_best_weights_are_those_with_the_highest_mean(pack: Pack, run: Path) -> None:
+    evaluations = [entry for entry in log_of(run) if "eval" in entry]
+    means = [mean_of(entry) for entry in evaluations]
+    best = evaluations[int(np.argmax(means))]  # the first of equal ones
+    model = mvitac.load(run, which="best")
+    assert evaluate(model, pack, model.run) == pytest.approx(best["eval"], rel=1e-6)
+    said = evaluations[-1]["verdict"]
+    assert f"best at step {best['step']} ({100 * (max(means) - means[0]):+.1f}, model.best.safetensors)" in said
+    assert f"{100 * (means[-1] - means[0]):+.1f} points" in said
+
+
+def test_the_first_of_equally_good_weights_is_kept(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores as given, weights as they were at each evaluation: step 4 is as good as step 6, and better than the last."""
+    wrong, seen = iter([5, 6, 3, 3, 4]), []
+
+    def scored(model: Model, *_: object) -> tuple[dict[str, float], Cells]:
+        seen.append({name: value.clone() for name, value in model.state_dict().items()})
+        return {}, {"touch/linear a": cell([next(wrong)] * 3)}
+
+    monkeypatch.setattr(validation, "validate", scored)
+    out = train(smoke(pack, eval_every=2), tmp_path / "r", quiet=True)
+    kept = safetensors.torch.load_file(out / "model.best.safetensors")
+    assert all(torch.equal(kept[name], value) for name, value in seen[2].items())
+    assert not all(torch.equal(kept[name], value) for name, value in seen[3].items())
+    assert log_of(out)[-1]["verdict"].endswith("best at step 4 (+20.0, model.best.safetensors)")
+    assert "better: +10.0 points [+10.0, +10.0]" in log_of(out)[-1]["verdict"]
+
+
+def test_killed_and_resumed_keeps_the_same_best_weights_and_sentence(pack: Pack, run: Path, tmp_path: Path) -> None:
+    """Killed before the first checkpoint, and between two; the start is not evaluated again."""
+    again, settings = tmp_path / "r", mvitac.load(run).run
+    for cut in (1, 5):
+        with power_cut(cut), pytest.raises(RuntimeError, match="power cut"):
+            train(settings, again, resume=True, quiet=True)
+    train(settings, again, resume=True, quiet=True)
+    for which in ("last", "best"):
+        assert mvitac.load(again, which).weights_digest() == mvitac.load(run, which).weights_digest()  # type: ignore
+    first, second = ([e for e in log_of(path) if "eval" in e] for path in (run, again))
+    assert first == second
+
+
+def test_a_checkpoint_from_before_goes_on_without_a_start(pack: Pack, tmp_path: Path) -> None:
+    run = smoke(pack, checkpoint_every=2)
+    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "r", quiet=True)
+    state = torch.load(tmp_path / "r" / CHECKPOINT, weights_only=True)
+    assert state.pop("kept")["start"].keys() == set(LINEAR)
+    torch.save(state, buffer := io.BytesIO())
+    seal(buffer)
+    (tmp_path / "r" / CHECKPOINT).write_bytes(buffer.getbuffer())
+    lines = [entry for entry in log_of(tmp_path / "r") if entry["step"] != 0]
+    (tmp_path / "r" / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    train(run, tmp_path / "r", resume=True, quiet=True)
+    assert not any("verdict" in entry for entry in log_of(tmp_path / "r"))
+
+
+def cell(wrong: list[int], rows: int = 10) -> torch.Tensor:
+    return torch.tensor([[[w, rows] for w in wrong]], dtype=torch.float64)
+
+
+def test_better_level_or_worse_is_a_paired_t_interval_over_groups() -> None:
+    """Groups of equal size, one task: the jackknife is the paired t interval."""
+    start: Cells = {"touch/linear a": cell([5, 6, 7, 4, 5, 6])}
+    for wrong, word in (
+        ([2, 3, 3, 1, 2, 4], "better"),
+        ([5, 6, 6, 4, 6, 6], "level"),
+        ([8, 9, 9, 8, 9, 9], "worse"),
+    ):
+        said = verdict(start, {"touch/linear a": cell(wrong)}, "object")
+        change = 1 - np.array(wrong) / 10, 1 - np.array([5, 6, 7, 4, 5, 6]) / 10
+        low, high = ttest_rel(*change).confidence_interval(0.95)
+        gain = 100 * (change[0] - change[1]).mean()
+        assert said.startswith(f"compared with the start, the features are {word}: {gain:+.1f} points")
+        assert f"[{100 * low:+.1f}, {100 * high:+.1f}] (linear probe on 6 objects of val, mean of touch/a)" in said
+    assert "nothing says" in verdict({}, {}, "object")
+
+
+def test_values_have_r2(measured: Pack) -> None:
+    run = smoke(measured)
+    model = fresh(run, measured.spec, measured.size)
+    values, cells = validate(model, measured, run)
+    light, both = cells["touch/linear light"], cells["touch/linear both"]
+    assert light.shape[0] == 1 and both.shape[0] == 2
+    errors, guess = light[0].sum(0).tolist()
+    rows = measured.rows("val")
+    level = measured.column("level")[rows]
+    assert guess == pytest.approx(((level - level.mean()) ** 2).sum(), rel=1e-4)
+    assert values["touch/linear light"] == pytest.approx(1 - errors / guess) and values["touch/linear light"] > 0.5
+    assert torch.equal(both[0], light[0])  # the same target; weight has rows of its own
+    weight = measured.column("weight")[rows]
+    known = weight[~np.isnan(weight)]
+    assert float(both[1, :, 1].sum()) == pytest.approx(((known - known.mean()) ** 2).sum(), rel=1e-4)
+
+
+def test_probe_scores_the_best_weights(
+    pack: Pack, run: Path, smoke_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["--weights", "best", "--tasks", "pattern", "--modalities", "touch", "--no-controls"]
+    assert main(["probe", str(run), *asked]) == 0
+    assert "mvitac, best" in capsys.readouterr().out and not (run / "probe.json").exists()
+    result = read_json(run / "probe.best.json", "scores")
+    assert from_json(list, result["models"]) and stored_result([run], pack) is None
+    plain = train(smoke(pack, steps=1, eval_every=0), run.parent / "plain", quiet=True)
+    assert main(["probe", str(plain), *asked]) == 2
+    error = capsys.readouterr().err
+    assert "has no model.best.safetensors: train with --eval-every N" in error and error.count("\n") == 1
+
+
+def test_the_report_shows_the_start_and_the_sentence(run: Path, tmp_path: Path) -> None:
+    page = write_report([run], tmp_path / "report", quiet=True).read_text()
+    assert "linear probe, pattern" in page and "Dashed: the value at the start" in page
+    assert log_of(run)[-1]["verdict"] in page.replace("&#x27;", "'")
