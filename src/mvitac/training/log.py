@@ -90,7 +90,7 @@ class Log:
             self.first = values
         shown = []
         for name, value in values.items():
-            if "/linear " in name or "/knn " in name or name.endswith("R@5"):
+            if "/linear " in name or name.endswith("R@5"):  # kNN accuracy too is in log.jsonl
                 beside = step and name in self.first and not name.startswith("chance")
                 gain = f" ({value - self.first[name]:+.3f})" if beside else ""
                 shown.append(f"{name} {value:.3f}{gain}")
