@@ -176,11 +176,7 @@ def probe_runs(
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
     _check_models(paths, models, pack)
-    for task in tasks:
-        for modality in seen_by(pack, task, modalities):
-            rows = split_rows(pack, task, modality)
-            if isinstance(task, Task) and task.event:
-                check_event(pack, task, rows.fitted, rows.test)
+    _check_tasks(pack, tasks, modalities)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     if session.controls:
@@ -194,16 +190,11 @@ def probe_runs(
         found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
     result = {
-        "data": pack.spec.name,
-        "pack": pack.digest,
+        **_describe_data(pack, tasks),
         "asked": to_json(session),
         "models": _digests(paths, weights),
         "encoders": [model.describe() for model, _ in others],
-        "group_by": pack.spec.group_by,
-        "notes": list(pack.spec.notes),
         "leaks": leaks_of([*records, *retrieval]),
-        "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
-        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
         "records": records,
         "retrieval": retrieval,
         "summary": summarise(records, session.probes[0]),
@@ -218,6 +209,27 @@ def probe_runs(
     for path in paths:
         write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
     return Scores(result)
+
+
+def _check_tasks(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> None:
+    """Raise ValueError if a task has no rows to fit or to score, or no recordings for its event."""
+    for task in tasks:
+        for modality in seen_by(pack, task, modalities):
+            rows = split_rows(pack, task, modality)
+            if isinstance(task, Task) and task.event:
+                check_event(pack, task, rows.fitted, rows.test)
+
+
+def _describe_data(pack: Pack, tasks: Sequence[AnyTask]) -> dict[str, Any]:
+    """What a result says of its data."""
+    return {
+        "data": pack.spec.name,
+        "pack": pack.digest,
+        "group_by": pack.spec.group_by,
+        "notes": list(pack.spec.notes),
+        "classes": {task.name: list(task.classes) for task in with_classes(tasks)},
+        "targets": {task.name: to_json(task.targets) for task in tasks if isinstance(task, ValueTask)},
+    }
 
 
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
