@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, Event, Task, ValueTask
+from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
 from mvitac.evaluation.events import check_event, with_event
@@ -19,7 +19,6 @@ from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import (
     PROBES,
-    Probe,
     cross_modal,
     probe_model,
     probes_of,
@@ -28,12 +27,13 @@ from mvitac.evaluation.probe import (
     split_rows,
     with_classes,
 )
+from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
-from mvitac.evaluation.sensors import Standardise, describe_statistics, sensor_records
+from mvitac.evaluation.sensors import describe_statistics, sensor_records
 from mvitac.model import Model, Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
-from mvitac.registry import LATER, from_json, to_json, unknown
+from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run
 from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
 from mvitac.system.processes import in_threads
@@ -41,58 +41,6 @@ from mvitac.system.progress import work
 
 END_TO_END = ", end to end"
 """Suffix of a source's name for the scores of its own heads, trained along with its encoders."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProbeConfig:
-    """What to probe, and whether to score controls."""
-
-    probes: tuple[Probe, ...] = ("linear",)
-    """linear: logistic regression, or ridge for values, C or alpha chosen on held-out groups of train. paper: the paper's
-    Adam probe. knn: 20 nearest. mlp: one hidden layer. attentive: attention over the trunk's last feature map."""
-    tasks: tuple[str, ...] = ()
-    """Tasks to probe. Default: all."""
-    modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
-    """Modalities to probe. Default: all of the data."""
-    controls: bool = True
-    """Also score the controls: majority class, untrained trunk, pixels, border, and the dataset's own."""
-    imagenet: Path | None = None
-    """File with ImageNet weights of the trunk, for the frozen-ImageNet control."""
-    event: tuple[str, ...] = field(default=(), metadata=LATER)
-    """TASK=CLASS, e.g. slip=yes: also score this class as an event in time. How early does a recording's frame raise an
-    alarm, before the first frame of this class, or before the recording's end if all of its frames have it?"""
-    fps: float | None = field(default=None, metadata=LATER)
-    """Frames per second, if the --clock of --event counts frames. Otherwise times are in its units."""
-    clock: str | None = field(default=None, metadata=LATER)
-    """Column with the time of each frame for --event: frame numbers, or seconds. Default: the one that orders frames
-    (--data.order, else frame, seq or time)."""
-    false_alarms: float = field(default=0.1, metadata=LATER)
-    """Share of recordings without the --event in which an alarm is accepted. It sets the threshold, on train and val."""
-    standardise: tuple[Standardise, ...] = field(default=(), metadata=LATER)
-    """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
-    their own mean and standard deviation. batch-norm: take the statistics of BatchNorm anew. colours: show images of a
-    sensor that --learn-on lacks in the colours of those that it has, and take the mean features."""
-    sensors: bool = field(default=False, metadata=LATER)
-    """Also say how well touch features tell the sensor, and how often they find the same press through another one."""
-
-    def __post_init__(self) -> None:
-        given = {"probe": self.probes, "task": self.tasks, "modality": self.modalities, "standardise": self.standardise}
-        for name, values in given.items():
-            for value in values:
-                if values.count(value) > 1:
-                    raise ValueError(f"{name} {value!r} is given twice: give it once")
-        if self.imagenet and not self.imagenet.is_file():
-            raise ValueError(f"imagenet {self.imagenet}: give a file that exists")
-        for name, _, happens in (asked.partition("=") for asked in self.event):
-            if not (name and happens):
-                raise ValueError(f"event {name or '='!r}: give a task and its class, such as slip=yes")
-        if (self.fps is not None or self.clock) and not self.event:
-            raise ValueError(f"{'clock' if self.clock else 'fps'} is for events: name one with --event TASK=CLASS")
-        self.event_of("")
-
-    def event_of(self, happens: str) -> Event:
-        """The class ``happens`` as an event with these options."""
-        return Event(happens=happens, clock=self.clock, fps=self.fps, false_alarms=self.false_alarms)
 
 
 class Scores(dict[str, Any]):

@@ -191,9 +191,7 @@ def touch(
     motion = Motion.draw(_TAG, seed, category, instance, touch, moment) if moment else None
     choice = sensors or [s for s in SENSORS.values() if s.held_out == held_out_sensor]
     if not 0 <= through < len(choice):
-        raise ValueError(
-            f"through {through}: there are {len(choice)} sensors to press on one spot, give a smaller number"
-        )
+        raise ValueError(f"through {through}: there are {len(choice)} sensors for one spot, give a smaller number")
     again = np.random.default_rng([_TAG, seed, category, instance, touch, 0, through]) if through else None
     vision = _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size, motion)
     pressed = _feel(
