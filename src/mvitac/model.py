@@ -7,8 +7,6 @@
 Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the shared space, K classes.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from html import escape
@@ -33,10 +31,8 @@ from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, e
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 FORMAT = "mvitac-model"
-BEST = "model.best.safetensors"
-"""Weights of a run that were best on split val, kept with ``Run.eval_every``."""
-EMBED_BATCH = 64
-"""Images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px."""
+BEST = "model.best.safetensors"  # weights of a run that were best on split val, kept with ``Run.eval_every``
+EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px
 
 
 class Model(nn.Module):
@@ -214,22 +210,15 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Class probabilities [B, K] from the classifier that a supervised method trained with its encoders.
+        """Class probabilities [B, K] of one of ``tasks``, by the head that a supervised method trained.
 
-        Args:
-            task: One of ``tasks``, with classes.
-            features: modality -> ``features(..., for_heads=True)``.
+        ``features``: modality -> ``features(..., for_heads=True)``.
         """
         return self._answer(task, features).softmax(dim=1)
 
     @torch.no_grad()
     def estimate(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Values [B, T] in their units, from the head that a supervised method trained with its encoders.
-
-        Args:
-            task: One of ``tasks``, with values.
-            features: modality -> ``features(..., for_heads=True)``.
-        """
+        """Values [B, T] of one of ``tasks`` in their units, as for ``classify``."""
         return self._answer(task, features)
 
     def _answer(self, task: str, features: dict[str, Tensor]) -> Tensor:

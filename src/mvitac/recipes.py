@@ -1,7 +1,5 @@
 """Recipes: functions that return a complete ``Run``. Each changes another recipe, so the code shows the differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, replace
 

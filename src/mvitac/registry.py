@@ -7,8 +7,6 @@ A *kind* is a direct subclass of ``Registered``. Each further subclass that has 
     find(MethodConfig, "mvitac") is MViTacConfig
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import importlib

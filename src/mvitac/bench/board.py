@@ -1,7 +1,5 @@
 """The board: one static page that compares results of one suite. Tasks down, encoders across, controls first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -75,12 +73,7 @@ class Board:
 
 
 def write_board(files: Sequence[Path], out: Path) -> Path:
-    """Write the page that compares the results in ``files``.
-
-    Raises:
-        ValueError: If a file is no result, was changed, is of another suite or version than the others or than the one
-            of this mvitac, has scores that its own sums do not give, or two results have one name.
-    """
+    """Write the page that compares the results in ``files``; ValueError if they do not hold or cannot be compared."""
     results: dict[str, dict[str, Any]] = {}
     for path in files:
         result = read_result(path)

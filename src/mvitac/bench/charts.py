@@ -1,7 +1,5 @@
 """The board's charts: score against parameters, and against the number of labels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

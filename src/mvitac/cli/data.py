@@ -24,8 +24,7 @@ from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.registry import default, unknown
 from mvitac.system.files import check_place, write_atomic
 
-OWN_COLUMNS = ("id", "group", "touch_group", "split", "sensor")
-"""Columns that packing adds to a table."""
+OWN_COLUMNS = ("id", "group", "touch_group", "split", "sensor")  # columns that packing adds to a table
 
 
 @dataclass(frozen=True, kw_only=True)

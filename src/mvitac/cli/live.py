@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from mvitac.live.display import Window
     from mvitac.live.predictor import Live
 
-_REDRAW = 0.1
-"""Seconds between two pictures of the terminal or the window."""
+_REDRAW = 0.1  # seconds between two pictures of the terminal or the window
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,13 +239,8 @@ def sources(
 ) -> dict[str, tuple[str, ...]]:
     """The sources by modality: those that were given, or simulated sensors if there are none.
 
-    Args:
-        inputs: shapes [S, S, C] of the engine's inputs, by modality.
-        vision: source of the camera.
-        touch: sources of the touch sensors.
-
-    Raises:
-        ValueError: only some inputs have a source; a simulated sensor must not pass for a real one.
+    ``inputs``: modality -> shape [S, S, C] of an input. ValueError if only some have a source: a simulated sensor must
+    not pass for a real one.
     """
     given: dict[str, tuple[str, ...]] = {"vision": (vision,) if vision else (), "touch": tuple(touch)}
     given = {modality: texts for modality, texts in given.items() if texts}

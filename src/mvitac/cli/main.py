@@ -83,8 +83,7 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 
-LEAST_MEMORY = 1 << 30
-"""Bytes of address space that any command needs."""
+LEAST_MEMORY = 1 << 30  # bytes of address space that any command needs
 _NO_MEMORY = (
     "out of memory|can't allocate memory|cannot allocate memory|failed to map segment|can't start new thread"
     "|std::bad_alloc"

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-STDOUT = Path("-")
-"""The --json FILE that means stdout."""
+STDOUT = Path("-")  # the --json FILE that means stdout
 
 
 def parse(

@@ -1,7 +1,5 @@
 """Makes the parts of a pack, in several processes: reads items, checks and resizes images, writes rows and checksums."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -55,8 +53,7 @@ def make_parts(work: Work, parts: Sequence[Part], workers: int) -> Iterator[int]
             raise
 
 
-_work: Work
-"""The work of this worker process."""
+_work: Work  # the work of this worker process
 
 
 def _start_worker(work: Work) -> None:

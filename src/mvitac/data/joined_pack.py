@@ -3,8 +3,6 @@
 This module does not import torch.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

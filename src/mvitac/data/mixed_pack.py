@@ -3,8 +3,6 @@
 This module does not import torch.
 """
 
-from __future__ import annotations
-
 import copy
 import functools
 import itertools
@@ -131,10 +129,7 @@ class MixedPack(Pack):
 class MixedImages(Lazy):
     """uint8 [N, S, S, C]: the images of several packs, one after another, resized to one side.
 
-    Args:
-        pieces: Images of each pack; a number stands for so many rows without an image, which are zeros.
-        size: Side S in pixels.
-        channels: C.
+    A number among ``pieces`` stands for so many rows without an image, which are zeros.
     """
 
     def __init__(self, pieces: Sequence[Images | int], size: int, channels: int) -> None:

@@ -1,7 +1,5 @@
 """The table and the tasks of several packs as one (``data/mixed_pack.py``). This module does not import torch."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -15,8 +13,7 @@ from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
 OWN = re.compile(r"(id|group|touch_group|press|part|sensor|(has|crc|bytes|label)_.*)")
 """Columns that are not taken over as they are."""
 
-Renamed = Mapping[str, Mapping[str, str]]
-"""Part -> column of its table -> name of that column in the mix."""
+Renamed = Mapping[str, Mapping[str, str]]  # part -> column of its table -> name of that column in the mix
 
 
 def renamed_columns(parts: Mapping[str, Pack]) -> Renamed:

@@ -33,8 +33,7 @@ from mvitac.system.files import brief, digest, digest_file, read_json
 
 FORMAT = "mvitac-pack"
 SHARDED = "mvitac-shards"
-FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}
-"""Format version by how images are stored."""
+FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}  # format version by how images are stored
 SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}
 
 Store = Literal["raw", "jpeg"]
@@ -237,11 +236,7 @@ class Pack:
 
     @functools.cached_property
     def presses(self) -> np.ndarray:
-        """int64 [N], number of each row's press (column press): its rows are moments of one press.
-
-        Raises:
-            ValueError: If the pack has no such column.
-        """
+        """int64 [N], number of each row's press: its rows are moments of one press. ValueError without that column."""
         if "press" not in self.table.column_names:
             raise ValueError(
                 "same-press positives need a column 'press', which says which rows are moments of one press: simulate"

@@ -161,14 +161,12 @@ class Part:
     path: Path
     items: tuple[int, int]
     first: int
-    stamp: str | None = None
-    """Digest of the stamps of the files that the items are read from, if any."""
+    stamp: str | None = None  # digest of the stamps of the files that the items are read from, if any
 
     def read(self) -> dict[str, Any]:
-        """Return what the part's file says: columns, damaged, lost, and by modality crc and bytes (JPEG) of each row.
+        """What the part's file says: columns, damaged, lost, and by modality crc and bytes (JPEG) of each row.
 
-        Raises:
-            ValueError: If the file does not exist, or is about other rows or about files that have changed.
+        ValueError if the file does not exist, or is about other rows or about files that have changed.
         """
         known = read_json(self.path, "a part of an unfinished pack")
         if (known["items"], known["first"], known.get("stamp")) != ([*self.items], self.first, self.stamp):

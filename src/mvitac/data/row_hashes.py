@@ -1,7 +1,5 @@
 """Hashes of ids and groups of rows, by which packs find rows of each other. This module does not import torch."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

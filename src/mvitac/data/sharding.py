@@ -1,7 +1,5 @@
 """Writes a pack as shards for ``data/streaming.py``, to a folder or any store that fsspec supports."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -16,8 +14,7 @@ from mvitac.data.streaming import reach, shard_name
 from mvitac.system.files import brief, digest
 from mvitac.system.progress import shown, work
 
-MAX_SHARD_MB = 1_000_000
-"""A terabyte: a shard is read whole."""
+MAX_SHARD_MB = 1_000_000  # a terabyte: a shard is read whole
 
 
 def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, quiet: bool = False) -> int:

@@ -1,7 +1,5 @@
 """Description of a dataset: modalities, tasks, groups, owner. Packing workers import it, so it does not import torch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,8 +8,7 @@ from typing import Literal
 from mvitac.registry import LATER
 
 MODALITIES = ("vision", "touch")
-PHASES = ("before", "during", "after")
-"""Values of column phase: the moments of a grasp."""
+PHASES = ("before", "during", "after")  # values of column phase: the moments of a grasp
 
 
 @dataclass(frozen=True, kw_only=True)

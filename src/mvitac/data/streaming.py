@@ -9,8 +9,6 @@ Touch groups are in random order and each in one shard (if it fits), so any few 
 (``data/sharding.py`` writes them). A ``StreamedPack`` has the interface of ``Pack``. This module does not import torch.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 import itertools
@@ -31,10 +29,8 @@ from mvitac.data.pack import SHARDED, SUFFIXES, Images, Pack
 from mvitac.registry import from_json
 from mvitac.system.files import brief, check_place, digest_file
 
-NUM_FETCHING = 4
-"""Number of files fetched at a time."""
-HEADER = 128
-"""Bytes of a .npy header; numpy pads it to this length for any number of rows."""
+NUM_FETCHING = 4  # number of files fetched at a time
+HEADER = 128  # bytes of a .npy header; numpy pads it to this length for any number of rows
 
 
 def reach(url: str) -> tuple[Any, str]:
@@ -60,13 +56,9 @@ class StreamedPack(Pack):
     format: ClassVar[str] = SHARDED
 
     def __init__(self, url: str, cache: Path, *, limit: int, window: int) -> None:
-        """Open ``url``. Each file is verified after it is fetched.
+        """Open ``url``, whose files are verified and kept in ``cache``, at most ``limit`` bytes: two windows must fit.
 
-        Args:
-            url: Location of the shards.
-            cache: Folder for fetched shards.
-            limit: Largest size of the cache in bytes; two windows must fit.
-            window: Number of shards whose rows training mixes at a time.
+        ``window`` is the number of shards whose rows training mixes at a time.
         """
         self.url, self.window, self._limit = url, window, limit
         self._fetched: list[int] = []

@@ -1,7 +1,5 @@
 """The base class of dataset configs. A config gives a source of samples; all other code reads the pack made from it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from pathlib import Path

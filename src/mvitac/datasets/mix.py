@@ -1,7 +1,5 @@
 """Several packs as one training set."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -8,8 +8,6 @@ Members with the same name up to the first dot are one sample:
 Images are read from inside the tar. A .json gives a column per scalar, .cls and .txt one column each.
 """
 
-from __future__ import annotations
-
 import tarfile
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The model card of an artifact: what the model is, an example, scores next to controls, preprocessing, data."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -8,8 +8,6 @@
 Pickles in a torch export are refused. torch still calls its format unsafe, so open only exports that you trust.
 """
 
-from __future__ import annotations
-
 import bisect
 import os
 import re

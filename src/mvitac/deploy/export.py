@@ -4,8 +4,6 @@ The reference is ``Model.features`` and its probes, the code that computed the p
 written file, opened again by the engine that will run it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

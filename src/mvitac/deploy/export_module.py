@@ -6,8 +6,6 @@ embedding_<modality> [B, D], shared_<modality> [B, E] (L2-normalised; absent wit
 probability_<task> [B, K], value_<task> [B, T] in the units of its T targets.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

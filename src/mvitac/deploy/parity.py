@@ -50,11 +50,8 @@ def parity(
 ) -> dict[str, Any]:
     """Compare the outputs of ``call`` for pack rows with ``wanted``.
 
-    Returns:
-        num_rows; cosine by embedding (min, mean); accuracy by task (original, export, num labelled rows).
-
-    Raises:
-        ValueError: they differ by more than ``config`` allows; the message names the likeliest reason.
+    Returns num_rows; cosine by embedding (min, mean); accuracy by task (original, export, num labelled rows).
+    ValueError with the likeliest reason if they differ by more than ``config`` allows.
     """
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 16)):  # batches of another size than the traced one

@@ -1,7 +1,5 @@
 """Publish runs: fit the probes on a finished run's data, write one artifact folder, and push it to the Hub."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from pathlib import Path

@@ -48,11 +48,7 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
         self.background = background
 
     def fit(self, X: Any, y: Any = None) -> ImageFeatures:
-        """Load the model. ``X`` and ``y`` are not used.
-
-        Raises:
-            ValueError: If there is no such model, or it has no such encoder.
-        """
+        """Load the model. ``X`` and ``y`` are not used."""
         self.model_ = self.model if isinstance(self.model, Model) else load(self.model)
         for name in self._names():
             self.model_.check_modality(name)

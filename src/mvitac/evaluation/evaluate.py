@@ -1,7 +1,5 @@
 """Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -263,9 +261,8 @@ def check_unseen(
 ) -> list[list[Source] | None]:
     """What each run at ``paths`` learned from; None where that is not known.
 
-    Raises:
-        ValueError: If a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
-            its own data follows from the split that was chosen, so there the scores only say LEAK.
+    ValueError if a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
+    its own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
     for path, model in zip(paths, models, strict=True):
@@ -311,8 +308,7 @@ def _probe_run(
 def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     """Names of the runs: the method, the recipe if recipes differ, and the folder if runs of one name differ further.
 
-    Raises:
-        ValueError: If two runs are the same, since they would count as two seeds.
+    ValueError if two runs are the same, since they would count as two seeds.
     """
     several = len({model.run.recipe for model in models}) > 1
     names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]

@@ -7,8 +7,6 @@ The first source of a run is its own training rows. A run that starts from anoth
 model. A source without rows stands for weights of which nothing says what they were trained on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,20 +24,16 @@ from mvitac.run import Run
 from mvitac.system.files import brief, write_atomic
 
 FILE = "trained_on.safetensors"
-UNKNOWN = "unknown"
-"""A leak that cannot be checked, because nothing says what the run was trained on."""
+UNKNOWN = "unknown"  # a leak that cannot be checked, because nothing says what the run was trained on
 
 
 @dataclass(frozen=True)
 class Source:
     """Rows of a dataset that a model learned from."""
 
-    name: str
-    """Name of the dataset."""
-    ids: np.ndarray
-    """uint64, sorted: hashes of the rows' ids."""
-    groups: np.ndarray
-    """uint64, sorted: hashes of the rows' groups."""
+    name: str  # name of the dataset
+    ids: np.ndarray  # uint64, sorted: hashes of the rows' ids
+    groups: np.ndarray  # uint64, sorted: hashes of the rows' groups
 
 
 def source_of(pack: Pack, rows: np.ndarray) -> Source:
@@ -77,18 +71,10 @@ def write_sources(folder: Path, sources: Sequence[Source]) -> None:
 
 
 def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list[Source] | None:
-    """What the run in ``folder`` learned from.
+    """What the run in ``folder`` learned from; None if that is not known.
 
-    Runs of version 0.1.0 have no such file. Their rows are computed from their data if it is ``pack`` or is still there.
-
-    Args:
-        folder: Folder of the run.
-        run: Its settings.
-        digest: Digest of the pack it was trained on, from run.json.
-        pack: The data to score, which may be the same.
-
-    Returns:
-        The sources, or None if they are not known.
+    Runs of version 0.1.0 have no such file. Their rows are computed from their data, whose ``digest`` is in run.json,
+    if it is ``pack`` (the data to score) or is still there.
     """
     if (folder / FILE).exists():
         try:

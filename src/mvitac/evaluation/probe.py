@@ -3,8 +3,6 @@
 Nothing is chosen on test rows: regularisation is chosen on held-out groups of train. Shapes: features [N, D].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -38,8 +36,7 @@ VALUE_PROBES = ("linear", "knn", *TRAINED)
 MIN_GALLERY = 11
 """Least number of test groups for retrieval. With fewer, the first five are half of all groups or more."""
 
-FeatureSource = Callable[[str, np.ndarray], np.ndarray]
-"""(modality, pack rows) -> features [len(rows), D]."""
+FeatureSource = Callable[[str, np.ndarray], np.ndarray]  # (modality, pack rows) -> features [len(rows), D]
 
 
 @dataclass(frozen=True)
@@ -62,17 +59,10 @@ class ProbeSplit:
 
 
 def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
-    """Labelled (or measured) rows of ``task`` by split.
+    """Labelled (or measured) rows of ``task`` by split, with an image of ``modality`` ("both": of both, "none": any).
 
-    Without a validation split, a fifth of the training groups is set aside for it.
-
-    Args:
-        pack: The data.
-        task: The task whose labels, row filter and split column apply.
-        modality: Rows must have an image of this modality; "both" asks for both, "none" for no image.
-
-    Raises:
-        ValueError: If no labelled row is left in train or in test, or a target has no different values there.
+    Without a validation split, a fifth of the training groups is set aside for it. ValueError if no labelled row is
+    left in train or in test, or a target has no different values there.
     """
     having = names_in(modality, pack)
     known = pack.answered(task)
@@ -170,8 +160,7 @@ def fit_probe(
 ) -> tuple[Classifier, dict[str, Any]]:
     """Fit one probe on features ``x`` of ``rows.fitted``.
 
-    Returns:
-        A function from features [N, D] to class probabilities [N, K], and what was chosen (C of ``linear``).
+    Returns a function from features [N, D] to class probabilities [N, K], and what was chosen (C of ``linear``).
     """
     labels = labels_of(pack, task)
     y, y_whole, num = labels[rows.train], labels[rows.fitted], len(task.classes)
@@ -195,8 +184,7 @@ def fit_values(
 ) -> tuple[Regressor, dict[str, Any]]:
     """Fit one probe of a task with values on features ``x`` of ``rows.fitted``.
 
-    Returns:
-        A function from features [N, D] to values [N, T], and what was chosen (alpha of ``linear``, which is ridge).
+    Returns a function from features [N, D] to values [N, T], and what was chosen (alpha of ``linear``, which is ridge).
     """
     y = pack.values(task)[rows.fitted]
     if kind == "linear":
@@ -220,13 +208,10 @@ def probe_model(
     probes: Sequence[str],
     standardise: tuple[Standardise, ...] = (),
 ) -> list[dict[str, Any]]:
-    """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
+    """Probe every task and modality that ``model`` has an encoder for, and its own heads ("own") where it has some.
 
-    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones.
-
-    Returns:
-        One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
-        model's own head is "own".
+    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones. Returns one
+    record per (task, modality, probe): these names and the scores of ``scores.score``.
     """
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
@@ -371,11 +356,10 @@ def retrieved_rows(pack: Pack) -> np.ndarray:
 
 
 def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
-    """Retrieval of groups across modalities, in both directions, among ``rows`` (default: ``retrieved_rows``).
+    """Retrieval of groups across modalities among ``rows`` (default: ``retrieved_rows``), one record per direction.
 
-    Returns:
-        One record per direction: R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. Empty without a
-        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
+    A record has R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. There is none without a shared space,
+    on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
     """
     if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
         return []

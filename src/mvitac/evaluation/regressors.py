@@ -26,12 +26,9 @@ NEIGHBOURS = 20
 
 
 def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Joined, list[float]]:
-    """Fit ridge regression on standardised features and targets.
+    """Fit ridge regression on standardised features and targets; returns the regressor and each target's alpha.
 
-    Each target's alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
-
-    Returns:
-        The regressor and the chosen alpha of each target.
+    Each alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
     """
     fitted = _fit_each(x, y, num_val, lambda: [])
     return Joined(fitted), [float(pipeline[-1].alpha_) for pipeline, _, _ in fitted]

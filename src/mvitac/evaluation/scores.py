@@ -253,8 +253,7 @@ def _p(mean: float, variance: _Variance) -> float:
     return 2 * float(stdtr(variance.freedom, -abs(mean) / variance.value**0.5))
 
 
-Cell = tuple[str, str, str]
-"""(task, modality, source)."""
+Cell = tuple[str, str, str]  # (task, modality, source)
 
 
 def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[dict[str, Any]]]:

@@ -3,8 +3,6 @@
 Like accuracy, R2 is computed from sums over each test group, so that intervals can leave groups out (``scores``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

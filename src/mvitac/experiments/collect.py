@@ -10,8 +10,6 @@ Finished runs are skipped and interrupted ones resumed. A run whose loss became 
 kept as failed.json and named below the table.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,20 +38,11 @@ from mvitac.training.views import gel_mirror
 
 
 def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str = "auto") -> Work:
-    """The jobs of ``plan``, ordered by seed and then by row.
+    """The jobs of ``plan``, whose data is ``pack``, ordered by seed and then by row.
 
     Rows that need what the data lacks (labels, a camera) and rows equal to an earlier one are left out. A row may read
-    the same samples differently (difference images of touch), but not other samples.
-
-    Args:
-        plan: The plan; its data must be set.
-        pack: The plan's data.
-        out: Folder of the comparison.
-        session: How to score each run.
-        device: Device of every run.
-
-    Raises:
-        ValueError: If no row is possible, or ``out`` holds other runs.
+    the same samples differently (difference images of touch), but not other samples. ValueError if no row is possible,
+    or ``out`` holds other runs.
     """
     assert plan.data is not None
     chosen(pack, session)
@@ -114,11 +103,7 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
 
 
 def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
-    """Collect the finished runs and the controls into the result that tables are made from.
-
-    Raises:
-        ValueError: If no run is finished.
-    """
+    """Collect the finished runs and the controls into the result that tables are made from; ValueError without runs."""
     failed = {job.name: job.failure for job in work.jobs if job.failure}
     finished = [job for job in work.jobs if job.done and not job.failure]
     if not finished:

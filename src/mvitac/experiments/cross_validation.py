@@ -3,8 +3,6 @@
 Each fold has its own folder of runs and controls. A plan without folds is one fold with an empty name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,8 +25,7 @@ from mvitac.system.files import digest
 def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "auto") -> list[Work]:
     """The work of every fold of ``plan``. A row that one fold does not allow is left out of all.
 
-    Raises:
-        ValueError: If two folds test the same group, or no row is left.
+    ValueError if two folds test the same group, or no row is left.
     """
     works: list[Work] = []
     tested: dict[tuple[str, str], str] = {}

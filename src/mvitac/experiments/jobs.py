@@ -165,16 +165,8 @@ class _Reporter:
 def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
     """Run the unfinished jobs, ``num_jobs`` at a time, each on its own GPU if there are several.
 
-    Args:
-        work: The jobs.
-        num_jobs: Number of parallel processes.
-        say: Receives a line about each job.
-        console: Shows progress and the time left; None shows nothing.
-
-    Raises:
-        Exception: The first error of a failed job, after all other jobs ran.
-        ValueError: If a process was killed.
-        Interrupted: After Ctrl-C, once the active runs have saved their checkpoints.
+    ``say`` receives a line about each job. The first error of a failed job is raised after all other jobs ran;
+    ValueError if a process was killed; Interrupted after Ctrl-C, once the active runs have saved their checkpoints.
     """
     todo = [job for job in work.jobs if not job.done]
     for job in work.jobs:

@@ -14,10 +14,8 @@ from mvitac.registry import LATER, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import parse_json
 
-Printed = dict[str, dict[str, float]]
-"""modality -> task -> top-1 accuracy in percent as printed in the paper."""
-ONE_ROW = "one row"
-"""Where the pairs of a run are from if its positives are views of the same image, as in the paper."""
+Printed = dict[str, dict[str, float]]  # modality -> task -> top-1 accuracy in percent as printed in the paper
+ONE_ROW = "one row"  # where the pairs of a run are from if its positives are views of the same image, as in the paper
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,5 @@
 """The table of a comparison as Markdown, LaTeX, CSV and a figure."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

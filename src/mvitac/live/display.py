@@ -3,8 +3,6 @@
 ``draw`` needs neither a display nor OpenCV, so it can be tested; ``Window`` needs both, and its error names the missing one.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from types import ModuleType

@@ -4,8 +4,6 @@ A ``Stream`` keeps the newest frame of its source (``live/cameras.py``), counts 
 comes from a clock passed as an argument, so tests use a fake one. Frames are uint8 RGB [H, W, 3].
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter, deque

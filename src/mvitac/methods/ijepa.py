@@ -97,8 +97,7 @@ class Blocks:
     """Context and targets of each image, as patch numbers; unused places are filled with any patch."""
 
     context: Int[Tensor, "B K"]
-    in_context: Bool[Tensor, "B K"]
-    """Which places of ``context`` are used."""
+    in_context: Bool[Tensor, "B K"]  # which places of ``context`` are used
     targets: Int[Tensor, "B M S"]
     in_target: Bool[Tensor, "B M S"]
 

@@ -33,8 +33,7 @@ from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, wi
 from mvitac.nn import vit
 from mvitac.nn.encoders import EncoderConfig
 
-EPS = 1e-6
-"""Added to the variance of a patch, as in the authors' code."""
+EPS = 1e-6  # added to the variance of a patch, as in the authors' code
 
 
 @dataclass(frozen=True, kw_only=True)

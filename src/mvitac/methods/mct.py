@@ -28,8 +28,7 @@ from mvitac.nn.encoders import EncoderConfig
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 
-HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]
-"""Each has a queue."""
+HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]  # each has a queue
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -152,11 +152,7 @@ class SupervisedConfig(LabelledConfig):
         return rows[np.isin(pack.column("group")[rows].astype(str), kept if self.hold_out else [*kept, *held])]
 
     def _drawn_groups(self, pack: Pack, rows: np.ndarray) -> tuple[list[str], list[str]]:
-        """Names of the groups to learn from, and of those to choose settings on. A larger share adds to a smaller one.
-
-        Raises:
-            ValueError: If groups are to be held out, and there are too few.
-        """
+        """Names of the groups to learn from, and of those to choose settings on. A larger share adds to a smaller."""
         groups = pack.column("group")[rows].astype(str)
         order = np.random.default_rng(self.draw).permutation(np.unique(groups))
         tasks = self.tasks_of(pack.spec)

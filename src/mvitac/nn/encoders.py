@@ -1,7 +1,5 @@
 """Trunks (any timm model), their initial weights, and projection heads."""
 
-from __future__ import annotations
-
 import copy
 import difflib
 import math
@@ -26,10 +24,8 @@ from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
-MAP_SIDE = 7
-"""A feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px."""
-_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-"""Names of timm's files on the hub."""
+MAP_SIDE = 7  # a feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px
+_WEIGHTS = ("model.safetensors", "pytorch_model.bin")  # names of timm's files on the hub
 _VITS = ("timm.models.vision_transformer", "timm.models.deit", "timm.models.eva")
 """timm's files of ViTs that take images of any size ..."""
 _ANY_SIZE = {"dynamic_img_size": True, "dynamic_img_pad": True}
@@ -235,15 +231,8 @@ def timm_trunk(
 ) -> nn.Module:
     """A copy of an encoder from ``build_trunk`` as timm would have made it, with a ``pretrained_cfg`` of these values.
 
-    Args:
-        encoder: The encoder.
-        name: Name of its timm model.
-        input_size: Channels, height and width of its images.
-        mean: Mean of each channel.
-        std: Standard deviation of each channel.
-
-    Raises:
-        ValueError: If ``encoder`` is not a single timm model.
+    ``input_size`` is channels, height and width; ``mean`` and ``std`` are of each channel. ValueError if it is no
+    single timm model.
     """
     if not hasattr(encoder, "forward_features"):
         raise ValueError(f"this encoder is no single timm model but a {type(encoder).__name__}: use model.encoders")

@@ -3,8 +3,6 @@
 Shapes: B images, P places of a feature map, D features, O outputs of a layer and I inputs of each.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterable
 from typing import Literal

@@ -3,8 +3,6 @@
 Shapes: B images, D features (a probe on both modalities reads vision, then touch, concatenated), K classes, T targets.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,8 +14,7 @@ from torch import Tensor, nn
 from mvitac.data.spec import Target
 from mvitac.registry import LATER
 
-UNSEEN = -1e4
-"""Logit of a class without training examples: probability 0 in fp32, and still finite in fp16."""
+UNSEEN = -1e4  # logit of a class without training examples: probability 0 in fp32, and still finite in fp16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +22,7 @@ class _Asked:
     """Task and modality of a probe."""
 
     task: str
-    modality: str
-    """touch, vision or both."""
+    modality: str  # touch, vision or both
 
     @property
     def name(self) -> str:
@@ -42,10 +38,8 @@ class ProbeInfo(_Asked):
     """Task, modality and test score of a probe of classes."""
 
     classes: tuple[str, ...]
-    accuracy: float
-    """Accuracy on the test split of the dataset it was trained on."""
-    majority: float
-    """Accuracy on the same rows of always predicting the most frequent class."""
+    accuracy: float  # accuracy on the test split of the dataset it was trained on
+    majority: float  # accuracy on the same rows of always predicting the most frequent class
     num_test: int
     leak: str = field(default="", metadata=LATER)
     """Which test rows the encoders were trained on, or "unknown" (``evaluation.leaks``)."""
@@ -62,10 +56,8 @@ class Error:
     r2: float
     mae: float
     rmse: float
-    edges: tuple[float, ...]
-    """Bounds [R - 1], ascending, between the R ranges of the predicted value."""
-    spread: tuple[float, ...]
-    """Root mean squared error [R] of the test rows whose prediction is in each range."""
+    edges: tuple[float, ...]  # bounds [R - 1], ascending, between the R ranges of the predicted value
+    spread: tuple[float, ...]  # root mean squared error [R] of the test rows whose prediction is in each range
 
     def __post_init__(self) -> None:
         if len(self.spread) != len(self.edges) + 1 or list(self.edges) != sorted(self.edges):
@@ -83,11 +75,9 @@ class ValueInfo(_Asked):
     """Task, modality and test errors of a probe of values."""
 
     targets: tuple[Target, ...]
-    errors: tuple[Error, ...]
-    """One for each target."""
+    errors: tuple[Error, ...]  # one for each target
     num_test: int
-    leak: str = field(default="", metadata=LATER)
-    """As for ``ProbeInfo``."""
+    leak: str = field(default="", metadata=LATER)  # as for ``ProbeInfo``
 
     def __post_init__(self) -> None:
         if not self.targets or len(self.errors) != len(self.targets):
@@ -101,10 +91,7 @@ class ValueInfo(_Asked):
 class LinearProbe(nn.Module):
     """softmax(features W^T + b) for classes; features W^T + b, in the units of the targets, for values.
 
-    Args:
-        question: What the probe predicts.
-        weight: [K, D] or [T, D], fp32.
-        bias: [K] or [T], fp32.
+    ``weight`` is [K, D] or [T, D], ``bias`` [K] or [T], both fp32.
     """
 
     weight: Tensor

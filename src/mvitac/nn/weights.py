@@ -1,7 +1,5 @@
 """Named tensors in safetensors files: read, digest, compare with what a network needs."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -14,11 +12,7 @@ from mvitac.system.files import brief
 
 
 def read_safetensors(file: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Header and tensors of ``file``.
-
-    Raises:
-        ValueError: If it cannot be read.
-    """
+    """Header and tensors of ``file``; ValueError if it cannot be read."""
     try:
         with safetensors.safe_open(file, framework="pt") as opened:
             return opened.metadata() or {}, {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118

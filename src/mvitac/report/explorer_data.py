@@ -3,8 +3,6 @@
 Shapes: N rows of the pack, D features.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Sequence
@@ -23,24 +21,14 @@ from mvitac.nn.linear_probe import ProbeInfo
 from mvitac.registry import unknown
 from mvitac.report.palette import COLOURS, MAP_HUES, ramp
 
-LEVELS = 32
-"""Number of colours between the lowest and the highest value."""
+LEVELS = 32  # number of colours between the lowest and the highest value
 
 
 class ExplorerData:
     """One run: pack rows ``rows`` [N], unit features ``x[modality]`` [N, D], predictions ``guess[task]`` [N]."""
 
     def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
-        """Compute the features; fit probes on ``pack`` if the model has none.
-
-        Args:
-            model: The model.
-            pack: The data to show.
-            limit: Show a random sample of at most this many rows that have all images.
-
-        Raises:
-            ValueError: If the pack's images do not fit the model.
-        """
+        """Compute features of at most ``limit`` random rows that have all images; fit probes if the model has none."""
         names = check_pack(model, pack)
         self.model, self.pack = with_readouts(model, pack), pack
         whole = np.flatnonzero(np.all([pack.has(m) for m in names], axis=0))

@@ -3,8 +3,6 @@
 All text is escaped. Only arguments named ``html``, ``svg`` or ``image`` are trusted.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Collection, Iterable, Sequence
@@ -155,14 +153,10 @@ def table(
     words: bool = False,
     label: str = "table",
 ) -> str:
-    """A table that scrolls in its own box.
+    """A table that scrolls in its own box. A row of one cell is a heading.
 
-    Args:
-        columns: Column headings.
-        rows: Rows of cells. A row of one cell is a heading.
-        muted: First cells of rows to show in grey.
-        words: Cells are text, left-aligned and wrapped, instead of numbers.
-        label: Accessible name.
+    ``muted``: first cells of rows to show in grey. With ``words``, cells are text, left-aligned and wrapped, instead of
+    numbers. ``label`` is the accessible name.
     """
     head = "".join(f'<th scope="col">{escape(column)}</th>' for column in columns)
     body = []

@@ -1,7 +1,5 @@
 """The report of finished runs as one HTML page: verdict, tables, curves, pictures, settings, cost. No network."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

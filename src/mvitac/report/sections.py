@@ -1,7 +1,5 @@
 """Sections of the report: retrieval, training curves, confusion matrices."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,8 +20,7 @@ from mvitac.report.palette import HUES, MODALITY_HUES
 from mvitac.run import Run
 from mvitac.system.files import write_atomic
 
-WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}
-"""The input of a probe, in words."""
+WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}  # the input of a probe, in words
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Probe results as tables for a terminal 80 columns wide, and the rows that every table of results shares."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,8 +24,7 @@ from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 VALUE_PROBE_NAMES = {"linear": "ridge regression"}
-RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
-"""Columns of a retrieval table, in percent."""
+RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")  # columns of a retrieval table, in percent
 EVENT = ("", "features", "detected %", "false alarms %", "alarm before onset", "AUROC")
 """Columns of a table of an event: shares of the recordings with and without it, and the median time."""
 

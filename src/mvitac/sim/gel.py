@@ -26,8 +26,7 @@ __all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "background", "p
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
 Pair = tuple[float, float]
 
-GEL_STIFFNESS = 0.06
-"""Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm."""
+GEL_STIFFNESS = 0.06  # Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm
 
 MEMBRANE_MM = (0.12, 0.35, 0.9)
 """Radii over which the membrane bridges gaps (set by eye, from the halo around real imprints)."""

@@ -19,8 +19,6 @@ VERSION.
 Every item is a function of (seed, object, grasp).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -37,26 +35,21 @@ __all__ = ["NUM_GRASPS", "NUM_OBJECTS", "PHASES", "VERSION", "grasp", "object_na
 
 VERSION = 2
 NUM_OBJECTS = 106
-NUM_GRASPS = 50
-"""Grasps per object as in the original; larger indices are allowed."""
+NUM_GRASPS = 50  # grasps per object as in the original; larger indices are allowed
 
-FIELD_MM = 22.0
-"""Width of a gel's field of view."""
+FIELD_MM = 22.0  # width of a gel's field of view
 
-GRID = 144
-"""Smallest number of samples across a gel, because the relief is finer than the pixels of a small picture."""
+GRID = 144  # smallest number of samples across a gel, because the relief is finer than the pixels of a small picture
 
 SHEAR_MM_PER_N = 0.35
 SHEAR_LIMIT_MM = 1.2
 
-FAR = 0.25
-"""Fraction of grips that miss the centre of mass."""
+FAR = 0.25  # fraction of grips that miss the centre of mass
 
 EXPECTED_FRICTION = 0.5
 """The hand knows the weight of an object, not its friction; it presses as hard as this friction needs."""
 
-BEHIND_M = 3.0
-"""Rays start this far behind the pad, so that they are parallel to within 0.2 degrees."""
+BEHIND_M = 3.0  # rays start this far behind the pad, so that they are parallel to within 0.2 degrees
 
 # One random stream per purpose, so that sensor and picture size do not affect physics and camera.
 _PLAN, _VIEW, _TOUCH = 0x67A50, 0x67A51, 0x67A52

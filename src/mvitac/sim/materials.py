@@ -25,17 +25,13 @@ from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS, Sensor
 
-VERSION = 1
-"""Stored in the pack. Increase it with every change of a pixel."""
+VERSION = 1  # stored in the pack. Increase it with every change of a pixel.
 
-SOFT_BELOW = 0.12
-"""Stiffness in N/mm^3 below which an instance is labelled soft."""
+SOFT_BELOW = 0.12  # stiffness in N/mm^3 below which an instance is labelled soft
 
 _TAG = 0x3A7
-_TOUCH_MM = 12.8
-"""Width of the gel's field of view."""
-_CAMERA_MM = 90.0
-"""Width of the camera's field of view at zoom 1."""
+_TOUCH_MM = 12.8  # width of the gel's field of view
+_CAMERA_MM = 90.0  # width of the camera's field of view at zoom 1
 MIN_SIZE, MAX_SIZE = 16, 512
 
 
@@ -46,14 +42,12 @@ class Material:
     name: str
     sight: str
     feel: str
-    colour: tuple[float, float, float]
-    """Mean reflectance; instances vary widely around it."""
+    colour: tuple[float, float, float]  # mean reflectance; instances vary widely around it
     wavelength_mm: tuple[float, float] = (0.9, 2.4)
     anisotropy: tuple[float, float] = (1.0, 1.3)
     irregularity: tuple[float, float] = (0.1, 0.6)
     gloss: tuple[float, float] = (0.0, 0.3)
-    soft: float = 0.5
-    """Fraction of soft instances (thin sheets on foam, panels on rubber, ...)."""
+    soft: float = 0.5  # fraction of soft instances (thin sheets on foam, panels on rubber, ...)
     rough: float = 0.5
 
 
@@ -106,8 +100,7 @@ class Instance:
     amplitude_mm: float
     gloss: float
     colour: NDArray[np.float32]
-    ink: NDArray[np.float32]
-    """Second colour, which follows the relief with either sign."""
+    ink: NDArray[np.float32]  # second colour, which follows the relief with either sign
     contrast: float
 
     @property

@@ -1,7 +1,5 @@
 """The random views of each step, which are a function of (seed, step)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -62,11 +60,7 @@ def load_chunks(
 
 
 def gel_mirror(run: Run, pack: Pack, device: torch.device) -> GelMirror | None:
-    """The object that flips touch images with their colours, or None if the run flips pixels only.
-
-    Raises:
-        ValueError: If the colours of the pack's sensors cannot be learned.
-    """
+    """The object that flips touch images with their colours, or None if the run flips pixels only."""
     return GelMirror(pack, device) if run.augment.gel_flip == "colour" else None
 
 

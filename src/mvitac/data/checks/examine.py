@@ -1,7 +1,5 @@
 """Runs all checks on a pack, or on a source that is packed as thumbnails first."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -64,13 +62,10 @@ class ThumbnailSource(Source):
 def examine(
     pack: Pack, counts: list[Count] | None = None, *, part: bool = False, window: Window = SINGLE
 ) -> list[Finding]:
-    """Run every check on ``pack``.
+    """Run every check on ``pack``; ``counts`` are published ones.
 
-    Args:
-        pack: The pack.
-        counts: Published counts, from the source.
-        part: Whether the pack is a part of the source. Classes missing here may be in the rest, so they are not "broken".
-        window: Frames that a row will show; checked if it is more than one.
+    Of a ``part`` of a source, missing classes may be in the rest, so they are not "broken". A ``window`` of several
+    frames is checked, too.
     """
     looks = look_at(pack)
     labels = [table_checks.missing_labels(pack), *table_checks.class_balance(pack), *value_checks.values(pack)]
@@ -129,20 +124,10 @@ def examine_source(
     quiet: bool = False,
     window: Window = SINGLE,
 ) -> tuple[list[Finding], list[Block]]:
-    """Check ``source``, which is read into a temporary pack of ``size`` px.
+    """Findings about ``source``, which is read into a temporary pack of ``size`` px, and the contact sheet's blocks.
 
-    Damaged items are a finding; it is an error only if nothing can be read.
-
-    Args:
-        source: The dataset.
-        num: Number of items to read, evenly spaced; 0 = all.
-        size: Side of the thumbnails in pixels.
-        workers: Number of processes; 0 = one per core.
-        quiet: Show no progress.
-        window: Frames that a row will show.
-
-    Returns:
-        The findings, and the blocks of the contact sheet.
+    ``num`` items are read, evenly spaced; 0 = all. Damaged items are a finding; it is an error only if nothing can be
+    read.
     """
     thumbnails = ThumbnailSource(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:

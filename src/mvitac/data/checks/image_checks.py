@@ -1,7 +1,5 @@
 """Checks of the images, by thumbnails [N, S, S, 3] of ``ImageStats``. They compare rows of one dataset with each other."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -10,11 +8,9 @@ from mvitac.data.checks.finding import Finding, share, some
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
 
-ORDER_COLUMNS = ("seq", "frame", "step", "time")
-"""Columns that give the order of the rows of a group."""
+ORDER_COLUMNS = ("seq", "frame", "step", "time")  # columns that give the order of the rows of a group
 MAX_LAG = 5
-BLOCK = 48
-"""Frames per measurement of the offset in a long sequence."""
+BLOCK = 48  # frames per measurement of the offset in a long sequence
 
 
 def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:

@@ -1,7 +1,5 @@
 """Checks of names: groups and classes that are probably one, typed in two ways."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import defaultdict

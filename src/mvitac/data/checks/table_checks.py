@@ -1,7 +1,5 @@
 """Checks of the table: damaged items, labels, classes, leaks between splits, sensors, numbers, published counts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,8 +11,7 @@ from mvitac.data.source import Count
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
 """Columns whose values should not be in more than one split either, if the dataset has them."""
-MIX = ("sensor", "vision_size", "touch_size")
-"""Columns that describe how an image was taken."""
+MIX = ("sensor", "vision_size", "touch_size")  # columns that describe how an image was taken
 
 
 def unreadable(pack: Pack) -> Finding:

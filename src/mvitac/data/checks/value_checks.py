@@ -1,7 +1,5 @@
 """Checks of tasks with values (units, outliers, glitches, stuck sensors, test outside train), and of windows of frames."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -15,8 +13,7 @@ UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", 
 """Units whose name at the end of a column's name, as in depth_mm, is taken for the unit of the column."""
 SPIKE_FRAMES, OUTLYING_FRAMES = 3, 15
 """Longest glitch, a value that leaves and comes back: within the usual range, and beyond it."""
-STUCK_FRAMES = 10
-"""Shortest constant stretch that is reported."""
+STUCK_FRAMES = 10  # shortest constant stretch that is reported
 
 
 def values(pack: Pack) -> list[Finding]:
@@ -63,8 +60,7 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, rec
 
 
 _SIDES = {"train": ("train", "val"), "test": ("test",)}
-Note = tuple[str, list[int]]
-"""What is wrong ("" = nothing), and the rows to look at."""
+Note = tuple[str, list[int]]  # what is wrong ("" = nothing), and the rows to look at
 
 
 def _recordings(pack: Pack, window: Window) -> list[np.ndarray]:

@@ -15,8 +15,6 @@ Sources: the owners' scripts (github.com/robertocalandra/the-feeling-of-success)
 split by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for their 32 and 8 objects.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -42,8 +40,7 @@ from mvitac.datasets.calandra.objects import (
 from mvitac.registry import to_json, unknown
 from mvitac.system.files import brief, digest
 
-VERSION = 1
-"""Version of this reader. Increase it when the same shards would give another pack."""
+VERSION = 1  # version of this reader. Increase it when the same shards would give another pack.
 Phase = Literal["before", "during", "after"]
 NUM_SHARDS, NUM_PER_SHARD, NUM_GRASPS = 38, 250, 9296
 SHARD = re.compile(r"calandra_corl2017_(\d{3})\.h5")

@@ -3,8 +3,6 @@
 Images are embedded as PNG, without loss. An episode is a touch group; timestamps are nominal (``fps``).
 """
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterator
@@ -21,15 +19,12 @@ from mvitac.datasets.lerobot.reader import RENAMED, VERSION
 from mvitac.system.files import write_json
 from mvitac.system.locks import new_folder
 
-ROWS_PER_GROUP = 100
-"""Rows per parquet row group, which is the smallest unit of reading."""
-FILE_BYTES = 100 << 20
-"""Size after which the next data file begins, as in lerobot."""
+ROWS_PER_GROUP = 100  # rows per parquet row group, which is the smallest unit of reading
+FILE_BYTES = 100 << 20  # size after which the next data file begins, as in lerobot
 FILES_PER_CHUNK = 1000
 TAKEN = {"timestamp", "task_index", "task", *RENAMED, *RENAMED.values()}
 """Column names reserved by the format or by our reader; a pack column of such a name is renamed."""
-NUM_FOR_STATS = 256
-"""Number of images used for mean and standard deviation."""
+NUM_FOR_STATS = 256  # number of images used for mean and standard deviation
 ONE_FILE = "chunk-000/file-000.parquet"
 
 

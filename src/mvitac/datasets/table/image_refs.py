@@ -25,8 +25,7 @@ from mvitac.system.files import brief
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 
 
-Damage = dict["ImageRef", str]
-"""Reference of a damaged image -> what is wrong with it."""
+Damage = dict["ImageRef", str]  # reference of a damaged image -> what is wrong with it
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +45,10 @@ class ImageRef(ABC):
     @staticmethod
     @abstractmethod
     def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        """Yield each reference with its image as RGB.
+        """Yield each reference with its image as RGB; damaged images go to ``lost`` instead.
 
-        Args:
-            refs: References in ascending order, all of one class and with one container.
-            lost: Receives the damaged images, which are not yielded.
-
-        Raises:
-            ValueError, OSError: If the container cannot be opened.
+        ``refs`` are in ascending order, all of one class and with one container. ValueError or OSError if that cannot
+        be opened.
         """
 
 

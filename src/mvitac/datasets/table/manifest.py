@@ -29,8 +29,7 @@ from mvitac.registry import unknown
 from mvitac.system.files import brief, digest, digest_file, parse_json
 
 MANIFESTS = (".csv", ".parquet", ".jsonl")
-NAN = ("nan", "NaN", "NAN")
-"""How programs write a missing number. "Nan" is a name."""
+NAN = ("nan", "NaN", "NAN")  # how programs write a missing number. "Nan" is a name.
 COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 
 
@@ -223,9 +222,8 @@ def _check_header(file: Path, columns: Sequence[str]) -> None:
 def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bool = False) -> Manifest:
     """Return the manifest of a tree of class folders (the layouts are in ``mvitac.datasets.folder``).
 
-    Args:
-        pictures: Modality of the images if the tree has no folders for modalities.
-        allow_missing: Leave a cell empty where an image has no counterpart.
+    ``pictures`` is the modality of the images if no folders name it; ``allow_missing`` leaves a cell without image
+    empty.
     """
     rows: list[dict[str, str]] = []
     for split in _split_folders(root) or [""]:

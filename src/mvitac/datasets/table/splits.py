@@ -1,7 +1,5 @@
 """Train/val/test splits: assign whole groups to splits, or validate a given split column."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -61,17 +59,10 @@ def assign_splits(
 def group_by_video(
     root: Path, numbers: Sequence[int], refs: Iterable[Sequence[ImageRef | None]]
 ) -> tuple[str, list[str]]:
-    """Group rows that no column groups: by video, with videos that occur in the same row as one group.
+    """What a group is ("video" or "row") and the group of each row, for rows that no column groups.
 
-    A row of image files is its own group.
-
-    Args:
-        root: Folder that names of videos are relative to.
-        numbers: Row numbers.
-        refs: For each image column, one reference per row.
-
-    Returns:
-        What a group is ("video" or "row"), and the group of each row.
+    Videos that occur in the same row are one group. A row of image files is its own group. ``refs`` has one reference
+    per row for each image column.
     """
     columns = list(refs)
     videos = [
@@ -174,8 +165,7 @@ def add_folds(rows: Sequence[dict[str, str]], strata: Sequence[str], num: int, v
             row[column] = split
 
 
-SCALE = 1_000_000
-"""Fractions are integers in millionths, so that the result is the same on every machine."""
+SCALE = 1_000_000  # fractions are integers in millionths, so that the result is the same on every machine
 
 
 def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.ndarray:

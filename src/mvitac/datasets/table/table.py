@@ -3,8 +3,6 @@
 The table is checked completely before the first image is decoded.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
@@ -43,12 +41,10 @@ from mvitac.datasets.table.splits import BY_GROUP, group_by_video
 from mvitac.registry import LATER, to_json
 from mvitac.system.files import digest
 
-VERSION = 3
-"""Version of this reader. Increase it when the same table would give another pack."""
+VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
 CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet")
 """Controls that every probe computes by itself."""
-MAX_TOGETHER = 1024
-"""Rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``."""
+MAX_TOGETHER = 1024  # rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``
 MAX_TOGETHER_BYTES = 600 << 20
 """Memory per worker for these images at the stored size: 1024 rows of two gels and a camera at 256 px."""
 

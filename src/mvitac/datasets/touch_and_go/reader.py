@@ -10,8 +10,6 @@ are in the owners' repository (see ``lists.py``). One pack has all three tasks; 
 label -1.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,10 +44,8 @@ from mvitac.datasets.touch_and_go.recordings import (
 from mvitac.registry import to_json
 from mvitac.system.files import digest, digest_file
 
-VERSION = 1
-"""Version of this reader. Increase it when the same files would give another pack."""
-CHUNK = 256
-"""Frames of one recording that a worker holds at a time (100 MB of pairs at 256 px)."""
+VERSION = 1  # version of this reader. Increase it when the same files would give another pack.
+CHUNK = 256  # frames of one recording that a worker holds at a time (100 MB of pairs at 256 px)
 
 
 @dataclass(frozen=True, kw_only=True)

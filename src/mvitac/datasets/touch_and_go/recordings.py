@@ -3,8 +3,6 @@
 Each modality of a recording is an mp4 file or a folder of JPEGs named by frame number (the layout is in ``reader.py``).
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import re
@@ -109,8 +107,7 @@ def missing_report(missing: dict[str, str], num: int) -> str:
     return f"{len(missing)} of {num} listed recordings cannot be packed: {'; '.join(parts)}"
 
 
-Shape = tuple[int, int]
-"""Height and width."""
+Shape = tuple[int, int]  # height and width
 
 
 def read_frames(

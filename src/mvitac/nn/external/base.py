@@ -36,19 +36,13 @@ STATISTICS = {"imagenet": IMAGENET, "clip": CLIP, "none": PLAIN}
 class Loaded:
     """What an adapter opened."""
 
-    network: nn.Module
-    """As ``ExternalEncoder`` takes it."""
+    network: nn.Module  # as ``ExternalEncoder`` takes it
     preprocessing: Preprocessing
-    title: str
-    """Its name in tables."""
-    files: tuple[Path, ...] = ()
-    """Files with its weights."""
-    licence: str = UNKNOWN
-    """Licence of the weights."""
-    source: str = UNKNOWN
-    """Where they are from."""
-    trained_on: str = UNKNOWN
-    """The data it was trained on; ``NOTHING`` for random weights."""
+    title: str  # its name in tables
+    files: tuple[Path, ...] = ()  # files with its weights
+    licence: str = UNKNOWN  # licence of the weights
+    source: str = UNKNOWN  # where they are from
+    trained_on: str = UNKNOWN  # the data it was trained on; ``NOTHING`` for random weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,11 +171,7 @@ def seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
 
 
 def open_encoder(text: str) -> OpenEncoder:
-    """Open the encoder that ``text`` names (module docstring).
-
-    Raises:
-        ValueError: If there is no such encoder, an option is unknown, or the network does not take such images.
-    """
+    """Open the encoder that ``text`` names (module docstring); ValueError if that is not possible."""
     adapter = parse(text)
     loaded = adapter.load()
     given = {name: getattr(adapter, name) for name in ("licence", "trained_on") if getattr(loaded, name) == UNKNOWN}

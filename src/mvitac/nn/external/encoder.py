@@ -23,8 +23,7 @@ class Layout:
 
     sensors: int = 1
     frames: int = 1
-    gain: float = 0.0
-    """2 for difference images, (image - background) / 2 + 128; 0 for plain ones."""
+    gain: float = 0.0  # 2 for difference images, (image - background) / 2 + 128; 0 for plain ones
 
 
 class Plain(nn.Module):

@@ -6,8 +6,6 @@ code. No owner's code is used. MViTac's notebooks number the stages of torchvisi
 or without a name in front; with strict=False they would load nothing.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import ClassVar

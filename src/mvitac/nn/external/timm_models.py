@@ -3,8 +3,6 @@
 Preprocessing is that of the model's ``pretrained_cfg`` (huggingface/pytorch-image-models @aa4b585).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

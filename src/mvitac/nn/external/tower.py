@@ -24,8 +24,7 @@ from mvitac.nn.weights import read_safetensors
 from mvitac.system.files import brief
 
 Tensors = dict[str, Tensor]
-HEAD = 64
-"""Channels of an attention head."""
+HEAD = 64  # channels of an attention head
 
 
 def read_tensors(file: Path) -> Tensors:
