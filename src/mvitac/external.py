@@ -71,9 +71,7 @@ class ExternalModel(Model):
     @property
     def run(self) -> NoReturn:  # type: ignore[override]
         """External encoders have none."""
-        raise ValueError(
-            f"{self.text} was not trained here and has no run: use it with `mvitac probe --encoder` or `embed`"
-        )
+        raise ValueError(f"{self.text} was not trained here: use it with `mvitac probe --encoder` or `embed`")
 
     @property
     def seed(self) -> int:

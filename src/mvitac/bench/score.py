@@ -105,12 +105,8 @@ class Reader:
         model, pack = self.bound
         asked = [(task, m) for ask, task in self.opened.tasks for m in ask.modalities if modality in names_in(m, pack)]
         rows = np.unique(np.concatenate([split_rows(v, task, m).all for v in self.opened.packs for task, m in asked]))
-        z = joined(
-            [
-                features(model, v, modality, rows, maps=maps)
-                for v in sensors(pack, modality, model.spec.channels(modality))
-            ]
-        )
+        parts = sensors(pack, modality, model.spec.channels(modality))
+        z = joined([features(model, part, modality, rows, maps=maps) for part in parts])
         if z.ndim != 2 + maps or len(z) != len(rows):
             raise ValueError(
                 f"{self.name} gives features of shape {list(z.shape)} for {len(rows)} images of {modality}: give one"

@@ -149,9 +149,7 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
         packs = _fold(pack, one) if one.folds else (pack,)
         found = {"rows": _rows_digest(packs, [task for _, task in tasks]), **_image_digests(made)}
         return Opened(form.name, packs, tasks, found, _compared(one, form, found))
-    places = " or ".join(
-        dict.fromkeys(str((root or Path()) / place) for form in one.forms for place in form.at.values())
-    )
+    places = " or ".join(dict.fromkeys(str((root or Path()) / p) for form in one.forms for p in form.at.values()))
     return f"{places} is not there" if root else f"no --data-root was given, where {places} would be"
 
 
@@ -177,9 +175,8 @@ def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
     kept = sorted(set(groups[answered].tolist()))
     if one.folds > len(kept):
         raise ValueError(f"{one.name} has {len(kept)} labelled groups, the suite asks for {one.folds} folds")
-    columns = folds(
-        kept, [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept], one.folds, one.val_every
-    )
+    strata = [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept]
+    columns = folds(kept, strata, one.folds, one.val_every)
     found = []
     for column in columns.values():
         side = dict(zip(kept, column, strict=True))
@@ -214,7 +211,5 @@ def _rows_digest(packs: Sequence[Pack], tasks: Sequence[AnyTask]) -> str:
 
 def _image_digests(packs: Sequence[Pack]) -> dict[str, str]:
     """Digests of the images by modality; of the scored pack with the prefix "scored"."""
-    files = [
-        (prefix, *item) for prefix, pack in zip(("", "scored "), packs, strict=False) for item in pack.digests.items()
-    ]
+    files = [(by, *item) for by, pack in zip(("", "scored "), packs, strict=False) for item in pack.digests.items()]
     return {prefix + name.partition(".")[0]: found for prefix, name, found in files if name != "samples.parquet"}

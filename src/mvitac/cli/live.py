@@ -247,9 +247,7 @@ def sources(
     if not given:
         return {m: tuple(f"sim:{i}" for i in range(shape[2] // 3)) for m, shape in inputs.items()}
     for modality in inputs.keys() - given.keys():
-        raise ValueError(
-            f"the model takes {modality} too: give --{modality} SOURCE (--{modality} sim for a simulated one)"
-        )
+        raise ValueError(f"the model takes {modality} too: give --{modality} SOURCE (--{modality} sim simulates one)")
     for modality in given.keys() - inputs.keys():
         raise ValueError(f"the model has no input for {modality}: leave --{modality} out")
     return given
@@ -322,9 +320,8 @@ def view(loop: "Live") -> Any:
     wide = max([10, *map(len, titles.values()), *(len(reading.name) for reading in values)])
     for task, (name, confidence) in loop.answers(touch).items():
         sure = "" if confidence >= loop.config.min_confidence else "  unsure"
-        lines.append(
-            Text(f"{titles[task]:{wide}} {name:18} {'#' * round(20 * confidence):20} {100 * confidence:3.0f} %{sure}")
-        )
+        bar = "#" * round(20 * confidence)
+        lines.append(Text(f"{titles[task]:{wide}} {name:18} {bar:20} {100 * confidence:3.0f} %{sure}"))
     lines += [Text(f"{reading.name:{wide}} {reading}") for reading in values]
     if touch and touch.known:
         lines.append(Text("like: " + "; ".join(touch.known)))
@@ -349,9 +346,7 @@ def _print_summary(summary: dict[str, Any]) -> None:
     age = summary["age_ms"]
     if age["p50"] is not None:
         print("end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**age))
-    print(
-        f"{summary['predictions']} predictions in {summary['touches']} touches; {summary['stale']} frames too old to use"
-    )
+    print("{predictions} predictions in {touches} touches; {stale} frames too old to use".format(**summary))
     for name, s in summary["streams"].items():
         print(f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged")
     if summary["events"]:

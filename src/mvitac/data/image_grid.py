@@ -67,10 +67,8 @@ def draw(
 
 
 def _block(block: Block, cell: int, columns: int, room: int) -> Image.Image:
-    cells = [
-        _stack([_framed(tile), *([_text(tile.caption, cell, 12, INK)] if tile.caption else [])], 2)
-        for tile in block.tiles
-    ]
+    captions = [[_text(tile.caption, cell, 12, INK)] if tile.caption else [] for tile in block.tiles]
+    cells = [_stack([_framed(tile), *under], 2) for tile, under in zip(block.tiles, captions, strict=True)]
     rows = [_row(cells[i : i + columns], cell, GAP) for i in range(0, len(cells), columns)]
     heading = [_text(block.heading, room, 14, INK)] if block.heading else []
     return _stack([*heading, *rows], 4)

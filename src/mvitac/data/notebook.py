@@ -53,7 +53,6 @@ def _strip(pack: Pack, modality: str, rows: np.ndarray) -> str:
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(np.concatenate([pack.images[modality][int(row)][..., :3] for row in rows], axis=1)).save(
-        file, "PNG"
-    )
+    rgb = [pack.images[modality][int(row)][..., :3] for row in rows]
+    Image.fromarray(np.concatenate(rgb, axis=1)).save(file, "PNG")
     return f'<img alt="{modality}" src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'

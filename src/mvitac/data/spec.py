@@ -145,9 +145,8 @@ class DataSpec:
         units: dict[str, str] = {}
         for target in (target for task in self.values for target in task.targets):
             if units.setdefault(target.name, target.unit) != target.unit:
-                raise ValueError(
-                    f"{target.name!r} has two units, {units[target.name]} and {target.unit}: give a column one unit"
-                )
+                unit = units[target.name]
+                raise ValueError(f"{target.name!r} has two units, {unit} and {target.unit}: give a column one unit")
 
     @property
     def all_tasks(self) -> tuple[AnyTask, ...]:

@@ -77,9 +77,7 @@ class StreamedPack(Pack):
         try:
             super().__init__(folder, verify=False)
         except ValueError as error:
-            (folder / "samples.parquet").unlink(
-                missing_ok=True
-            )  # else it would remain after the one at the URL is repaired
+            (folder / "samples.parquet").unlink(missing_ok=True)  # else it would outlive a repair at the URL
             raise ValueError(str(error).replace(str(folder), url)) from None
 
     @property

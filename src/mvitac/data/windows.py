@@ -125,9 +125,7 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
         place = np.full(pack.num, np.nan)
     if not np.isfinite(place).all():
         row = int(np.flatnonzero(~np.isfinite(place))[0])
-        raise ValueError(
-            f"frames: column {name!r} is not a number in row {row}: give one in every row, or another order"
-        )
+        raise ValueError(f"frames: column {name!r} is not a number in row {row}: give all rows one, or another order")
     return name, place
 
 

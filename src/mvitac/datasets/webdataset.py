@@ -63,9 +63,7 @@ class WebDatasetConfig(RowsConfig):
                     if f".{last}" in IMAGES:
                         column = name or self.pictures
                         if column in places.setdefault(key, {}):
-                            raise ValueError(
-                                f"{shard} has two {column} images of {key}: names must differ between shards"
-                            )
+                            raise ValueError(f"{shard} has two {column} images of {key}: names must differ")
                         places[key][column] = TarMember(str(shard), member.offset_data, member.size)
                     elif last in ("json", "cls", "txt"):
                         file = tar.extractfile(member)

@@ -202,9 +202,7 @@ def _torch(path: Path, precision: str, threads: int) -> Call:
         torch.set_num_threads(threads)
         try:
             with torch.inference_mode():
-                return [
-                    x.numpy() for x in module(*(torch.tensor(a) for a in arrays))
-                ]  # a copy: memory-mapped images are read-only
+                return [x.numpy() for x in module(*(torch.tensor(a) for a in arrays))]  # a copy: images are read-only
         finally:
             torch.set_num_threads(before)
 

@@ -71,9 +71,8 @@ class ObservationEncoder(nn.Module):
             for name in names:
                 image = self._get(observation, name)
                 if image.ndim not in (4, 5) or image.shape[-3] != 3:
-                    raise ValueError(
-                        f"{name}: expected images [B, 3, H, W] or [B, T, 3, H, W], got {tuple(image.shape)}"
-                    )
+                    shape = tuple(image.shape)
+                    raise ValueError(f"{name}: expected images [B, 3, H, W] or [B, T, 3, H, W], got {shape}")
                 self._check_range(name, image)
                 lead = image.shape[:-3]
                 views.append(encoder_input(resized(image.flatten(0, -4), self.stored), self.size))

@@ -149,9 +149,8 @@ def probe_runs(
         result["statistics"] = describe_statistics(pack, session.standardise)
     if session.sensors:
         found_by = zip(names, models, strict=True)
-        result["sensors"] = [
-            {"source": n, "seed": m.run.seed, **r} for n, m in found_by for r in sensor_records(m, pack)
-        ]
+        found_of = ((n, m, r) for n, m in found_by for r in sensor_records(m, pack))
+        result["sensors"] = [{"source": n, "seed": m.run.seed, **r} for n, m, r in found_of]
     for path in paths:
         write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
     return Scores(result)
@@ -184,9 +183,7 @@ def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
         return pack
     packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
-        raise ValueError(
-            "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
-        )
+        raise ValueError("these runs were trained on different data: probe them one by one, or on one pack with --on")
     return packs[0]
 
 

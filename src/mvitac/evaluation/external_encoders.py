@@ -21,9 +21,8 @@ def open_encoders(texts: Sequence[str], pack: Pack | None) -> list[Bound]:
     found: list[Bound] = []
     for model in map(load_external, texts):
         if any((model.title, model.seed) == (other.title, other.seed) for other, _ in found):
-            raise ValueError(
-                f"{model.text}: {model.title!r} with seed {model.seed} is given twice: give it a title=NAME"
-            )
+            who = f"{model.title!r} with seed {model.seed}"
+            raise ValueError(f"{model.text}: {who} is given twice: give it a title=NAME")
         assert pack is not None
         found.append(model.on(pack))
     return found

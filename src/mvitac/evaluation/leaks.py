@@ -80,10 +80,8 @@ def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list
         try:
             with safetensors.safe_open(folder / FILE, framework="numpy") as file:
                 names = file.metadata()
-                return [
-                    Source(names[i], *(file.get_tensor(f"{i}.{k}") for k in ("ids", "groups")))
-                    for i in sorted(names, key=int)
-                ]
+                tensors = file.get_tensor
+                return [Source(names[i], tensors(f"{i}.ids"), tensors(f"{i}.groups")) for i in sorted(names, key=int)]
         except Exception as error:  # safetensors raises several types for damaged files
             raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
     own = pack if pack.digest == digest else _own_pack(folder, run)
@@ -119,9 +117,8 @@ class Scored:
         found = []
         for source in sources:
             groups = np.unique(self._groups[rows])
-            num_rows, num_groups = (
-                int(np.isin(a, b).sum()) for a, b in ((self._ids[rows], source.ids), (groups, source.groups))
-            )
+            both = (self._ids[rows], source.ids), (groups, source.groups)
+            num_rows, num_groups = (int(np.isin(a, b).sum()) for a, b in both)
             if num_rows or num_groups:
                 by = self.pack.spec.group_by
                 found.append(

@@ -216,9 +216,8 @@ def probe_model(
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
         return []
-    needed = np.unique(
-        np.concatenate([split_rows(pack, t, m).all for t in tasks for m in seen_by(pack, t, modalities)])
-    )
+    parts = [split_rows(pack, task, m).all for task in tasks for m in seen_by(pack, task, modalities)]
+    needed = np.unique(np.concatenate(parts))
     own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
 
     def source_of(maps: bool) -> FeatureSource:

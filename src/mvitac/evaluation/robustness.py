@@ -166,9 +166,8 @@ def _dropout(case: _Case) -> Scores:
 
 def _without(lost: str, clean: dict[str, np.ndarray], num: int) -> np.ndarray:
     """Features of both modalities [N, D], those of ``lost`` replaced by the mean of its first ``num`` rows."""
-    return np.concatenate(
-        [np.broadcast_to(z[:num].mean(0), z.shape) if m == lost else z for m, z in clean.items()], axis=1
-    )
+    means = {m: np.broadcast_to(z[:num].mean(0), z.shape) if m == lost else z for m, z in clean.items()}
+    return np.concatenate([*means.values()], axis=1)
 
 
 def _few(rows: ProbeSplit, labels: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, ProbeSplit]:

@@ -134,9 +134,7 @@ class RecolouredPack(JoinedPack):
             raise ValueError("--standardise colours knows single images of one gel only: leave it out")
         self.new = {n for n, name in enumerate(self.sensor_names) if name not in learn.sensor_names}
         if not self.new:
-            raise ValueError(
-                f"--standardise colours: all sensors of {score.path} are in {learn.path} too, leave it out"
-            )
+            raise ValueError(f"--standardise colours: all sensors of {score.path} are in {learn.path}, leave it out")
         rows = np.bincount(self.sensors[: learn.num], minlength=len(self.sensor_names))
         old = np.argsort(-rows, kind="stable")[: min(len(learn.sensor_names), MAX_LOOKS)]
         learned = {number: _colours_of(self, number) for number in self.new}

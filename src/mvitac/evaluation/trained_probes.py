@@ -42,9 +42,8 @@ def fit_network(
     """
     build = partial(_network, kind, x, y, num_out, seed)
     answers, num = torch.from_numpy(y), len(x) - num_val
-    held = [
-        _loss_on(network, x[num:], answers[num:]) for network in _trained(build(), x[:num], answers[:num], STEPS, seed)
-    ]
+    networks = _trained(build(), x[:num], answers[:num], STEPS, seed)
+    held = [_loss_on(network, x[num:], answers[num:]) for network in networks]
     steps = STEPS[int(np.argmin(held))]
     (network,) = _trained(build(), x, answers, (steps,), seed)
     return partial(_outputs, network), steps
@@ -86,9 +85,7 @@ class Standardised(nn.Module):
         super().__init__()
         self.network = network
         places = x.reshape(-1, x.shape[-1])
-        parts = np.array_split(
-            places, -(-len(places) // 4096)
-        )  # fp16 maps of many rows would fill the memory as floats
+        parts = np.array_split(places, -(-len(places) // 4096))  # all rows' maps as floats may not fit
         mean = sum(part.sum(0, dtype=float) for part in parts) / len(places)
         std = np.sqrt(sum(((part - mean) ** 2).sum(0) for part in parts) / len(places))
         self.register_buffer("mean", torch.from_numpy(mean).float())

@@ -96,9 +96,7 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
     """Return ``own`` if it has the samples, splits and labels of ``pack``."""
     for name in ("id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)):
         if name not in own.table.column_names or not np.array_equal(own.column(name), pack.column(name)):
-            raise ValueError(
-                f"its data {own.path} has another column {name} than {pack.path}: compare the same samples"
-            )
+            raise ValueError(f"its data {own.path} has another column {name} than {pack.path}: give the same samples")
     return own
 
 
@@ -280,6 +278,5 @@ def _time_left(work: Work, todo: Sequence[Job], images: dict[str, int], measure:
     usual = statistics.fmean(1 / speed for found in speeds.values() for speed in found)
     paces = {label: statistics.fmean(1 / speed for speed in found) for label, found in speeds.items()}
     seconds = sum(images[job.label] * paces.get(job.label, usual) for job in todo)
-    return (
-        f"{len(todo)} runs left, about {duration(seconds)} of training one after another ({told}); scoring comes on top"
-    )
+    left = f"{len(todo)} runs left, about {duration(seconds)} of training one after another"
+    return f"{left} ({told}); scoring comes on top"

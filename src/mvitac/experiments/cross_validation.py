@@ -37,9 +37,8 @@ def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "au
         work = lay_out(part, pack, out / fold, session, device)
         works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
     left_out = {label: reason for work in works for label, reason in work.left_out.items()}
-    works = [
-        replace(work, jobs=[job for job in work.jobs if job.label not in left_out], left_out=left_out) for work in works
-    ]
+    keep = [[job for job in work.jobs if job.label not in left_out] for work in works]
+    works = [replace(work, jobs=jobs, left_out=left_out) for work, jobs in zip(works, keep, strict=True)]
     if not works[0].jobs:
         raise ValueError(f"plan {plan.name!r} has no row that all folds allow: {next(iter(left_out.values()))}")
     return works
@@ -71,9 +70,8 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
     if len(results) == 1:
         return {**results[0], "plan": to_json(plan)}
     retrieval = [r for result in results for r in result["retrieval"] if r["num_groups"] >= MIN_GALLERY]
-    merged = {
-        key: [value for result in results for value in result[key]] for key in ("notes", "run_commits", "run_devices")
-    }
+    lists = ("notes", "run_commits", "run_devices")
+    merged = {key: [value for result in results for value in result[key]] for key in lists}
     return {
         **results[0],
         "plan": to_json(plan),

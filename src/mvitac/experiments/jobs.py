@@ -59,9 +59,8 @@ class Job:
     @property
     def asked(self) -> dict[str, Any]:
         """The probes, tasks and modalities to score, as stored with the scores."""
-        return to_json(
-            ProbeConfig(probes=self.session.probes, tasks=self.session.tasks, modalities=self.session.modalities)
-        )
+        asked = self.session
+        return to_json(ProbeConfig(probes=asked.probes, tasks=asked.tasks, modalities=asked.modalities))
 
     @property
     def failure(self) -> str:
@@ -136,9 +135,8 @@ def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -
         records = stress(load(job.out), pack, *chosen(pack, job.session))
         own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
         write_json(job.out / "stress.json", {"asked": job.asked, "records": [{**own, **record} for record in records]})
-    write_json(
-        job.out / "scores.json", {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
-    )
+    scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
+    write_json(job.out / "scores.json", scores)
     job.drop_checkpoint()
     return f"{seconds_of(job.out):.0f} s of training"
 

@@ -37,9 +37,7 @@ class Row:
 
     def __post_init__(self) -> None:
         if self.encoder and (self.method, self.recipe, self.set) != ("mvitac", None, {}):
-            raise ValueError(
-                f"row {self.label!r} has an encoder, which is not trained: leave out method, recipe and set"
-            )
+            raise ValueError(f"row {self.label!r} is an encoder, not trained: leave out method, recipe and set")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,9 +116,8 @@ class Plan:
             return [("", self)]
         assert self.data is not None
         whole = recipe(self.recipe, self.data, phased=False)  # for its data alone
-        parts = [
-            {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
-        ]
+        pairs = [dict(setting(pair, "fold") for pair in fold.split(",")) for fold in self.folds]
+        parts = [{f"data.{name}": value for name, value in pair.items()} for pair in pairs]
         names = [slug(" ".join(str(value) for value in part.values())) for part in parts]
         if len(set(names)) < len(names):
             names = [slug(fold) for fold in self.folds]

@@ -97,22 +97,17 @@ class DINO(Contrastive):
     def __init__(self, config: DINOConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.student = build_towers(
-            encoder, spec, lambda width: Prototypes(width, config.hidden, config.out, config.prototype_norm)
-        )
+        sizes = config.hidden, config.out, config.prototype_norm
+        self.student = build_towers(encoder, spec, lambda width: Prototypes(width, *sizes))
         self.teacher = nn.ModuleDict({m: Momentum(tower) for m, tower in self.student.items()})
         self.register_buffer("centre", torch.zeros(len(self.student), config.out))
         self.pending: Tensor | None = None
 
     def queries(self, batch: Views) -> Embeddings:
-        return {
-            ("student", m, i): tower(batch.images[m][i]) for m, tower in present(self.student, batch) for i in (0, 1)
-        }
+        return {("student", m, i): t(batch.images[m][i]) for m, t in present(self.student, batch) for i in (0, 1)}
 
     def keys(self, batch: Views) -> Embeddings:
-        return {
-            ("teacher", m, i): tower(batch.images[m][i]) for m, tower in present(self.teacher, batch) for i in (0, 1)
-        }
+        return {("teacher", m, i): t(batch.images[m][i]) for m, t in present(self.teacher, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         config, losses, means = self.config, {}, []

@@ -108,9 +108,8 @@ class MAE(Contrastive):
             images = batch.images[modality][0]
             other = next((seen[m] for m in seen if m != modality), None)
             decoder = self.decoders[modality]
-            predicted = decoder(seen[modality], hidden[modality][:, None], vit.grid_of(trunk, images), other=other)[
-                :, 0
-            ]
+            size = vit.grid_of(trunk, images)
+            predicted = decoder(seen[modality], hidden[modality][:, None], size, other=other)[:, 0]
             with torch.autocast(images.device.type, enabled=False):
                 values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
                 error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2

@@ -168,9 +168,8 @@ class MViTac(Contrastive):
         super().__init__()
         self.config = config
         # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
-        self.query = nn.ModuleDict(
-            {m: Tower(config, encoder, spec.channels(m), spec.frames(m)) for m in spec.modalities}
-        )
+        towers = {m: Tower(config, encoder, spec.channels(m), spec.frames(m)) for m in spec.modalities}
+        self.query = nn.ModuleDict(towers)
         momentum = self.query if config.keys == "momentum" else {}
         running = config.key_norm == "running"
         self.key = nn.ModuleDict({m: Momentum(tower, running_norm=running) for m, tower in momentum.items()})
@@ -183,9 +182,8 @@ class MViTac(Contrastive):
     def keys(self, batch: Views) -> Embeddings:
         """Eq. 5, 7, 10, 13. End-to-end keys are the queries themselves, so there is nothing to add."""
         views = (1, 0) if self.config.both_ways else (1,)
-        return embed("k", self.key, batch, views, more=True) | {
-            ("both", m): positions for m, positions in batch.both.items()
-        }
+        z = embed("k", self.key, batch, views, more=True)
+        return z | {("both", m): positions for m, positions in batch.both.items()}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         k = "q" if self.config.keys == "end-to-end" else "k"

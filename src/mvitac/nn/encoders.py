@@ -201,9 +201,8 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
         if not Path(config.weights).is_file():
             raise ValueError(f"weights {config.weights!r}: give imagenet, scratch, or a file that exists")
         try:
-            return timm.create_model(
-                config.trunk, pretrained=True, pretrained_cfg_overlay={"file": config.weights}, **arguments
-            )
+            overlay = {"file": config.weights}
+            return timm.create_model(config.trunk, pretrained=True, pretrained_cfg_overlay=overlay, **arguments)
         except Exception as error:  # torch, safetensors and timm raise different types for an unsuitable file
             raise ValueError(f"{config.weights} does not hold weights for {config.trunk}: {brief(error)}") from None
     return _with_imagenet(config.trunk, arguments)

@@ -50,9 +50,7 @@ class Init:
         if self.path.is_file():
             return self.path
         if not self.path.is_dir():
-            raise ValueError(
-                f"init {self.path} does not exist: give the folder of a run or artifact, or a .safetensors"
-            )
+            raise ValueError(f"init {self.path} does not exist: give the folder of a run or artifact, or .safetensors")
         if not (self.path / MODEL).is_file():
             unfinished = (self.path / "checkpoint.pt").exists()
             why = "its run is not finished, continue it with --resume" if unfinished else "give that of a finished run"

@@ -133,9 +133,8 @@ def examine_source(
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         options: dict[str, Any] = {"size": size, "workers": workers, "quiet": quiet}
         pack = build(thumbnails, Path(folder) / "pack", max_damaged=1.0, **options)
-        findings = examine(
-            pack, thumbnails.expected(), part=len(thumbnails.items()) < len(source.items()), window=window
-        )
+        partly = len(thumbnails.items()) < len(source.items())
+        findings = examine(pack, thumbnails.expected(), part=partly, window=window)
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
         return findings, blocks_of(pack, findings)

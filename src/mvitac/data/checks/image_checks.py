@@ -44,11 +44,7 @@ def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             notes.append(f"{name}: all without colour")
     verdict = "look" if rows else "ok"
     evidence = "; ".join(notes) or "all in colour"
-    advice = (
-        "different cameras or converters: convert all in the same way, or mark them as different sensors"
-        if rows
-        else ""
-    )
+    advice = "different cameras or converters: convert all alike, or mark them as different sensors" if rows else ""
     return Finding(item="grayscale among colour", verdict=verdict, evidence=evidence, advice=advice, rows=tuple(rows))
 
 

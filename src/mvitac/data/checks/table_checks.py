@@ -104,10 +104,8 @@ def class_balance(pack: Pack) -> list[Finding]:
         if majority > 0.9 or (majority > 0.75 and len(task.classes) > 2):
             verdict, advice = "look", "report balanced accuracy as well"
         if unseen:
-            verdict, advice = (
-                "broken",
-                "these cannot be learned: assign the groups to splits again, or drop the classes",
-            )
+            verdict = "broken"
+            advice = "these cannot be learned: assign the groups to splits again, or drop the classes"
             evidence += f"; tested but never seen in training: {some(unseen)}"
         findings.append(Finding(item=item, verdict=verdict, evidence=evidence, advice=advice))
     return findings
@@ -149,9 +147,8 @@ def leaks(pack: Pack) -> list[Finding]:
                 kind = f" ({pack.spec.group_by})" if name == "group" else ""
                 test = on.get("test", set())
                 of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""
-                notes.append(
-                    f"{name}{kind}: {len(both)} of {len(set(values))} in more than one split, e.g. {both[0]!r}{of}"
-                )
+                num = f"{len(both)} of {len(set(values))}"
+                notes.append(f"{name}{kind}: {num} in more than one split, e.g. {both[0]!r}{of}")
                 for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
@@ -245,11 +242,8 @@ def numbers(pack: Pack) -> Finding:
         good = values[~bad]
         if len(good) >= 8:
             low, middle, high = np.percentile(good, [5, 50, 95])
-            far = (
-                np.flatnonzero(np.abs(np.where(bad, middle, values) - middle) > 100 * (high - low))
-                if high > low
-                else []
-            )
+            values_far = np.abs(np.where(bad, middle, values) - middle) > 100 * (high - low)
+            far = np.flatnonzero(values_far) if high > low else []
             if len(far):
                 notes.append(f"{name} is {values[far[0]]:g} in row {far[0]}, others {low:g} to {high:g}")
                 rows += list(far)
@@ -301,9 +295,8 @@ def give_aways(pack: Pack) -> Finding:
 def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
     """Return whether the values are few and each has one label only: the label itself, or another name for it."""
     names, numbers = np.unique(values, return_inverse=True)
-    return len(names) <= 2 * len(np.unique(labels)) and all(
-        len(set(labels[numbers == i])) == 1 for i in range(len(names))
-    )
+    one_class = (len(set(labels[numbers == i])) == 1 for i in range(len(names)))
+    return len(names) <= 2 * len(np.unique(labels)) and all(one_class)
 
 
 def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
@@ -327,9 +320,7 @@ def _parsed(values: np.ndarray) -> np.ndarray | None:
     known = 0
     for i, cell in enumerate(values):
         try:
-            out[i] = float(
-                "" if "_" in str(cell) else cell
-            )  # 20220319_002026 is a name, although Python reads it as a number
+            out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name
             known += 1
         except (TypeError, ValueError):
             continue

@@ -32,9 +32,7 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, rec
     measured = {side: rows[np.isfinite(found[rows])] for side, rows in sides.items()}
     if lacking := [side for side, rows in measured.items() if not len(rows)]:
         evidence = f"no row of {' and '.join(lacking)} has a value"
-        return Finding(
-            item=item, verdict="broken", evidence=evidence, advice="measure some, or assign the splits again"
-        )
+        return Finding(item=item, verdict="broken", evidence=evidence, advice="measure some or assign the splits again")
     rows = np.sort(np.concatenate(list(measured.values())))
     known = found[rows]
     low, middle, high = np.percentile(known, [0, 50, 100])
@@ -69,10 +67,8 @@ def _recordings(pack: Pack, window: Window) -> list[np.ndarray]:
         _, place = places(pack, window)
     except ValueError:
         return []
-    return [
-        rows[np.argsort(place[rows], kind="stable")]
-        for rows in map(pack.rows_of, range(int(pack.touch_groups.max()) + 1))
-    ]
+    touches = map(pack.rows_of, range(int(pack.touch_groups.max()) + 1))
+    return [rows[np.argsort(place[rows], kind="stable")] for rows in touches]
 
 
 def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
@@ -189,9 +185,7 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     if gaps:
         with_gaps = sum((step > 2.5 * rate).any() for step, rate in zip(steps, rates, strict=True))
         longest = max(step.max() / rate for step, rate in zip(steps, rates, strict=True))
-        evidence.append(
-            f"{gaps} gaps in {share(int(with_gaps), len(steps))} touches, the longest of {longest:.3g} frames"
-        )
+        evidence.append(f"{gaps} gaps in {share(int(with_gaps), len(steps))} touches, the longest {longest:.3g} frames")
         advice.append("a window across a gap shows an older frame than asked: split the touches there")
     if len(rates) and rates.max() > 1.25 * rates.min():
         evidence.append(f"frames are {rates.min():.3g} apart in some touches and {rates.max():.3g} in others")
@@ -199,6 +193,5 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     if too_short := set(pack.touch_groups.tolist()) - set(pack.touch_groups[whole].tolist()):
         evidence.append(f"{share(len(too_short), int(pack.touch_groups.max()) + 1)} touches are shorter than a window")
         advice.append("their first frame repeats in every row: give fewer frames or a smaller stride")
-    return Finding(
-        item=item, verdict="look" if advice else "ok", evidence="; ".join(evidence), advice="; ".join(advice)
-    )
+    verdict: Verdict = "look" if advice else "ok"
+    return Finding(item=item, verdict=verdict, evidence="; ".join(evidence), advice="; ".join(advice))

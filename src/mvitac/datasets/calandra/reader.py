@@ -188,9 +188,8 @@ class Calandra(Source):
         where = f"{grasp.shard:03d}-{grasp.index:03d}"
         with h5py.File(grasp.file) as file:
             for phase in (phase for phase in PHASES if phase in self.config.phases):
-                left, right, vision = (
-                    _image(file, f"{name}_{phase}", grasp) for name in ("gelsightA", "gelsightB", "kinectA_rgb")
-                )
+                names = (f"{name}_{phase}" for name in ("gelsightA", "gelsightB", "kinectA_rgb"))
+                left, right, vision = (_image(file, name, grasp) for name in names)
                 if left.shape != right.shape:
                     raise ValueError(
                         f"{grasp.file.name} i{grasp.index}: gelsightA_{phase} is {left.shape}, gelsightB_{phase} is"

@@ -69,9 +69,7 @@ def read_task(selected: Selection, column: str, counts: Sequence[bool]) -> tuple
     labelled = sum(bool(cell) for cell in cells)
     if len(names) < 2:
         what = f"only the class {min(names)!r}" if names else "no labels"
-        raise ValueError(
-            f"{selected.where}: column {column!r} has {what} in {len(cells)} rows: a task needs two classes"
-        )
+        raise ValueError(f"{selected.where}: column {column!r} has {what} in {len(cells)} rows: a task needs two")
     if len(names) == labelled >= 10:
         raise ValueError(
             f"{selected.where}: column {column!r} has another value in each of its {labelled} rows (e.g."
@@ -145,9 +143,7 @@ def read_values(
                 columns[target.name][i] = value
     for name, found in columns.items():
         if len({value for value in found if value == value}) < 2:  # NaN differs from itself
-            raise ValueError(
-                f"{selected.where}: column {name!r} has fewer than two different values: nothing to predict"
-            )
+            raise ValueError(f"{selected.where}: column {name!r} has fewer than two values: nothing to predict")
     known = [
         [0 if any(not math.isnan(columns[t.name][i]) for t in task.targets) else -1 for i in range(len(counts))]
         for task in tasks

@@ -232,9 +232,7 @@ def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bo
     for number, row in enumerate(rows, 1):
         if len(row) < len(columns) and not allow_missing:
             lacking = next(name for name in columns if name not in row)
-            raise ValueError(
-                f"{root} has {lacking} images in some splits only (row {number} has none): add or remove them"
-            )
+            raise ValueError(f"{root} has {lacking} images in some splits only (row {number} has none): add or remove")
     rows = [{name: row.get(name, "") for name in columns} for row in rows]
     if not rows:
         raise ValueError(f"{root} holds no images ({', '.join(IMAGES)}): put them in <class> folders")
@@ -272,9 +270,7 @@ def _split_rows(root: Path, split: str, pictures: str, allow_missing: bool) -> l
         label, *below = key.split("/")
         if not below:
             raise ValueError(f"{first} is not in a class folder: put it in one, named by its class")
-        row = {
-            name: images[key].relative_to(root).as_posix() if key in images else "" for name, images in found.items()
-        }
+        row = {n: images[key].relative_to(root).as_posix() if key in images else "" for n, images in found.items()}
         group = key.rpartition("/")[0] if len(below) > 1 else f"{split}/{key}"
         rows.append({**row, "label": label, "group": group, **({"split": split} if split else {})})
     return rows

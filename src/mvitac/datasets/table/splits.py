@@ -73,9 +73,8 @@ def group_by_video(
     for shown in videos:
         for video in shown[1:]:
             parent[_root(parent, video)] = _root(parent, shown[0])
-    groups = [
-        _root(parent, shown[0]) if shown else f"{number:06d}" for number, shown in zip(numbers, videos, strict=True)
-    ]
+    shown_in = zip(numbers, videos, strict=True)
+    groups = [_root(parent, shown[0]) if shown else f"{number:06d}" for number, shown in shown_in]
     return "video" if any(videos) else "row", groups
 
 
@@ -131,11 +130,8 @@ def check_sides(
     for task, target in zip(tasks, targets, strict=True):
         for side in ("train", "test"):
             if not any(label >= 0 and s == side for label, s in zip(target, splits, strict=True)):
-                hint = (
-                    "give more groups, or another --data.test-share"
-                    if split == BY_GROUP
-                    else "a probe needs train and test"
-                )
+                more = "give more groups, or another --data.test-share"
+                hint = more if split == BY_GROUP else "a probe needs train and test"
                 raise ValueError(f"{where}: {what} gives label {task.name!r} no labelled rows in {side}: {hint}")
 
 

@@ -281,9 +281,8 @@ class Rows(Source):
             group_by, groups = group_by_video(selected.manifest.root, selected.numbers, selected.refs.values())
         touch_group = self._config.touch_group
         touch_groups = selected.filled(touch_group, "touch_group") if touch_group else groups
-        return Grouping(
-            groups=groups, group_by=group_by, touch_groups=touch_groups, touch_group_by=touch_group or group_by
-        )
+        shared = touch_group or group_by
+        return Grouping(groups=groups, group_by=group_by, touch_groups=touch_groups, touch_group_by=shared)
 
     def _make_rows(
         self, selected: Selection, own: dict[str, Sequence[Any]], extra: dict[str, list[float]]

@@ -96,9 +96,8 @@ class Adapter(Registered, ABC):
 
     def changed(self, made: Preprocessing) -> Preprocessing:
         """``made`` with the values that options give."""
-        changes: dict[str, Any] = {
-            n: getattr(self, n) for n in ("frames", "stride", "offset") if getattr(self, n) is not None
-        }
+        options = ("frames", "stride", "offset")
+        changes: dict[str, Any] = {n: getattr(self, n) for n in options if getattr(self, n) is not None}
         for name, at in (("mean", 0), ("std", 1)):
             if text := getattr(self, name):
                 changes[name] = STATISTICS[text][at] if text in STATISTICS else _numbers(text, name, float, "/")

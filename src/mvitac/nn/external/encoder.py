@@ -47,11 +47,9 @@ class Plain(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         found = self.forward_features(images)
-        return (
-            found.mean((2, 3))
-            if found.ndim == 4
-            else found[:, min(self.num_prefix_tokens, found.shape[1] - 1) :].mean(1)
-        )
+        if found.ndim == 4:
+            return found.mean((2, 3))
+        return found[:, min(self.num_prefix_tokens, found.shape[1] - 1) :].mean(1)
 
 
 class ExternalEncoder(nn.Module):

@@ -29,9 +29,8 @@ class Notebooks(Adapter):
         tensors = read_tensors(self.path())
         if not any(name == "0.weight" for name in tensors):
             tensors = {re.sub(r"^[a-z]\w*\.", "", name): value for name, value in tensors.items()}
-        return _loaded(
-            self, under(tensors, "", NUMBERS), 256, "MViTac notebooks", "https://github.com/ligerfotis/mvitac"
-        )
+        made = under(tensors, "", NUMBERS)
+        return _loaded(self, made, 256, "MViTac notebooks", "https://github.com/ligerfotis/mvitac")
 
 
 @dataclass(frozen=True, kw_only=True)

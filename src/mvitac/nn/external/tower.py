@@ -53,9 +53,8 @@ def under(tensors: Tensors, start: str, names: Mapping[str, str] = {}) -> Tensor
 
 def depth(tensors: Tensors, start: str = "blocks.") -> int:
     """Number of blocks: one more than the largest number after ``start``."""
-    return 1 + max(
-        (int(found[1]) for n in tensors if (found := re.match(rf"{re.escape(start)}(\d+)\.", n))), default=-1
-    )
+    found = (re.match(rf"{re.escape(start)}(\d+)\.", name) for name in tensors)
+    return 1 + max((int(match[1]) for match in found if match), default=-1)
 
 
 def shape(adapter: Adapter, tensors: Tensors, name: str, dims: int) -> tuple[int, ...]:
