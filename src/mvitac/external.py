@@ -62,7 +62,7 @@ class ExternalModel(Model):
         for modality, part in parts.items():
             sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
             self.encoders[modality] = part.encoder.bound(Layout(sensors, spec.frames(modality), gains[modality]))
-        self.projectors, self.classifiers, self.tasks, self.readouts = nn.ModuleDict(), nn.ModuleList(), (), {}
+        self.projectors, self.classifiers, self.tasks, self.probes = nn.ModuleDict(), nn.ModuleList(), (), {}
         self.eval()
 
     def __repr__(self) -> str:

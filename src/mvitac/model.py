@@ -51,7 +51,7 @@ class Model(nn.Module):
         encoders: modality -> trunk.
         projectors: modality -> head into the shared space.
         tasks: Names of the tasks of the method's own heads (``classifiers``); empty for a self-supervised method.
-        readouts: Name -> linear probe, if the model is a published artifact.
+        probes: Name -> linear probe, if the model is a published artifact.
         foreign: Whether it is from an artifact or an index, which may be a stranger's: no place that ``run`` names is
             opened.
     """
@@ -67,7 +67,7 @@ class Model(nn.Module):
         self.tasks = tuple(own)
         self.classifiers = nn.ModuleList(own.values())
         # Not in the state dict: the weights of a run are the same with and without published probes.
-        self.readouts: dict[str, LinearProbe] = {}
+        self.probes: dict[str, LinearProbe] = {}
         self.eval()
 
     @property
@@ -310,20 +310,20 @@ class Model(nn.Module):
         asked = "both" if len(given) == 2 else next(iter(given))
         if len({len(x) for x in given.values()}) > 1:
             raise ValueError(f"predict: got {len(given['vision'])} vision and {len(given['touch'])} touch images")
-        chosen = [r for r in self.readouts.values() if r.question.modality == asked]
+        chosen = [r for r in self.probes.values() if r.info.modality == asked]
         if not chosen:
             raise ValueError(f"this model has no probe on {asked}: load an artifact written by `mvitac publish`")
-        return {r.question.task: r(torch.cat([given[m].cpu() for m in r.question.modalities], dim=1)) for r in chosen}
+        return {r.info.task: r(torch.cat([given[m].cpu() for m in r.info.modalities], dim=1)) for r in chosen}
 
     @property
     def classes(self) -> dict[str, tuple[str, ...]]:
         """task -> class names, in the order of the columns of ``predict``."""
-        return {q.task: q.classes for r in self.readouts.values() if isinstance(q := r.question, ProbeInfo)}
+        return {q.task: q.classes for r in self.probes.values() if isinstance(q := r.info, ProbeInfo)}
 
     @property
     def targets(self) -> dict[str, tuple[Target, ...]]:
         """task -> names and units of its values, in the order of the columns of ``predict``."""
-        return {q.task: q.targets for r in self.readouts.values() if isinstance(q := r.question, ValueInfo)}
+        return {q.task: q.targets for r in self.probes.values() if isinstance(q := r.info, ValueInfo)}
 
     def open_data(self, *, quiet: bool = False) -> Pack:
         """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""

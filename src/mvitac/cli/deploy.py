@@ -12,7 +12,7 @@ from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
 from mvitac.deploy.artifact import load, read_manifest
-from mvitac.deploy.publish import as_trained, own_data, with_readouts
+from mvitac.deploy.publish import as_trained, own_data, with_probes
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
 from mvitac.report.tables import print_summary
@@ -107,7 +107,7 @@ def export(argv: list[str]) -> None:
     pack = as_trained(model, pack)
     with shown(Console(stderr=True)):
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
-        report = exports.export(with_readouts(model, pack), pack, options.out, config, calibrate=calibrate)
+        report = exports.export(with_probes(model, pack), pack, options.out, config, calibrate=calibrate)
     Console(markup=False).print(_table(options.out, report))
 
 

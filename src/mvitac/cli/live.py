@@ -258,7 +258,7 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     from mvitac.deploy.artifact import load
     from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, import_openvino, lists_bf16
     from mvitac.deploy.export import export
-    from mvitac.deploy.publish import own_data, with_readouts
+    from mvitac.deploy.publish import own_data, with_probes
     from mvitac.model import safetensors_digest
     from mvitac.registry import to_json
     from mvitac.system.files import cache_dir, digest
@@ -270,13 +270,13 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
         return engine
     loaded = load(model)
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
-    probes = [[to_json(r.question), safetensors_digest(dict(r.state_dict()))] for r in loaded.readouts.values()]
+    probes = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
     key = digest([FORMAT_VERSION, loaded.weights_digest(), probes])
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
         pack = own_data(loaded, "`mvitac export MODEL --on PACK --out DIR` first, and give DIR")
-        export(with_readouts(loaded, pack), pack, folder)
+        export(with_probes(loaded, pack), pack, folder)
     return Engine(folder, threads=threads)
 
 

@@ -144,7 +144,7 @@ def read(folder: Path) -> PublishedModel:
                 f"{folder}: artifact.json says {name} {given.get(name)}, its model was trained with {asked.get(name)}:"
                 " predictions would be wrong, publish it again"
             )
-    model.readouts = read_probes(folder, manifest, model)
+    model.probes = read_probes(folder, manifest, model)
     return PublishedModel(model, folder).eval()
 
 
@@ -206,24 +206,24 @@ def read_probes(folder: Path, manifest: dict[str, Any], model: Model) -> dict[st
         values: tuple[ValueInfo, ...] = from_json(tuple[ValueInfo, ...], manifest.get("values", []), "values")
     except ValueError as error:
         raise ValueError(f"{folder / MANIFEST} is damaged ({error}): publish it again") from None
-    questions = (*classes, *values)
-    if not questions:
+    infos = (*classes, *values)
+    if not infos:
         return {}
     path = folder / "probes.safetensors"
     if path.name not in manifest["files"]:
         raise ValueError(f"{folder / MANIFEST} describes probes but names no {path.name}: publish it again")
     tensors = safetensors.torch.load_file(path)
-    expected = {f"{q.name}.{part}" for q in questions for part in ("weight", "bias")}
+    expected = {f"{q.name}.{part}" for q in infos for part in ("weight", "bias")}
     for name in sorted(expected ^ tensors.keys()):
         where = "is missing" if name in expected else "does not belong"
         raise ValueError(f"{path}: tensor {name!r} {where}: publish the artifact again")
-    readouts = {}
-    for question in questions:
-        if unknown := set(question.modalities) - set(model.encoders):
-            raise ValueError(f"{path}: probe {question.name} needs {unknown}, which this model has no encoder for")
-        dim = sum(int(model.encoders[m].num_features) for m in question.modalities)  # type: ignore[arg-type]
-        weight = tensors[f"{question.name}.weight"]
+    probes = {}
+    for info in infos:
+        if unknown := set(info.modalities) - set(model.encoders):
+            raise ValueError(f"{path}: probe {info.name} needs {unknown}, which this model has no encoder for")
+        dim = sum(int(model.encoders[m].num_features) for m in info.modalities)  # type: ignore[arg-type]
+        weight = tensors[f"{info.name}.weight"]
         if weight.shape[-1] != dim:
-            raise ValueError(f"{path}: probe {question.name} reads {weight.shape[-1]} features, the model gives {dim}")
-        readouts[question.name] = LinearProbe(question, weight, tensors[f"{question.name}.bias"])
-    return readouts
+            raise ValueError(f"{path}: probe {info.name} reads {weight.shape[-1]} features, the model gives {dim}")
+        probes[info.name] = LinearProbe(info, weight, tensors[f"{info.name}.bias"])
+    return probes

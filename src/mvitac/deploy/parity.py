@@ -32,7 +32,7 @@ def reference(
         found |= {
             f"shared_{m}": model.project(m, model.features(m, images[m], for_heads=True)) for m in graph.projectors
         }
-        found |= {output_of(r): r(joined) for r in graph.readouts}  # type: ignore[arg-type]
+        found |= {output_of(r): r(joined) for r in graph.probes}  # type: ignore[arg-type]
         chunks.append(found)
         advance(len(chunk))
     return {name: torch.cat([c[name] for c in chunks]).numpy() for name in graph.outputs}

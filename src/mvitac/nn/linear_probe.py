@@ -97,48 +97,48 @@ class LinearProbe(nn.Module):
     weight: Tensor
     bias: Tensor
 
-    def __init__(self, question: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor) -> None:
+    def __init__(self, info: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor) -> None:
         super().__init__()
-        num = len(question.outputs)
+        num = len(info.outputs)
         if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
             raise ValueError(
-                f"probe {question.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
-                f" do not fit {num} {'classes' if isinstance(question, ProbeInfo) else 'targets'}: expected [{num}, D] and"
+                f"probe {info.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
+                f" do not fit {num} {'classes' if isinstance(info, ProbeInfo) else 'targets'}: expected [{num}, D] and"
                 f" [{num}]"
             )
         if weight.dtype != torch.float32 or bias.dtype != torch.float32:
-            raise ValueError(f"probe {question.name}: weights are {weight.dtype}, expected torch.float32")
+            raise ValueError(f"probe {info.name}: weights are {weight.dtype}, expected torch.float32")
         if not (weight.isfinite().all() and bias.isfinite().all()):
-            raise ValueError(f"probe {question.name}: its weights are not all finite")
-        self.question = question
+            raise ValueError(f"probe {info.name}: its weights are not all finite")
+        self.info = info
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)
 
     def forward(self, features: Tensor) -> Tensor:
         """Probabilities [B, K] or values [B, T] of ``features`` [B, D]."""
         found = nn.functional.linear(features, self.weight, self.bias)
-        return torch.softmax(found, dim=1) if isinstance(self.question, ProbeInfo) else found
+        return torch.softmax(found, dim=1) if isinstance(self.info, ProbeInfo) else found
 
 
-def from_logistic(question: ProbeInfo, model: Any, mean: np.ndarray, std: np.ndarray) -> LinearProbe:
+def from_logistic(info: ProbeInfo, model: Any, mean: np.ndarray, std: np.ndarray) -> LinearProbe:
     """Convert a scikit-learn ``LogisticRegression`` fitted on (x - mean) / std; the scaling is folded into the weights."""
     coef, intercept = np.asarray(model.coef_, float), np.asarray(model.intercept_, float)
     if len(coef) == 1:  # with two classes scikit-learn has one logit, that of the second class
         coef, intercept = np.concatenate([0 * coef, coef]), np.concatenate([0 * intercept, intercept])
-    num = len(question.classes)
+    num = len(info.classes)
     weight, bias = np.zeros((num, coef.shape[1])), np.full(num, UNSEEN)
     weight[model.classes_] = coef / std
     bias[model.classes_] = intercept - (coef / std) @ mean
-    return LinearProbe(question, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
+    return LinearProbe(info, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
 
 
-def constant(question: ProbeInfo, label: int, dim: int) -> LinearProbe:
+def constant(info: ProbeInfo, label: int, dim: int) -> LinearProbe:
     """A probe that always predicts class ``label``, for training data with a single class."""
-    bias = torch.full((len(question.classes),), UNSEEN)
+    bias = torch.full((len(info.classes),), UNSEEN)
     bias[label] = 0
-    return LinearProbe(question, torch.zeros(len(question.classes), dim), bias)
+    return LinearProbe(info, torch.zeros(len(info.classes), dim), bias)
 
 
-def from_ridge(question: ValueInfo, weight: np.ndarray, bias: np.ndarray) -> LinearProbe:
+def from_ridge(info: ValueInfo, weight: np.ndarray, bias: np.ndarray) -> LinearProbe:
     """A probe of values with these weights [T, D] and biases [T]."""
-    return LinearProbe(question, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
+    return LinearProbe(info, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
