@@ -40,7 +40,7 @@ def run(page: Path, folder: Path) -> None:
         if not source.startswith("%%bash\n"):
             exec(compile(source, page.name, "exec"), names)
             continue
-        for command in source.splitlines()[1:]:
+        for command in source.replace("\\\n", " ").splitlines()[1:]:
             program, *arguments = shlex.split(command)
             assert program == "mvitac", f"{page.name} runs {program}, which this test cannot run"
             assert main(arguments) == 0, command
