@@ -8,8 +8,6 @@
 "external:sparsh:FILE+external:timm/resnet18".
 """
 
-from __future__ import annotations
-
 from typing import Any, NoReturn
 
 import torch
@@ -94,7 +92,7 @@ class ExternalModel(Model):
         """What its encoders were trained on, as far as it is known; ("nothing",) for random weights."""
         return tuple(dict.fromkeys(part.loaded.trained_on for part in self.parts.values()))
 
-    def on(self, pack: Pack) -> tuple[ExternalModel, Pack]:
+    def on(self, pack: Pack) -> "tuple[ExternalModel, Pack]":
         """This model and ``pack``, for each other; ValueError if they do not fit.
 
         The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows
@@ -129,7 +127,7 @@ class ExternalModel(Model):
                 notes.append(f"{modality}: its owner subtracts a background, this data has none: images as they are")
         return ExternalModel(self.text, parts, pack.spec, pack.size, tuple(notes)), pack
 
-    def untrained(self) -> ExternalModel | None:
+    def untrained(self) -> "ExternalModel | None":
         """The same networks with random weights, as a control; None where that is not possible."""
         parts = {m: random for m, part in self.parts.items() if (random := part.untrained())}
         if not parts:

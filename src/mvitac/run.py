@@ -1,7 +1,5 @@
 """``Run``: every setting that decides the outcome of pre-training. It is stored with each result as run.json."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -222,7 +220,7 @@ class Run:
         assert self.precision != "auto", "auto is resolved earlier (device.pick_precision)"
         return self.precision == "bf16"
 
-    def without_idle(self, spec: DataSpec) -> Run:
+    def without_idle(self, spec: DataSpec) -> "Run":
         """This run with every setting that has no effect on the dataset at a fixed value.
 
         Two runs that train alike on the dataset become equal.
@@ -241,7 +239,7 @@ class Run:
         return digest(value)
 
     @classmethod
-    def load(cls, value: Any) -> Run:
+    def load(cls, value: Any) -> "Run":
         """Create a run from the "run" object of a run.json."""
         return from_json(cls, value)
 

@@ -10,8 +10,6 @@ A pack stored as JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``data/j
 This module opens and checks packs; ``data/build.py`` builds them. It does not import torch.
 """
 
-from __future__ import annotations
-
 import functools
 import warnings
 import zlib
@@ -56,7 +54,7 @@ class Pack:
     format: ClassVar[str] = FORMAT
     window: int = 0
     """Number of shards whose rows training mixes at a time; 0 = all rows (shards: ``data/streaming.py``)."""
-    parts: Mapping[str, Pack] = MappingProxyType({})
+    parts: "Mapping[str, Pack]" = MappingProxyType({})
     """Name -> pack, for several packs that are opened as one (``data/mixed_pack.py``)."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:

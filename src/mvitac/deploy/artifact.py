@@ -10,8 +10,6 @@
 against its digest before it is parsed, and no file with another name is opened.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path
@@ -65,7 +63,7 @@ class PublishedModel(Model, ModelHubMixin):
     @classmethod
     def from_pretrained(
         cls, pretrained_model_name_or_path: str | Path, *, revision: str | None = None, **options: Any
-    ) -> PublishedModel:
+    ) -> "PublishedModel":
         """The artifact in a folder or on the Hub ("owner/name"); options of ``huggingface_hub.snapshot_download``."""
         local = Path(pretrained_model_name_or_path)
         return read(local if local.is_dir() else pull(str(pretrained_model_name_or_path), revision, **options))

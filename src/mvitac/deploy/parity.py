@@ -1,7 +1,5 @@
 """Whether an export is the trained model: its outputs on test rows next to those of the code that was scored."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -45,7 +43,7 @@ def parity(
     pack: Pack,
     rows: np.ndarray,
     wanted: dict[str, np.ndarray],
-    config: ExportConfig,
+    config: "ExportConfig",
     advance: Callable[[int], object] = lambda num: None,
 ) -> dict[str, Any]:
     """Compare the outputs of ``call`` for pack rows with ``wanted``.

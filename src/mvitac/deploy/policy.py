@@ -7,8 +7,6 @@
 Follows LeRobot's convention: images are [B, 3, H, W] (or [B, T, 3, H, W]), float in [0, 1] or uint8, RGB.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch
@@ -57,7 +55,7 @@ class ObservationEncoder(nn.Module):
         features = (int(e.num_features) for e in self.encoders.values())  # type: ignore[arg-type]
         self.out_features = sum(features) + state
 
-    def train(self, mode: bool = True) -> ObservationEncoder:
+    def train(self, mode: bool = True) -> "ObservationEncoder":
         """As for any module, but the encoders stay in eval mode: small batches of a policy would spoil their BatchNorm."""
         super().train(mode)
         self.encoders.eval()

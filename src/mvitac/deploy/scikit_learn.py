@@ -4,8 +4,6 @@ pipeline = make_pipeline(ImageFeatures("artifacts/mine", "touch"), StandardScale
 pipeline.fit(paths, labels)
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -47,7 +45,7 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
         self.modality = modality
         self.background = background
 
-    def fit(self, X: Any, y: Any = None) -> ImageFeatures:
+    def fit(self, X: Any, y: Any = None) -> "ImageFeatures":
         """Load the model. ``X`` and ``y`` are not used."""
         self.model_ = self.model if isinstance(self.model, Model) else load(self.model)
         for name in self._names():

@@ -9,8 +9,6 @@
 Shapes: N rows, Q queries, E dimensions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -119,7 +117,7 @@ def describe(pack: Pack, rows: np.ndarray) -> pa.Table:
     return pack.table.select(names).take(rows).append_column("row", pa.array(rows, pa.int64()))
 
 
-def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> Index:
+def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> "Index":
     """Index the complete pairs of a pack in the new folder ``out``, with a copy of the model for queries.
 
     A model with a space that both modalities share is indexed there, so that touch finds vision and vision finds touch;

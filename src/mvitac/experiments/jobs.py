@@ -4,8 +4,6 @@ Jobs can be killed at any time and resume. A run whose loss became NaN or infini
 failed.json. A run that fails otherwise is reported, and the next call tries it again.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
@@ -190,7 +188,7 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
         raise report.errors[0]
 
 
-def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: _Progress, *, quiet: bool) -> None:
+def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: "_Progress", *, quiet: bool) -> None:
     for job in todo:
         report.say(f"{job.name} ...")
         pack = work.pack if job.run.data == work.plan.data else None
@@ -199,7 +197,7 @@ def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: _P
         progress.update([])
 
 
-def _side_by_side(todo: Sequence[Job], num_jobs: int, report: _Reporter, progress: _Progress) -> None:
+def _side_by_side(todo: Sequence[Job], num_jobs: int, report: _Reporter, progress: "_Progress") -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
     with side_by_side(num_jobs, devices) as pool:

@@ -1,7 +1,5 @@
 """The description of a comparison: rows, tasks, probes, seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -101,7 +99,7 @@ class Plan:
         if self.rows[labels.index(self.reference)].encoder:
             raise ValueError(f"reference {self.reference!r} is another's encoder: choose a row that is trained")
 
-    def only(self, labels: Sequence[str]) -> Plan:
+    def only(self, labels: Sequence[str]) -> "Plan":
         """The plan with only these rows and the reference; all rows if none is given."""
         known = [row.label for row in self.rows]
         for label in labels:
@@ -110,7 +108,7 @@ class Plan:
         wanted = {*labels, self.reference} if labels else set(known)
         return replace(self, rows=tuple(row for row in self.rows if row.label in wanted))
 
-    def in_folds(self) -> list[tuple[str, Plan]]:
+    def in_folds(self) -> "list[tuple[str, Plan]]":
         """(name, plan) of each fold; the plan itself with an empty name if it has no folds."""
         if not self.folds:
             return [("", self)]

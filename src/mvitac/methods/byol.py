@@ -4,8 +4,6 @@ The online tower and a predictor q predict, from one view, the momentum (target)
 both directions: L = |q(z) - z'|^2 of normalised vectors = 2 - 2 cos. The predictor and the moving target prevent collapse.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -38,7 +36,7 @@ class BYOLConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> BYOL:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "BYOL":
         return BYOL(self, spec, encoder)
 
 

@@ -16,8 +16,6 @@ https://github.com/fredfyyang/Touch-and-Go (train_CMC_touch.py: K 16384, tau .07
 Shapes: N rows of training data, B in a batch, K negatives, D = 128.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar, cast
 
@@ -69,7 +67,7 @@ class CMCConfig(MethodConfig):
         limit = max(1, int(self.negatives_per_row * num_rows)) if self.negatives_per_row else self.num_negatives
         return min(self.num_negatives, limit)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> CMC:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "CMC":
         self.check_modalities(spec)
         return CMC(self, spec, encoder)
 

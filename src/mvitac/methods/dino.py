@@ -13,8 +13,6 @@ first epoch, gradient clipping (owners: norm 3), a weight decay that rises from 
 methods), and their truncated-normal start of the MLP.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -64,7 +62,7 @@ class DINOConfig(MethodConfig):
             width=("out", "hidden"),
         )
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> DINO:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "DINO":
         return DINO(self, spec, encoder)
 
 

@@ -18,8 +18,6 @@ trunk's own).
 Shapes: B images, N patches of P values (pixels x channels), K of them visible, D features.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -60,7 +58,7 @@ class MAEConfig(MethodConfig):
             raise ValueError(f"mask_ratio {self.mask_ratio}: give a share between 0 and 1")
         vit.check_predictor("decoder", self.decoder_width, self.decoder_depth)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MAE:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MAE":
         return MAE(self, spec, encoder)
 
 

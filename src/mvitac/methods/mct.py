@@ -10,8 +10,6 @@ No training code is public, so the exact margin loss could not be verified. The 
 normalised embeddings are our reading. The second modality of MCT was text; here, touch is augmented as an image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -49,7 +47,7 @@ class MCTConfig(QueueConfig):
         super().__post_init__()
         self.check_fields(positive=("temperature",), weight=("margin", "lambda_inter"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MCT:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MCT":
         self.check_modalities(spec)
         return MCT(self, spec, encoder)
 

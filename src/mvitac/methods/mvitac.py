@@ -16,8 +16,6 @@ Phi_t (touch, intra), Phi_v (touch, inter). In z_xy, x is the modality of the qu
 Shapes: images [B, C, H, W], features [B, D], embeddings z [B, 128].
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
@@ -119,7 +117,7 @@ class MViTacConfig(MethodConfig):
             mine = replace(mine, lambda_sensor=0.0)
         return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MViTac":
         possible = possible_losses(spec)
         if not set(self.losses) & set(possible):
             raise ValueError(

@@ -8,8 +8,6 @@ from labels: its own heads are scored, and its frozen trunks are probed like tho
 From the weights of another run (``Run.init``) the same method is fine-tuning, of all weights or of a part of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Self
@@ -174,7 +172,7 @@ class SupervisedConfig(LabelledConfig):
             )
         return [name for name in drawn if name not in held], held
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "Supervised":
         trunks = {m: build_trunk(encoder, spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
         for m in trunks if self.train == "attentive" else ():
             trunks[m] = AttentivePool(trunks[m])

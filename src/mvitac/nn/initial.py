@@ -3,8 +3,6 @@
 Shapes: O filters, C channels, h x w pixels of a kernel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -57,7 +55,7 @@ class Init:
             raise ValueError(f"init {self.path} is a folder without {MODEL}: {why}")
         return self.path / MODEL
 
-    def resolved(self) -> Init:
+    def resolved(self) -> "Init":
         """The same with ``digest``; ValueError if there are no such weights, or they have another digest."""
         if not self:
             return self

@@ -1,7 +1,5 @@
 """The momentum copy of a module (paper eq. 1-3, after MoCo). It copies the whole module, so that no part is forgotten."""
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any
@@ -30,7 +28,7 @@ class Momentum(nn.Module):
         self.running_norm = running_norm
         self._query = (query,)  # in a tuple, or its parameters would be listed here, too
 
-    def train(self, mode: bool = True) -> Momentum:
+    def train(self, mode: bool = True) -> "Momentum":
         return super().train(mode and not self.running_norm)
 
     @torch.no_grad()

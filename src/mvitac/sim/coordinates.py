@@ -1,7 +1,5 @@
 """Coordinates of the pictures of materials, and how they change between two moments of one press."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +57,7 @@ class Motion:
     noise: np.random.Generator  # source of the pixel noise of both pictures
 
     @classmethod
-    def draw(cls, *numbers: int) -> Motion:
+    def draw(cls, *numbers: int) -> "Motion":
         """Draw a motion that depends only on ``numbers``."""
         rng = np.random.default_rng(numbers)
         return cls(

@@ -6,8 +6,6 @@ file gets plain lines: the work, the time left after the first measured steps, a
 time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,7 +18,7 @@ from mvitac.system.console import Console
 
 WIDE = 120  # terminal width from which all losses and a long bar are shown
 FIRST, OFTEN, SELDOM = 5.0, 10.0, 300.0  # seconds before the first plain line, and the minimum and maximum between two
-_shown: list[Bars] = []
+_shown: "list[Bars]" = []
 
 
 class Bars(Progress):

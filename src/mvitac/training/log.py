@@ -1,7 +1,5 @@
 """Logging of a run: log.jsonl, the progress bar, and optional loggers (TensorBoard, Weights & Biases, Trackio)."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import time
@@ -46,7 +44,7 @@ class Log:
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
         self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, batch_size, quiet, ExitStack()
 
-    def __enter__(self) -> Log:
+    def __enter__(self) -> "Log":
         self.bars = self.stack.enter_context(shown(quiet=self.quiet))
         if self.bars:
             rate = {"unit": "steps", "rate": "pairs", "scale": self.batch_size}

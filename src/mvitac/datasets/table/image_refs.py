@@ -3,8 +3,6 @@
 References with the same container (a video, a row group) are read together in one pass.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 from abc import ABC, abstractmethod
@@ -44,7 +42,7 @@ class ImageRef(ABC):
 
     @staticmethod
     @abstractmethod
-    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+    def read(refs: "Sequence[ImageRef]", lost: Damage) -> "Iterator[tuple[ImageRef, Image.Image]]":
         """Yield each reference with its image as RGB; damaged images go to ``lost`` instead.
 
         ``refs`` are in ascending order, all of one class and with one container. ValueError or OSError if that cannot

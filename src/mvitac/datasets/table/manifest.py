@@ -3,8 +3,6 @@
 Cells are text, whatever the file format. Rows are counted from 1, without the header.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import operator
@@ -52,7 +50,7 @@ class Manifest:
     @classmethod
     def of(
         cls, root: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]] | None = None
-    ) -> Manifest:
+    ) -> "Manifest":
         """Return the table of ``rows`` that a reader made from the files below ``root``."""
         columns = tuple(dict.fromkeys(name for row in rows for name in row))
         return cls(root, root, columns, rows, digest(rows), found or {})
@@ -61,7 +59,7 @@ class Manifest:
         if column not in self.columns and column not in self.found:
             raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
 
-    def normalised(self, paths: Collection[str | None]) -> Manifest:
+    def normalised(self, paths: Collection[str | None]) -> "Manifest":
         """Return this table with the cells in one form (``normal``), except in the columns of ``paths``.
 
         Else two ways to type a name would be two classes, or one object in train and in test.
@@ -296,7 +294,7 @@ class Condition:
     value: str
 
     @classmethod
-    def parse(cls, text: str) -> Condition:
+    def parse(cls, text: str) -> "Condition":
         match = re.fullmatch(r"\s*([^<>=!]+?)\s*(<=|>=|!=|=)\s*([^<>=!]*?)\s*", text)
         if match is None:
             raise ValueError(f"condition {text!r}: write column=value, column!=value, column<=number or column>=number")

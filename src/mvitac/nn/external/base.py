@@ -8,8 +8,6 @@ An adapter is one file: a subclass of ``Adapter`` whose fields are its options. 
 weights were at hand when the adapters were written: they are tested on small weights with the owners' names and shapes.
 """
 
-from __future__ import annotations
-
 import copy
 import typing
 from abc import ABC, abstractmethod
@@ -134,7 +132,7 @@ class OpenEncoder:
     loaded: Loaded
     encoder: ExternalEncoder
 
-    def untrained(self) -> OpenEncoder | None:
+    def untrained(self) -> "OpenEncoder | None":
         """The same network with random weights; None if it has no weights here, or random ones already."""
         network = self.loaded.network
         if self.loaded.trained_on == NOTHING or not any(p.is_floating_point() for p in network.parameters()):

@@ -3,8 +3,6 @@
 Shapes: B images, S sensors, F frames, D features, P places.
 """
 
-from __future__ import annotations
-
 import copy
 import hashlib
 from dataclasses import dataclass
@@ -85,7 +83,7 @@ class ExternalEncoder(nn.Module):
             raise ValueError(f"the network returned {list(found.shape)} for two images: expected features [2, D]")
         self.num_features = self.width = found.shape[1]
 
-    def bound(self, layout: Layout) -> ExternalEncoder:
+    def bound(self, layout: Layout) -> "ExternalEncoder":
         """The same encoder, with the same weights, for images of ``layout``."""
         made = copy.copy(self)
         made.layout, made.num_features = layout, self.width * layout.sensors

@@ -3,8 +3,6 @@
 Shapes: N images, F frames (newest first), H x W pixels.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -64,7 +62,7 @@ class Preprocessing:
         if self.offset is not None and not 0 <= self.offset <= 1:
             raise ValueError(f"offset {self.offset}: give 0 to 1; 0.5 keeps no contact grey")
 
-    def resized_to(self, size: tuple[int, int]) -> Preprocessing:
+    def resized_to(self, size: tuple[int, int]) -> "Preprocessing":
         """The same for another input size; the margin of a centre crop grows with it."""
         shorter = None if self.shorter is None else round(self.shorter * min(size) / min(self.size))
         return replace(self, size=size, shorter=shorter)

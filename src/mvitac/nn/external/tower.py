@@ -3,8 +3,6 @@
 Widths and depths are taken from the file. A head has 64 channels in every transformer here, as in ViT-Ti, S, B and L.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import re
@@ -165,7 +163,7 @@ class Tower(nn.Module):
         z = self.head(tokens[:, self.num_prefix_tokens :].mean(1) if self.mean else tokens[:, 0])
         return z if self.scale is None else self.scale * F.normalize(z, dim=1)
 
-    def resize(self, size: tuple[int, int]) -> Tower:
+    def resize(self, size: tuple[int, int]) -> "Tower":
         """This tower for images of another size: learned positions are interpolated."""
         places = self.positions[0, self.placed :].unflatten(0, self.grid).permute(0, 3, 1, 2)
         grid = patches(size, self.patch)
