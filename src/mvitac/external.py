@@ -120,9 +120,8 @@ class ExternalModel(Model):
                     raise
                 notes.append(f"the current frame is repeated ({error})")
         for modality, part in parts.items():
-            difference = (pack.spec.difference and modality == "touch") or (
-                pack.spec.window.minus_first and modality in pack.spec.window.of
-            )
+            window, sense = pack.spec.window, modality == "touch" and pack.spec.difference
+            difference = sense or (window.minus_first and modality in window.of)
             if part.encoder.preprocessing.offset is not None and not difference:
                 notes.append(f"{modality}: its owner subtracts a background, this data has none: images as they are")
         return ExternalModel(self.text, parts, pack.spec, pack.size, tuple(notes)), pack

@@ -259,7 +259,7 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, import_openvino, lists_bf16
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_probes
-    from mvitac.model import safetensors_digest
+    from mvitac.nn.weights import safetensors_digest
     from mvitac.registry import to_json
     from mvitac.system.files import cache_dir, digest
 

@@ -72,10 +72,8 @@ def _make_part(work: Work, part: Part) -> int:
     with contextlib.suppress(ValueError, KeyError, TypeError, FileNotFoundError):  # missing or damaged
         known = part.read()
         num = len(known["columns"])
-        found = {
-            m: [zlib.crc32(row) for row in rows.found(part, num, known.get("bytes", {}).get(m, []))]
-            for m, rows in work.files.items()
-        }
+        sizes = known.get("bytes", {})
+        found = {m: [zlib.crc32(r) for r in rows.found(part, num, sizes.get(m, []))] for m, rows in work.files.items()}
         if found == known["crc"]:  # false if the machine lost power before all data reached the disk
             return num
     return _write_part(work, part)

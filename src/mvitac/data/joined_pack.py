@@ -32,9 +32,8 @@ class JoinedPack(Pack):
         _check_shapes(learn, score)
         tasks = _common_tasks(learn, score)
         columns = {"split", *(task.split for task, _ in tasks)}
-        self.table = _joined(
-            _side(learn, tasks, columns, "learned", {"train", "val"}), _side(score, tasks, columns, "scored", {"test"})
-        )
+        learned = _side(learn, tasks, columns, "learned", {"train", "val"})
+        self.table = _joined(learned, _side(score, tasks, columns, "scored", {"test"}))
         theirs = score.spec.controls
         self.spec = replace(
             learn.spec,

@@ -71,9 +71,8 @@ class MixedPack(Pack):
                 raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
             notes.append(found)
         self.spec = mixed_spec(self.parts, tasks, channels, notes)
-        self.images: dict[str, Images] = {
-            m: MixedImages([_of(pack, m) for pack in packs], self.size, channels[m]) for m in self.spec.modalities
-        }
+        pieces = {m: [_of(pack, m) for pack in packs] for m in self.spec.modalities}
+        self.images: dict[str, Images] = {m: MixedImages(each, self.size, channels[m]) for m, each in pieces.items()}
 
     def has(self, modality: str) -> np.ndarray:
         return self._has[modality]

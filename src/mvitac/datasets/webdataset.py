@@ -78,8 +78,5 @@ def _known(text: str, vectors: Collection[str]) -> dict[str, str]:
     value = parse_json(text)
     if not isinstance(value, dict):
         return {}
-    return {
-        name: text_of(v)
-        for name, v in value.items()
-        if isinstance(v, (str, int, float, bool)) or v is None or name in vectors
-    }
+    plain = (str, int, float, bool, type(None))
+    return {name: text_of(v) for name, v in value.items() if isinstance(v, plain) or name in vectors}

@@ -16,7 +16,6 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task, ValueTask
 from mvitac.evaluation.probe import (
     ProbeSplit,
-    cross_modal,
     labels_of,
     names_in,
     probe_all,
@@ -27,6 +26,7 @@ from mvitac.evaluation.probe import (
     score_rows,
     split_rows,
 )
+from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.sensors import Standardise
 from mvitac.model import Model, fresh
 from mvitac.nn.encoders import SCRATCH

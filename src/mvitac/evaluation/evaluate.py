@@ -15,17 +15,9 @@ from mvitac.evaluation.controls import Records, controls_of, scratch, start_weig
 from mvitac.evaluation.events import check_event, with_event
 from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
-from mvitac.evaluation.probe import (
-    PROBES,
-    cross_modal,
-    probe_model,
-    probes_of,
-    retrieved_rows,
-    seen_by,
-    split_rows,
-    with_classes,
-)
+from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows, with_classes
 from mvitac.evaluation.probe_config import ProbeConfig
+from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import describe_statistics, sensor_records
@@ -91,26 +83,14 @@ def probe_runs(
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
-    Example:
-        >>> result = probe_runs([Path("runs/first")], ProbeConfig(probes=("linear", "knn")))
-        >>> result["summary"]["category"]["touch"]["mvitac"]["mean"]
-
-    Args:
-        paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
-        session: What to probe.
-        pack: Other data to probe on. Default: the data the runs were trained on.
-        allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
-        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
-        encoders: Other people's encoders to probe beside the runs ("external:..."). They need ``pack``.
+    ``pack`` is other data than the runs were trained on; ``encoders`` ("external:...") need it. With ``allow_leak``, its
+    test rows may be rows, or of groups, that a run was trained on. The result of the best ``weights`` is in
+    probe.best.json. ValueError if the runs and the data do not fit together.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
         "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has
         a "leak", which is empty unless its test rows, or their groups, were trained on.
-
-    Raises:
-        ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
-            trained on rows or groups that other data than its own would score.
     """
     if paths or not encoders:
         _check_paths(paths)

@@ -1,4 +1,4 @@
-"""Probes of one model's frozen features on one pack: linear classifiers, kNN and cross-modal retrieval.
+"""Probes of one model's frozen features on one pack: linear classifiers, regression, kNN and small networks.
 
 Nothing is chosen on test rows: regularisation is chosen on held-out groups of train. Shapes: features [N, D].
 """
@@ -10,11 +10,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from scipy.special import softmax
-from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
-from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import Classifier, fit_knn, fit_linear, fit_papers, spread_out
 from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
@@ -33,8 +31,6 @@ mlp, attentive: small networks on features, or on the trunk's last map (``traine
 Probe = Literal["linear", "paper", "knn", "mlp", "attentive"]
 VALUE_PROBES = ("linear", "knn", *TRAINED)
 """Probes of tasks with values: ridge regression, alpha chosen on validation groups, the mean of the 20 nearest, networks."""
-MIN_GALLERY = 11
-"""Least number of test groups for retrieval. With fewer, the first five are half of all groups or more."""
 
 FeatureSource = Callable[[str, np.ndarray], np.ndarray]  # (modality, pack rows) -> features [len(rows), D]
 
@@ -277,15 +273,15 @@ def with_classes(tasks: Sequence[AnyTask]) -> list[Task]:
 
 def score_predictions(pack: Pack, task: ValueTask, rows: np.ndarray, predicted: np.ndarray) -> dict[str, Any]:
     """Score values ``predicted`` [len(rows), T] of pack ``rows``."""
-    return score_values(pack.values(task)[rows], predicted, _group_numbers(pack, rows), task.targets)
+    return score_values(pack.values(task)[rows], predicted, group_numbers(pack, rows), task.targets)
 
 
 def score_rows(pack: Pack, task: Task, rows: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
     """Score class ``probabilities`` [len(rows), K] of pack ``rows``."""
-    return score(labels_of(pack, task)[rows], probabilities, _group_numbers(pack, rows), len(task.classes))
+    return score(labels_of(pack, task)[rows], probabilities, group_numbers(pack, rows), len(task.classes))
 
 
-def _group_numbers(pack: Pack, rows: np.ndarray) -> np.ndarray:
+def group_numbers(pack: Pack, rows: np.ndarray) -> np.ndarray:
     """The groups of ``rows``, numbered 0 .. G-1."""
     return np.unique(pack.column("group")[rows].astype(str), return_inverse=True)[1]
 
@@ -339,46 +335,3 @@ def _papers(
             fitted = fit_papers(source(modality, rows), ys, [len(task.classes) for task in group], seed)
             found.update({(task.name, modality): predict for task, predict in zip(group, fitted, strict=True)})
     return found
-
-
-def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor]:
-    """Projections [len(rows), E] of each modality into the space that they share, on the CPU."""
-    device = next(model.parameters()).device
-    z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in ("touch", "vision")}
-    return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
-
-
-def retrieved_rows(pack: Pack) -> np.ndarray:
-    """Test rows with all modalities, of the phase that the first task is about."""
-    only = pack.spec.tasks[0].only if pack.spec.tasks else None
-    return pack.rows("test", only=only, having=pack.spec.modalities)
-
-
-def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
-    """Retrieval of groups across modalities among ``rows`` (default: ``retrieved_rows``), one record per direction.
-
-    A record has R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. There is none without a shared space,
-    on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
-    """
-    if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
-        return []
-    rows = retrieved_rows(pack) if rows is None else rows
-    sizes = np.bincount(_group_numbers(pack, rows))
-    if len(sizes) < MIN_GALLERY:
-        return []
-    z, groups = shared_space(model, pack, rows), torch.from_numpy(_group_numbers(pack, rows))
-    records = []
-    for query, gallery in (("vision", "touch"), ("touch", "vision")):
-        ranks = diagnostics.retrieval_ranks(z[query], z[gallery], groups)
-        hits = np.bincount(groups.numpy(), weights=(ranks < 5).numpy(), minlength=len(sizes)).astype(int)
-        records.append(
-            {
-                "direction": f"{query} -> {gallery}",
-                **diagnostics.recall_at(ranks),
-                "chance R@5": min(1.0, 5 / len(sizes)),
-                "num_groups": len(sizes),
-                "group_sizes": sizes.tolist(),
-                "group_correct": hits.tolist(),
-            }
-        )
-    return records

@@ -15,7 +15,8 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import scratch
 from mvitac.evaluation.evaluate import check_channels, check_unseen
 from mvitac.evaluation.leaks import Scored, Source, read_sources
-from mvitac.evaluation.probe import cross_modal, probe_model, retrieved_rows, scorable, split_rows
+from mvitac.evaluation.probe import probe_model, scorable, split_rows
+from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.model import Model, load
 from mvitac.nn.initial import Init
 from mvitac.run import Run

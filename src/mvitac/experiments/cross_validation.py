@@ -13,7 +13,7 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
-from mvitac.evaluation.probe import MIN_GALLERY
+from mvitac.evaluation.retrieval import MIN_GALLERY
 from mvitac.evaluation.scores import pool
 from mvitac.experiments.collect import gather, lay_out
 from mvitac.experiments.jobs import Work

@@ -147,10 +147,8 @@ class Live:
             self._lose(now)
             return False
         self.contact = self._contact(frames.get("touch", []))
-        images = {
-            m: np.concatenate([fit(f.image, self.engine.inputs[m][0]) for f in found if f], axis=2)
-            for m, found in frames.items()
-        }
+        seen = {m: [fit(f.image, self.engine.inputs[m][0]) for f in found if f] for m, found in frames.items()}
+        images = {m: np.concatenate(several, axis=2) for m, several in seen.items()}
         if self.contact:
             self._predict(frames, images, now)
         else:

@@ -61,11 +61,8 @@ class BYOL(Contrastive):
         self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.online.items()})
 
     def queries(self, batch: Views) -> Embeddings:
-        return {
-            ("q", m, i): self.predictor[m](online(batch.images[m][i]))
-            for m, online in present(self.online, batch)
-            for i in (0, 1)
-        }
+        z = {(m, i): online(batch.images[m][i]) for m, online in present(self.online, batch) for i in (0, 1)}
+        return {("q", m, i): self.predictor[m](found) for (m, i), found in z.items()}
 
     def keys(self, batch: Views) -> Embeddings:
         return {("k", m, i): target(batch.images[m][i]) for m, target in present(self.target, batch) for i in (0, 1)}

@@ -176,10 +176,9 @@ class IJEPA(Contrastive):
     def queries(self, batch: Views) -> Embeddings:
         """("predicted", modality) -> [B, M S, D], with the frames of a window one after another."""
         found = {m: self.blocks(batch, m) for m in self.trunks}
-        seen = {
-            m: vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
-            for m, (blocks, _) in found.items()
-        }
+        seen = {}
+        for m, (blocks, _) in found.items():
+            seen[m] = vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
         result: Embeddings = {}
         for modality, (blocks, grid) in found.items():
             other = next((seen[m] for m in seen if m != modality), None)

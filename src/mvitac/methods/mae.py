@@ -97,9 +97,8 @@ class MAE(Contrastive):
         for stream, (modality, trunk) in enumerate(self.trunks.items()):
             images = batch.images[modality][0]
             noise = vit.row_uniform(batch.seed, batch.rows, math.prod(vit.grid_of(trunk, images)), stream)
-            visible, hidden[modality] = (
-                at.repeat_interleave(vit.frames_of(trunk), 0) for at in split_patches(noise, self.config.mask_ratio)
-            )
+            parts = split_patches(noise, self.config.mask_ratio)
+            visible, hidden[modality] = (at.repeat_interleave(vit.frames_of(trunk), 0) for at in parts)
             seen[modality] = vit.encode_visible(trunk, images, visible)
         result: Embeddings = {}
         for modality, trunk in self.trunks.items():

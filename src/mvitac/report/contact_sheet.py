@@ -108,10 +108,8 @@ def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128
 
     sections = []
     for number, strip in enumerate(found):
-        cards = [
-            html.figure(html.picture(pair(pack, int(r), side), caption(int(r)), side), caption(int(r)))
-            for r in strip.rows
-        ]
+        said = [(int(row), caption(int(row))) for row in strip.rows]
+        cards = [html.figure(html.picture(pair(pack, row, side), text, side), text) for row, text in said]
         sections.append((f"s{number}", heading(strip, pack), html.grid(cards)))
     left_out = f" {num_all - len(found)} more are not shown." * (num_all > len(found))
     head = f"<h1>{escape(pack.spec.name)}</h1>" + html.paragraph(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import features, sample
-from mvitac.evaluation.probe import shared_space
+from mvitac.evaluation.retrieval import shared_space
 from mvitac.report import figures, html
 from mvitac.report.sections import Study
 

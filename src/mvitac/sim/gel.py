@@ -100,14 +100,8 @@ def press(
     Returns:
         The imprint [H, W] in mm.
     """
-    p = pressure(
-        relief_mm,
-        force_n=force_n,
-        stiffness=stiffness,
-        pixel_mm=pixel_mm,
-        dome_radius_mm=dome_radius_mm,
-        gel_stiffness=gel_stiffness,
-    )
+    gel: Any = {"dome_radius_mm": dome_radius_mm, "gel_stiffness": gel_stiffness}
+    p = pressure(relief_mm, force_n=force_n, stiffness=stiffness, pixel_mm=pixel_mm, **gel)
     return relax(p / np.float32(gel_stiffness), pixel_mm=pixel_mm)
 
 

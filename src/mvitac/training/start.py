@@ -10,10 +10,10 @@ from torch import Tensor
 from mvitac.data.pack import Pack
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, read_sources, unknown_source
 from mvitac.methods.base import Method
-from mvitac.model import FORMAT, load
+from mvitac.model import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
-from mvitac.nn.weights import read_safetensors
+from mvitac.nn.weights import FORMAT, read_safetensors
 from mvitac.run import read_record
 
 State = dict[str, Tensor]

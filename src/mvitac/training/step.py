@@ -140,10 +140,8 @@ def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
         parameters = _by_layer(config, method, parameters)
     elif config.weight_decay and not config.decay_norms:
         vectors = [p for p in parameters if p.ndim <= 1]  # biases and BatchNorm
-        parameters = [
-            {"params": [p for p in parameters if p.ndim > 1]},
-            {"params": vectors, "weight_decay": 0.0},
-        ]
+        matrices = [p for p in parameters if p.ndim > 1]
+        parameters = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
     if config.name == "sgd":
         momentum, decay = config.betas[0], config.weight_decay
         return torch.optim.SGD(parameters, config.lr, momentum=momentum, weight_decay=decay, fused=fused)

@@ -126,9 +126,8 @@ def _knn(
         labelled, scored = known >= 0, asked >= 0
         if labelled.any() and scored.any():
             for m in z:
-                values[f"{m}/knn {task.name}"] = diagnostics.knn_accuracy(
-                    bank[m][labelled], known[labelled], z[m][scored], asked[scored]
-                )
+                sides = bank[m][labelled], known[labelled], z[m][scored], asked[scored]
+                values[f"{m}/knn {task.name}"] = diagnostics.knn_accuracy(*sides)
     return values
 
 

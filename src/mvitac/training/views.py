@@ -107,10 +107,8 @@ def make_views(
                 seen = mirror.random(seen, source, run.augment.touch, generator)
             view = random_view(seen, config, run.augment.size, generator, dtype)
             images[modality].append(view)
-    labels = {
-        t.name: torch.from_numpy(pack.labels(t.name, *run.method.label_splits)[rows]).to(device)
-        for t in pack.spec.tasks
-    }
+    splits = run.method.label_splits
+    labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(device) for t in pack.spec.tasks}
     values = {task: value.to(device) for task, value in values_of(run, pack, rows).items()}
     at, seed = torch.from_numpy(rows).to(device), torch.tensor(generator.initial_seed()).to(device)
     return Views(images=images, labels=labels, rows=at, values=values, both=both, seed=seed)

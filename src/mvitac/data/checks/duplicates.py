@@ -31,14 +31,14 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             rows += across.tolist()
     if notes:
         return Finding(
-            item="identical images across splits",
-            verdict="broken",
-            evidence="; ".join(notes),
-            advice="remove the copies, or put them in one group so that they stay in one split",
+            "identical images across splits",
+            "broken",
+            "; ".join(notes),
+            "remove the copies, or put them in one group so that they stay in one split",
             rows=tuple(rows),
         )
     evidence = "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")
-    return Finding(item="identical images across splits", verdict="ok", evidence=evidence)
+    return Finding("identical images across splits", "ok", evidence)
 
 
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -74,10 +74,10 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
         rows += pairs.ravel().tolist()
     return Finding(
-        item="near-copies across splits",
-        verdict="look" if suspicious else "ok" if compared else "not checkable",
-        evidence="; ".join(notes),
-        advice=suspicious * "look at the sheet (pairs side by side); if they are one contact or one scene, group them",
+        "near-copies across splits",
+        "look" if suspicious else "ok" if compared else "not checkable",
+        "; ".join(notes),
+        suspicious * "look at the sheet (pairs side by side); if they are one contact or one scene, group them",
         rows=tuple(rows) if suspicious else (),
     )
 

@@ -101,16 +101,14 @@ def examine_pack(path: str | Path, window: Window = SINGLE) -> tuple[list[Findin
     except ValueError as error:
         if not (Path(path) / "pack.json").is_file():
             raise
-        found = Finding(
-            item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it, too"
-        )
+        found = Finding("pack", "broken", str(error), "make it again; training refuses it, too")
         return [found], [Block(f"broken: pack. {error}")]
     return examine_open(pack, window)
 
 
 def examine_open(pack: Pack, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
     """As ``examine_pack``, for a pack that is open."""
-    whole = Finding(item="pack", verdict="ok", evidence=f"{pack.num} rows, every digest matches")
+    whole = Finding("pack", "ok", f"{pack.num} rows, every digest matches")
     findings = [whole, *examine(pack, window=window)]
     return findings, blocks_of(pack, findings)
 
@@ -136,5 +134,5 @@ def examine_source(
         partly = len(thumbnails.items()) < len(source.items())
         findings = examine(pack, thumbnails.expected(), part=partly, window=window)
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
-        findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
+        findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
         return findings, blocks_of(pack, findings)

@@ -8,7 +8,7 @@ Verdict = Literal["ok", "look", "broken", "not checkable"]
 MAX_ROWS = 64
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """The result of one check."""
 

@@ -18,13 +18,13 @@ def unreadable(pack: Pack) -> Finding:
     """List items that packing could not read."""
     damaged = pack.meta.get("damaged", [])
     if not damaged:
-        return Finding(item="unreadable items", verdict="ok", evidence=f"none; {pack.num} rows were read")
+        return Finding("unreadable items", "ok", f"none; {pack.num} rows were read")
     name, why = damaged[0]
     return Finding(
-        item="unreadable items",
-        verdict="broken" if len(damaged) > 0.01 * pack.num else "look",
-        evidence=f"{len(damaged)}; {pack.num} rows were read; first {name}: {why}",
-        advice="repair them or download them again; the pack does not contain them",
+        "unreadable items",
+        "broken" if len(damaged) > 0.01 * pack.num else "look",
+        f"{len(damaged)}; {pack.num} rows were read; first {name}: {why}",
+        "repair them or download them again; the pack does not contain them",
     )
 
 
@@ -41,10 +41,10 @@ def missing_images(pack: Pack) -> Finding:
                 verdict = "look"
                 notes.append(f"no row of {split} has {modality}")
     return Finding(
-        item="missing images",
-        verdict=verdict,
-        evidence="; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
-        advice="assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else "",
+        "missing images",
+        verdict,
+        "; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
+        "assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else "",
     )
 
 
@@ -53,7 +53,7 @@ def missing_labels(pack: Pack) -> Finding:
     item, notes, rows = "missing labels", [], []
     verdict: Verdict = "ok"
     if not pack.spec.tasks:
-        return Finding(item=item, verdict="ok", evidence="no tasks: nothing to label")
+        return Finding(item, "ok", "no tasks: nothing to label")
     for task in pack.spec.tasks:
         labels = pack.column(f"label_{task.name}")
         for split in ("train", "val", "test"):
@@ -69,13 +69,8 @@ def missing_labels(pack: Pack) -> Finding:
                 )
                 rows += empty.tolist()
     advice = "fill them in, or move the rows to split unlabelled; fine if they are meant for pre-training only"
-    return Finding(
-        item=item,
-        verdict=verdict,
-        evidence="; ".join(notes) or "none in train, val and test",
-        advice=advice if notes else "",
-        rows=tuple(rows),
-    )
+    evidence = "; ".join(notes) or "none in train, val and test"
+    return Finding(item, verdict, evidence, advice if notes else "", tuple(rows))
 
 
 def class_balance(pack: Pack) -> list[Finding]:
@@ -89,7 +84,7 @@ def class_balance(pack: Pack) -> list[Finding]:
             counts[side] = np.bincount(found[found >= 0], minlength=len(task.classes))
         item = f"classes of {task.name}"
         if not counts["train"].sum() or not counts["test"].sum():
-            findings.append(Finding(item=item, verdict="not checkable", evidence="no labels in train or test"))
+            findings.append(Finding(item, "not checkable", "no labels in train or test"))
             continue
         majority = counts["test"][counts["train"].argmax()] / counts["test"].sum()
         unseen = [c for i, c in enumerate(task.classes) if counts["test"][i] and not counts["train"][i]]
@@ -107,7 +102,7 @@ def class_balance(pack: Pack) -> list[Finding]:
             verdict = "broken"
             advice = "these cannot be learned: assign the groups to splits again, or drop the classes"
             evidence += f"; tested but never seen in training: {some(unseen)}"
-        findings.append(Finding(item=item, verdict=verdict, evidence=evidence, advice=advice))
+        findings.append(Finding(item, verdict, evidence, advice))
     return findings
 
 
@@ -157,16 +152,16 @@ def leaks(pack: Pack) -> list[Finding]:
             continue
         findings.append(
             Finding(
-                item="groups across splits" if split == "split" else f"groups across column {split}",
-                verdict=verdict,
-                evidence="; ".join(notes) or f"none of {', '.join(names)} is in more than one split",
-                advice=bool(notes) * "split by the largest of these keys, or report what test shares with train",
+                "groups across splits" if split == "split" else f"groups across column {split}",
+                verdict,
+                "; ".join(notes) or f"none of {', '.join(names)} is in more than one split",
+                bool(notes) * "split by the largest of these keys, or report what test shares with train",
                 rows=tuple(rows),
             )
         )
     if sound:
         evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
-        findings.append(Finding(item="groups across split columns", verdict="ok", evidence=evidence))
+        findings.append(Finding("groups across split columns", "ok", evidence))
     return findings
 
 
@@ -194,12 +189,12 @@ def mixture(pack: Pack) -> Finding:
             notes += told
     if not columns:
         return Finding(
-            item="sensors and resolutions",
-            verdict="not checkable",
-            evidence="no column sensor, and a pack holds one size: check the source with --data instead",
+            "sensors and resolutions",
+            "not checkable",
+            "no column sensor, and a pack holds one size: check the source with --data instead",
         )
     advice = "probe each kind separately, or use the same kinds in train and test" if verdict != "ok" else ""
-    return Finding(item="sensors and resolutions", verdict=verdict, evidence="; ".join(notes), advice=advice)
+    return Finding("sensors and resolutions", verdict, "; ".join(notes), advice)
 
 
 def _predicted_tasks(pack: Pack, column: str, values: np.ndarray) -> list[str]:
@@ -248,10 +243,10 @@ def numbers(pack: Pack) -> Finding:
                 notes.append(f"{name} is {values[far[0]]:g} in row {far[0]}, others {low:g} to {high:g}")
                 rows += list(far)
     return Finding(
-        item="numbers",
-        verdict="look" if notes else "ok",
-        evidence="; ".join(notes) or f"{seen} columns, all finite and in range",
-        advice="repair the cells, or leave the rows out" if notes else "",
+        "numbers",
+        "look" if notes else "ok",
+        "; ".join(notes) or f"{seen} columns, all finite and in range",
+        "repair the cells, or leave the rows out" if notes else "",
         rows=tuple(rows),
     )
 
@@ -284,12 +279,8 @@ def give_aways(pack: Pack) -> Finding:
                     f"{name} predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
                 )
     advice = "report them with every score as a control (--data.controls name=column)" if notes else ""
-    return Finding(
-        item="columns that give a label away",
-        verdict="look" if notes else "ok",
-        evidence="; ".join(notes) or "no column of numbers does",
-        advice=advice,
-    )
+    evidence = "; ".join(notes) or "no column of numbers does"
+    return Finding("columns that give a label away", "look" if notes else "ok", evidence, advice)
 
 
 def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
@@ -335,10 +326,10 @@ def published(counts: list[Count]) -> list[Finding]:
         detail = f"; {count.detail}" if count.detail else ""
         findings.append(
             Finding(
-                item=f"published: {count.what}",
-                verdict="ok" if same else "look",
-                evidence=f"{count.found} found, {count.published} published{detail}",
-                advice="" if same else "fine for a part of the data; mention it with every result",
+                f"published: {count.what}",
+                "ok" if same else "look",
+                f"{count.found} found, {count.published} published{detail}",
+                "" if same else "fine for a part of the data; mention it with every result",
             )
         )
     return findings

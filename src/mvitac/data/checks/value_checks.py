@@ -32,7 +32,7 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, rec
     measured = {side: rows[np.isfinite(found[rows])] for side, rows in sides.items()}
     if lacking := [side for side, rows in measured.items() if not len(rows)]:
         evidence = f"no row of {' and '.join(lacking)} has a value"
-        return Finding(item=item, verdict="broken", evidence=evidence, advice="measure some or assign the splits again")
+        return Finding(item, "broken", evidence, "measure some or assign the splits again")
     rows = np.sort(np.concatenate(list(measured.values())))
     known = found[rows]
     low, middle, high = np.percentile(known, [0, 50, 100])
@@ -49,10 +49,10 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, rec
     wrong = {advice: note for advice, note in checks.items() if note[0]}
     verdict: Verdict = "look" if wrong else "ok"
     return Finding(
-        item=item,
-        verdict=verdict,
-        evidence="; ".join([*evidence, *(text for text, _ in wrong.values())]),
-        advice="; ".join(wrong),
+        item,
+        verdict,
+        "; ".join([*evidence, *(text for text, _ in wrong.values())]),
+        "; ".join(wrong),
         rows=tuple(row for _, suspicious in wrong.values() for row in suspicious),
     )
 
@@ -171,12 +171,12 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     """Return whether the recordings of ``pack`` have the frames that ``window`` asks for: gaps, rates and length."""
     item = f"windows of {window.frames} frames, stride {window.stride:g}"
     if part:
-        return Finding(item=item, verdict="not checkable", evidence="a part of the items has gaps: examine all of them")
+        return Finding(item, "not checkable", "a part of the items has gaps: examine all of them")
     try:
         name, place = places(pack, window)
         _, whole = frames_of(pack, window)
     except ValueError as error:
-        return Finding(item=item, verdict="broken", evidence=str(error), advice="training refuses these windows, too")
+        return Finding(item, "broken", str(error), "training refuses these windows, too")
     steps = [np.diff(place[rows]) for rows in _recordings(pack, window) if len(rows) > 2]
     rates = np.array([np.median(step) for step in steps])
     gaps = sum(int((step > 2.5 * rate).sum()) for step, rate in zip(steps, rates, strict=True))
@@ -185,7 +185,8 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     if gaps:
         with_gaps = sum((step > 2.5 * rate).any() for step, rate in zip(steps, rates, strict=True))
         longest = max(step.max() / rate for step, rate in zip(steps, rates, strict=True))
-        evidence.append(f"{gaps} gaps in {share(int(with_gaps), len(steps))} touches, the longest {longest:.3g} frames")
+        touches = f"{share(int(with_gaps), len(steps))} touches"
+        evidence.append(f"{gaps} gaps in {touches}, the longest of {longest:.3g} frames")
         advice.append("a window across a gap shows an older frame than asked: split the touches there")
     if len(rates) and rates.max() > 1.25 * rates.min():
         evidence.append(f"frames are {rates.min():.3g} apart in some touches and {rates.max():.3g} in others")
@@ -194,4 +195,4 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
         evidence.append(f"{share(len(too_short), int(pack.touch_groups.max()) + 1)} touches are shorter than a window")
         advice.append("their first frame repeats in every row: give fewer frames or a smaller stride")
     verdict: Verdict = "look" if advice else "ok"
-    return Finding(item=item, verdict=verdict, evidence="; ".join(evidence), advice="; ".join(advice))
+    return Finding(item, verdict, "; ".join(evidence), "; ".join(advice))

@@ -191,11 +191,8 @@ def _frames(
         for name in ("timestamp", "episode_index", "frame_index", *images):
             if name not in opened.schema_arrow.names:
                 raise ValueError(f"{file} has no column {name!r}: fetch it again")
-        names = [
-            name
-            for name in opened.schema_arrow.names
-            if name in scalars or name in vectors or name in RENAMED or name == "timestamp"
-        ]
+        wanted = {*scalars, *vectors, *RENAMED, "timestamp"}
+        names = [name for name in opened.schema_arrow.names if name in wanted]
         for group in range(opened.num_row_groups):
             for place, values in enumerate(opened.read_row_group(group, columns=names).to_pylist()):
                 if values["frame_index"] % every:

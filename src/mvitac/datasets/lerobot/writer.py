@@ -132,14 +132,8 @@ def _write_data(
 ) -> list[tuple[int, int]]:
     """Write the data files; return (chunk, file) of each episode, which is in a single file."""
     picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    kinds = {
-        "int64": pa.int64(),
-        "float32": pa.float32(),
-        "float64": pa.float64(),
-        "bool": pa.bool_(),
-        "string": pa.string(),
-        "image": picture,
-    }
+    kinds = {"int64": pa.int64(), "float32": pa.float32(), "float64": pa.float64(), "bool": pa.bool_()}
+    kinds |= {"string": pa.string(), "image": picture}
     schema = pa.schema([(name, kinds[feature["dtype"]]) for name, feature in features.items()])
     homes: list[tuple[int, int]] = []
     writer: pq.ParquetWriter | None = None

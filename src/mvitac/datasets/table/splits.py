@@ -65,10 +65,8 @@ def group_by_video(
     per row for each image column.
     """
     columns = list(refs)
-    videos = [
-        [os.path.relpath(ref.path, root) for column in columns if isinstance(ref := column[i], Frame)]
-        for i in range(len(numbers))
-    ]
+    rows = [[column[i] for column in columns] for i in range(len(numbers))]
+    videos = [[os.path.relpath(ref.path, root) for ref in row if isinstance(ref, Frame)] for row in rows]
     parent: dict[str, str] = {}  # union-find
     for shown in videos:
         for video in shown[1:]:

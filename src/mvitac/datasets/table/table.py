@@ -220,10 +220,8 @@ class Rows(Source):
 
         row_bytes = 3 * config.size**2 * sum(bool(column) for column in (self._vision, *self._touch))
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
-        self._stamps = [
-            one_stamp((*stamps[ref.path], *ref.within()) for i in item for ref in self._rows[i].refs())
-            for item in self._items
-        ]
+        used = [[ref for i in item for ref in self._rows[i].refs()] for item in self._items]
+        self._stamps = [one_stamp((*stamps[ref.path], *ref.within()) for ref in refs) for refs in used]
         tasks_with_classes = tuple(task for task, _ in read)
         self._spec = self._describe(tasks_with_classes, tuple(value_tasks), grouping.group_by, controls)
 

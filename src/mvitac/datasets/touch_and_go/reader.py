@@ -129,10 +129,8 @@ class TouchAndGo(Source):
             assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
         self._recordings = {recording.name: recording for recording in recordings}
         self._chunks = _chunks([*listed, *_unlabelled(listed, recordings, config)])
-        self._stamps = [
-            one_stamp(self._recordings[chunk[0].recording].stamps([frame.number for frame in chunk]))
-            for chunk in self._chunks
-        ]
+        frames = [(chunk[0].recording, [frame.number for frame in chunk]) for chunk in self._chunks]
+        self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
         notes = leaks(listed) if config.split == "official" else []
         if missing:
             notes.append(missing_report(missing, self._num_names))

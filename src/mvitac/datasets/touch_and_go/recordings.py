@@ -100,10 +100,8 @@ def missing_report(missing: dict[str, str], num: int) -> str:
     by_reason: dict[str, list[str]] = defaultdict(list)
     for name, why in missing.items():
         by_reason[why].append(name)
-    parts = [
-        f"{why} ({len(names)}): {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}"
-        for why, names in sorted(by_reason.items())
-    ]
+    each = [(f"{why} ({len(names)})", ", ".join(names[:8]), len(names) > 8) for why, names in sorted(by_reason.items())]
+    parts = [f"{what}: {first}{', ...' * more}" for what, first, more in each]
     return f"{len(missing)} of {num} listed recordings cannot be packed: {'; '.join(parts)}"
 
 
