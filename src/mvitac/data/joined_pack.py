@@ -18,11 +18,8 @@ from mvitac.system.files import brief
 class JoinedPack(Pack):
     """Train and val rows of ``learn`` followed by test rows of ``score``.
 
-    Tasks are those that both packs have, with the classes of ``learn``.
-
-    Raises:
-        ValueError: If the packs have no common task, other image shapes, classes in ``score`` that ``learn`` does not
-            have, or a group in both (its test rows would not be unseen).
+    Tasks are those that both packs have, with the classes of ``learn``. ValueError if there is none, or the packs have
+    other image shapes, classes that ``learn`` lacks, or a group in both (its test rows would not be unseen).
     """
 
     def __init__(self, learn: Pack, score: Pack) -> None:

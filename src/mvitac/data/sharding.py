@@ -18,19 +18,10 @@ MAX_SHARD_MB = 1_000_000  # a terabyte: a shard is read whole
 
 
 def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, quiet: bool = False) -> int:
-    """Write ``pack`` to ``url`` in shards and return their number.
+    """Write ``pack`` to ``url`` (a folder, or what fsspec supports) in shards and return their number.
 
-    pack.json is written last, so an interrupted call leaves no valid pack and can be repeated.
-
-    Args:
-        pack: The pack to write.
-        url: A folder, or a URL that fsspec supports.
-        shard_mb: Largest size of a shard in MB, all modalities together.
-        seed: Random seed for the order of touch groups.
-        quiet: Show no progress bar.
-
-    Raises:
-        ValueError: If ``url`` has a pack already or cannot be written.
+    pack.json is written last, so an interrupted call leaves no valid pack and can be repeated. ``shard_mb`` is the
+    largest size of a shard, all modalities together; ``seed`` is that of the order of touch groups.
     """
     if not 0 < shard_mb <= MAX_SHARD_MB:
         raise ValueError(f"shard_mb {shard_mb}: give a number of megabytes above 0, at most {MAX_SHARD_MB:,}")

@@ -182,13 +182,9 @@ class Cache:
     """A folder of limited size. Threads load the expected files; others are deleted, least recently used first."""
 
     def __init__(self, folder: Path, sizes: dict[str, int], limit: int, load: Callable[[str], Images]) -> None:
-        """Create a cache.
+        """A cache in ``folder``, of this process only. ``sizes``: file name -> bytes; ``limit`` of their sum in bytes.
 
-        Args:
-            folder: The folder, used by this process only.
-            sizes: File name -> bytes.
-            limit: Largest total size in bytes.
-            load: Fetches a file into ``folder``, if it is not there, and opens it.
+        ``load`` fetches a file into ``folder``, if it is not there, and opens it.
         """
         self._folder, self._sizes, self._limit, self._load = folder, sizes, limit, load
         self._mutex, self._pool = threading.Lock(), ThreadPoolExecutor(NUM_FETCHING, "shards")

@@ -25,15 +25,12 @@ class ObservationEncoder(nn.Module):
     """
 
     def __init__(self, model: Model, keys: Mapping[str, str], *, state: int = 0, tune: bool = False) -> None:
-        """
+        """Encode with ``model``; ValueError if a modality or the number of its keys does not fit it.
+
         Args:
-            model: a trained model.
             keys: modality of each observation key. Two gels of one gripper are two keys of "touch", left first.
             state: length of "observation.state" to append; 0 = none.
             tune: let the policy's loss train the encoders (BatchNorm keeps its statistics); otherwise they are frozen.
-
-        Raises:
-            ValueError: a modality or the number of its keys does not fit the model.
         """
         super().__init__()
         self.keys: dict[str, list[str]] = {}

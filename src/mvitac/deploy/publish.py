@@ -183,21 +183,11 @@ def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tup
 
 
 def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False) -> Path:
-    """Write the artifact of a finished run.
+    """Write the artifact of a finished run into the new folder ``out``.
 
-    Args:
-        run: the run's folder.
-        out: the new folder.
-        pack: data to fit the probes on (default: the data the run was trained on).
-        allow_leak: score also rows or groups of ``pack`` that the run was trained on; the card says LEAK beside scores.
-
-    Returns:
-        ``out``. The artifact was loaded once, as a check, before it got this name.
-
-    Raises:
-        Busy: another process writes ``out``.
-        ValueError: ``out`` exists or cannot be written, the run or its data is missing, or the run was trained on what
-            ``pack`` would score.
+    It is loaded once, as a check, before it gets its name. ``pack``: data to fit the probes on (default: the data the
+    run was trained on). With ``allow_leak``, its rows or groups may be some that the run was trained on; the card says
+    LEAK beside scores. Raises Busy if another process writes ``out``, else ValueError.
     """
     with new_folder(out) as partial:
         model = load(run)

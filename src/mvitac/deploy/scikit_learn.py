@@ -54,17 +54,9 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
         return self
 
     def transform(self, X: Sequence[Any] | np.ndarray) -> np.ndarray:
-        """Features of images.
+        """Features [N, D] of N images of any kind that ``Model.embed`` takes; for "both" N pairs (vision, touch).
 
-        Args:
-            X: N images of any kind that ``Model.embed`` takes; for "both" N pairs (vision, touch). A data frame of paths
-                is read by its columns "vision" and "touch".
-
-        Returns:
-            [N, D] float32.
-
-        Raises:
-            ValueError: If images do not fit the model.
+        A data frame of paths is read by its columns "vision" and "touch". ValueError if images do not fit the model.
         """
         check_is_fitted(self)
         names = self._names()

@@ -95,11 +95,9 @@ class EncoderConfig:
 def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Module:
     """Create a trunk that maps images [B, ``channels``, H, W] to pooled features [B, D]; ``trunk.num_features`` is D.
 
-    ``EncoderConfig.stem`` says how the first convolution of a pretrained trunk starts if there are not three channels. The
-    channels are those of all ``frames`` of a window together.
-
-    Raises:
-        ValueError: If the requested weights are not available. There is no silent fallback to random weights.
+    ``EncoderConfig.stem`` says how the first convolution of a pretrained trunk starts if there are not three channels.
+    The channels are those of all ``frames`` of a window together. ValueError if the requested weights are not
+    available: there is no silent fallback to random weights.
     """
     if frames == 1 or config.temporal == "stack":
         return use_products(_with_stem(config, channels))

@@ -64,14 +64,11 @@ class Bank(nn.Module):
         return at if size == 1 else torch.where(at % size == rank, at // size, self.num_own)
 
     def find_drawn(self, at: Int[Tensor, "B K"]) -> Int[Tensor, "B k"]:
-        """Positions in ``values`` of those of the rows ``at`` that this process holds, padded with the spare row.
+        """Positions [B, k] in ``values`` of those of the rows ``at`` that this process holds, padded with the spare row.
 
-        Args:
-            at: K rows for each query, drawn uniformly.
-
-        Returns:
-            [B, k]. On one process k = K. On several, k is a little above K times the share of rows this process holds. A
-            query with more such rows loses the excess; the probability of that is below 1e-32 (Chernoff bound).
+        ``at`` are K rows for each query, drawn uniformly. On one process k = K. On several, k is a little above K times
+        the share of rows this process holds. A query with more such rows loses the excess; the probability of that is
+        below 1e-32 (Chernoff bound).
         """
         place, mean = self.find(at), at.shape[1] * self.num_own / self.num
         width = math.ceil(mean + 12 * mean**0.5 + 50)

@@ -14,12 +14,10 @@ def momentum_at(progress: float, start: float, end: float | None) -> float:
 
 
 class Momentum(nn.Module):
-    """A frozen copy of a module that follows it: theta_k <- m theta_k + (1 - m) theta.
+    """A frozen copy of the module ``query`` that follows it: theta_k <- m theta_k + (1 - m) theta.
 
-    Args:
-        query: The module to copy.
-        running_norm: BatchNorm of the copy uses moving averages that follow the query's, instead of the statistics of the
-            batch. A key then depends on no other image of its batch (EMAN, Cai et al., CVPR 2021).
+    With ``running_norm``, BatchNorm of the copy uses moving averages that follow the query's, instead of the statistics
+    of the batch. A key then depends on no other image of its batch (EMAN, Cai et al., CVPR 2021).
     """
 
     def __init__(self, query: nn.Module, *, running_norm: bool = False) -> None:

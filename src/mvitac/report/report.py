@@ -38,21 +38,12 @@ def write_report(
     pack: Pack | None = None,
     quiet: bool = False,
 ) -> Path:
-    """Write ``out``/report.html and ``out``/figures/*.png about finished runs on the same data.
+    """Write ``out``/report.html and ``out``/figures/*.png about finished runs on the same data, and return the page.
 
-    Args:
-        paths: Folders of the runs.
-        out: Folder to write to.
-        result: What ``probe_runs`` returned for these runs. Default: the probe.json in the first run's folder if it is
-            complete (``stored_result``), else probe here, with logistic regression, all tasks and all controls.
-        pack: Data to show instead of the runs' own.
-        quiet: Print no progress.
-
-    Returns:
-        Path of the page.
-
-    Raises:
-        ValueError: If a run is not finished, or ``result`` is about other runs or data.
+    ``result`` is what ``probe_runs`` returned for these runs. Default: the probe.json in the first run's folder if it
+    is complete (``stored_result``), else they are probed here, with logistic regression, all tasks and all controls.
+    ``pack`` is shown instead of the runs' own. ValueError if a run is not finished, or ``result`` is about other runs
+    or data.
     """
     paths = [Path(path) for path in paths]
     runs = open_runs(paths)

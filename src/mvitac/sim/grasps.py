@@ -85,24 +85,21 @@ def grasp(
     phases: tuple[str, ...] = PHASES,
     measured: bool = False,
 ) -> list[dict[str, Any]]:
-    """Simulate one grasp.
+    """Simulate grasp number ``index`` of object number ``obj``.
 
     Args:
-        seed: Data seed.
-        obj: Number of the object.
-        index: Number of the grasp.
-        size: Side of the pictures in pixels.
         held_out_sensor: Use the sensor that is not used otherwise.
         phases: Phases to render; fewer are faster.
         measured: Also return what physics knows of the contact of each gel: ``contact.KNOWN`` and the shear force in N,
             right and down in the gel's picture, with names such as ``depth_left_mm`` and ``shear_x_right_n``.
 
     Returns:
-        A dict per phase with ``vision``, ``touch_left``, ``touch_right`` (uint8 [size, size, 3]), ``phase``, ``success``
-        (0 or 1, equal in all phases), the names ``object`` and ``sensor``, and numbers: the inputs (``mass_kg``,
-        ``friction``, ``force_n`` the set grip force, ``offset_mm`` from the centre of mass along the object, ``height_mm``
-        of the grip above it, ``yaw_deg``, ``peaks``, ``amplitude_mm``, ``softness``), the result (``lift_mm``,
-        ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in mm, a control).
+        A dict per phase with ``vision``, ``touch_left``, ``touch_right`` (uint8 [size, size, 3]), ``phase``,
+        ``success`` (0 or 1, equal in all phases), the names ``object`` and ``sensor``, and numbers: the inputs
+        (``mass_kg``, ``friction``, ``force_n`` the set grip force, ``offset_mm`` from the centre of mass along the
+        object, ``height_mm`` of the grip above it, ``yaw_deg``, ``peaks``, ``amplitude_mm``, ``softness``), the result
+        (``lift_mm``, ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in
+        mm, a control).
     """
     if not 0 <= obj < NUM_OBJECTS:
         raise ValueError(f"obj must be in 0..{NUM_OBJECTS - 1}, got {obj}")

@@ -160,18 +160,16 @@ def touch(
     sensors: Sequence[Sensor] = (),
     through: int = 0,
 ) -> dict[str, Any]:
-    """Simulate one pair.
+    """Simulate one pair, given the numbers of the data set, class, instance and touch.
 
     Args:
-        seed, category, instance, touch: Numbers of the data set, class, instance and touch.
-        size: Side of the pictures in pixels.
         held_out_sensor: Use the sensor that is not used otherwise; everything else is the same.
         background: Also return "background", the same copy of the sensor before contact.
         moment: 0, or the number of a later moment of the same press (`motion.Motion`).
         measured: Also return depth, position and size of the contact (`contact.KNOWN`).
         sensors: Sensors to choose from. Default: the known ones, or the held-out one.
-        through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs from
-            those of smaller numbers; the camera takes another picture.
+        through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs
+            from those of smaller numbers; the camera takes another picture.
 
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.

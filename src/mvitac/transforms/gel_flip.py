@@ -33,17 +33,10 @@ for gray images."""
 
 
 def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Learn the colours of slope from images of one sensor.
+    """Learn the colours of slope from images of one sensor, minus their mean; ValueError if no mixtures are slopes.
 
-    Args:
-        images: Images minus their mean image.
-
-    Returns:
-        ``colours`` [3, 2], rx and ry as columns, up to a common factor; ``mixtures`` [3, 2], where ``d @ mixtures`` are gx
-        and gy of a colour ``d``, up to the inverse factor; and ``curl``, 0 for perfect slopes and .5 for noise.
-
-    Raises:
-        ValueError: If no two mixtures of colours are slopes of one height.
+    Returns ``colours`` [3, 2], rx and ry as columns, up to a common factor; ``mixtures`` [3, 2], where ``d @ mixtures``
+    are gx and gy of a colour ``d``, up to the inverse factor; and ``curl``, 0 for perfect slopes and .5 for noise.
     """
     down = ((images[:, 2:, 1:-1] - images[:, :-2, 1:-1]) / 2).reshape(-1, 3)
     right = ((images[:, 1:-1, 2:] - images[:, 1:-1, :-2]) / 2).reshape(-1, 3)

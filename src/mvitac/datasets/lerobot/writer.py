@@ -37,9 +37,8 @@ def check_fps(fps: float) -> None:
 def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
     """Write the rows of ``pack`` that have every modality to the new folder ``out``, and return their number.
 
-    Raises:
-        Busy: If another process writes ``out``.
-        ValueError: If ``out`` exists or cannot be written, or no row has every modality.
+    Raises Busy if another process writes ``out``; ValueError if it exists, cannot be written, or no row has every
+    modality.
     """
     check_fps(fps)
     rows = pack.rows("train", "val", "test", "unlabelled", having=pack.spec.modalities)

@@ -18,20 +18,11 @@ BY_GROUP = "by-group"
 def assign_splits(
     groups: Sequence[str], targets: Sequence[Sequence[int]], test_share: float, val_share: float, seed: int
 ) -> list[str]:
-    """Assign whole groups to train, val and test, stratified by the classes of the first label.
+    """Split of each row: whole ``groups`` go to train, val and test, stratified by the classes of the first label.
 
     The first group of each class goes to train and each further group to the split with the largest deficit, so a class
-    with one group is never tested. Groups without any label are "unlabelled" if other groups are labelled.
-
-    Args:
-        groups: Group of each row.
-        targets: For each task, the class number of each row (-1 = unlabelled).
-        test_share: Fraction of groups in test.
-        val_share: Fraction of groups in val.
-        seed: Random seed.
-
-    Returns:
-        The split of each row.
+    with one group is never tested. Groups without any label are "unlabelled" if other groups are labelled. ``targets``:
+    class number of each row for each task (-1 = unlabelled); the shares are fractions of the groups.
     """
     votes: dict[str, Counter[int]] = {group: Counter() for group in groups}
     known: set[str] = set()
@@ -167,15 +158,8 @@ def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.nda
 
     Starts from a random assignment and moves one group, or exchanges two, as long as that lowers the sum of squared
     differences from ``shares``. Rows and groups count equally: the number of rows limits the precision of a score, the
-    number of groups its confidence interval. A class with a single group does not count.
-
-    Args:
-        counts: [G, C], number of rows of each group in each class.
-        shares: Fraction of each split.
-        seed: Random seed of the initial assignment.
-
-    Returns:
-        [G] int64, the index in ``shares`` of each group's split.
+    number of groups its confidence interval. A class with a single group does not count. ``counts`` [G, C] is the
+    number of rows of each group in each class. Returns int64 [G], the index in ``shares`` of each group's split.
     """
     num = len(counts)
     if not num:
