@@ -76,6 +76,7 @@ def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
     from mvitac.deploy.engine import frame_shapes
     from mvitac.live.display import Window
+    from mvitac.live.predictor import Live
     from mvitac.live.recorder import Recorder, finish
 
     if argv[:1] == ["--finish"] and len(argv) == 2:
@@ -94,14 +95,16 @@ def live(argv: list[str]) -> None:
     if options.plot and not engine.values:
         raise ValueError(f"--plot draws values over time, and {options.model} predicts classes only: leave it out")
     nearest = _nearest(options, engine)
-    streams = _streams(options, engine)
+    streams: Any = _streams(options, engine)
     if not (options.vision or options.touch):
         print("no --vision, no --touch: all sensors are simulated")
     recorder = None
     if options.record:
         channels = {m: s[2] for m, s in frame_shapes(engine).items()}
         recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
-    loop = _loop(engine, streams, options.live, console, nearest=nearest, record=recorder)
+    # Faults are printed above the picture, so that they stay in the scrollback and in a log file.
+    tell = lambda event: _say(console, event.text, "yellow")  # noqa: E731
+    loop = Live(engine, streams, options.live, nearest=nearest, record=recorder, tell=tell)
     said: list[Any] = []
     with _lines(options.predictions) as write:
         _run(loop, console, window, options.seconds, lambda new: (write(new), options.plot and said.append(new)))
@@ -154,16 +157,6 @@ def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
         pairs = zip(names, texts, strict=True)
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
     return streams
-
-
-def _loop(engine: "Engine", streams: dict[str, Any], config: LiveConfig, console: Console, **options: Any) -> "Live":
-    from mvitac.live.predictor import Live
-
-    # Printed above the picture, so that events stay in the scrollback and in a log file.
-    def tell(event: Any) -> None:
-        _say(console, event.text, "yellow")
-
-    return Live(engine, streams, config, tell=tell, **options)
 
 
 @contextmanager

@@ -125,11 +125,8 @@ def draw_instance(seed: int, category: int, instance: int) -> Instance:
     decades = rng.uniform(0.1, 0.6) if soft else -rng.uniform(0.1, 1.6)
     asperity = rng.uniform(0.3, 0.85) * (1 if rough else -1)
     wavelength = np.exp(rng.uniform(*np.log(m.wavelength_mm)))
-    shared = {
-        "anisotropy": rng.uniform(*m.anisotropy),
-        "irregularity": rng.uniform(*m.irregularity),
-        "asperity": asperity,
-    }
+    shared = {"anisotropy": rng.uniform(*m.anisotropy), "irregularity": rng.uniform(*m.irregularity)}
+    shared["asperity"] = asperity
     ratio = rng.uniform(6.0, 9.0)
     tables = draw_tables(rng)
     mean = np.asarray(m.colour, np.float32)
@@ -344,9 +341,5 @@ def _feel(
     made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
     if background:  # rendered last, so that other pictures do not change
         made["background"] = draw(np.zeros_like(imprint))
-    return {
-        **made,
-        "sensor": sensor.name,
-        "force_n": force,
-        **(contact(relief, force_n=force, **physics) if measured else {}),
-    }
+    made |= {"sensor": sensor.name, "force_n": force}
+    return made | (contact(relief, force_n=force, **physics) if measured else {})
