@@ -77,9 +77,9 @@ def main() -> None:
         augment=replace(base.augment, size=options.size),
     )
     model = fresh(run, pack.spec, options.size)
-    from mvitac.deploy.publish import with_readouts  # imported after the number of threads is set
+    from mvitac.deploy.publish import with_probes  # imported after the number of threads is set
 
-    graph = ExportModule(with_readouts(model, pack))
+    graph = ExportModule(with_probes(model, pack))
     calls: dict[str, Call] = {"eager": in_torch(graph)}
     if not options.no_compile:
         calls["torch.compile"] = in_torch(torch.compile(graph, dynamic=False))

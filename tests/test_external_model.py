@@ -22,7 +22,8 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
-from mvitac.evaluation.probe import cross_modal, probe_model
+from mvitac.evaluation.probe import probe_model
+from mvitac.evaluation.retrieval import cross_modal
 from mvitac.experiments.collect import gather, lay_out
 from mvitac.experiments.jobs import do
 from mvitac.experiments.plan import Row

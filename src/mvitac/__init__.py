@@ -6,8 +6,6 @@
 Names are imported on first use, so that ``import mvitac`` is fast.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -8,8 +8,6 @@
 "external:sparsh:FILE+external:timm/resnet18".
 """
 
-from __future__ import annotations
-
 from typing import Any, NoReturn
 
 import torch
@@ -62,7 +60,7 @@ class ExternalModel(Model):
         for modality, part in parts.items():
             sensors = max(1, spec.channels(modality) // 3 // spec.frames(modality))
             self.encoders[modality] = part.encoder.bound(Layout(sensors, spec.frames(modality), gains[modality]))
-        self.projectors, self.classifiers, self.tasks, self.readouts = nn.ModuleDict(), nn.ModuleList(), (), {}
+        self.projectors, self.classifiers, self.tasks, self.probes = nn.ModuleDict(), nn.ModuleList(), (), {}
         self.eval()
 
     def __repr__(self) -> str:
@@ -71,9 +69,7 @@ class ExternalModel(Model):
     @property
     def run(self) -> NoReturn:  # type: ignore[override]
         """External encoders have none."""
-        raise ValueError(
-            f"{self.text} was not trained here and has no run: use it with `mvitac probe --encoder` or `embed`"
-        )
+        raise ValueError(f"{self.text} was not trained here: use it with `mvitac probe --encoder` or `embed`")
 
     @property
     def seed(self) -> int:
@@ -96,13 +92,11 @@ class ExternalModel(Model):
         """What its encoders were trained on, as far as it is known; ("nothing",) for random weights."""
         return tuple(dict.fromkeys(part.loaded.trained_on for part in self.parts.values()))
 
-    def on(self, pack: Pack) -> tuple[ExternalModel, Pack]:
-        """This model and ``pack``, for each other.
+    def on(self, pack: Pack) -> "tuple[ExternalModel, Pack]":
+        """This model and ``pack``, for each other; ValueError if they do not fit.
 
-        The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows yet.
-
-        Raises:
-            ValueError: If the data has no image that this model reads, or the windows that were asked for are impossible.
+        The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows
+        yet.
         """
         parts = {m: part for m, part in self.parts.items() if m in pack.spec.modalities}
         if not parts:
@@ -126,14 +120,13 @@ class ExternalModel(Model):
                     raise
                 notes.append(f"the current frame is repeated ({error})")
         for modality, part in parts.items():
-            difference = (pack.spec.difference and modality == "touch") or (
-                pack.spec.window.minus_first and modality in pack.spec.window.of
-            )
+            window, sense = pack.spec.window, modality == "touch" and pack.spec.difference
+            difference = sense or (window.minus_first and modality in window.of)
             if part.encoder.preprocessing.offset is not None and not difference:
                 notes.append(f"{modality}: its owner subtracts a background, this data has none: images as they are")
         return ExternalModel(self.text, parts, pack.spec, pack.size, tuple(notes)), pack
 
-    def untrained(self) -> ExternalModel | None:
+    def untrained(self) -> "ExternalModel | None":
         """The same networks with random weights, as a control; None where that is not possible."""
         parts = {m: random for m, part in self.parts.items() if (random := part.untrained())}
         if not parts:
@@ -193,11 +186,7 @@ def is_noncommercial(licence: str) -> bool:
 
 
 def load_external(text: str) -> ExternalModel:
-    """Open the encoders that ``text`` names: one, or one for each sense joined by "+".
-
-    Raises:
-        ValueError: If there is no such encoder, or two encoders read the same sense.
-    """
+    """Open the encoders that ``text`` names: one, or one for each sense joined by "+"."""
     texts = [START + part for part in text.removeprefix(START).split(f"+{START}")]
     opened = [open_encoder(each) for each in texts]
     parts: dict[str, OpenEncoder] = {}

@@ -7,15 +7,12 @@
 Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the shared space, K classes.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 
@@ -25,18 +22,15 @@ from mvitac.data.spec import DataSpec, Target
 from mvitac.methods.base import Method
 from mvitac.nn.encoders import SCRATCH, last_map, num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
-from mvitac.nn.weights import check_tensors, read_safetensors, safetensors_digest
+from mvitac.nn.weights import check_tensors, read_model, safetensors_digest, write_model
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import brief, digest, parse_json, write_atomic
+from mvitac.system.files import brief, digest, parse_json
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
-FORMAT = "mvitac-model"
-BEST = "model.best.safetensors"
-"""Weights of a run that were best on split val, kept with ``Run.eval_every``."""
-EMBED_BATCH = 64
-"""Images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px."""
+BEST = "model.best.safetensors"  # weights of a run that were best on split val, kept with ``Run.eval_every``
+EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px
 
 
 class Model(nn.Module):
@@ -45,19 +39,15 @@ class Model(nn.Module):
     ``embed`` and ``predict`` take raw images of any kind and compute no gradients. ``forward`` takes tensors and computes
     gradients, so the model can be trained further like any torch module.
 
-    Args:
-        method: The method, trained or not.
-        run: The run that trains it.
-        spec: Description of the training data.
-        stored: Side in pixels of the images in the training pack. Raw images are first resized to it.
+    ``spec`` describes the training data; ``stored`` is the side in pixels of its images, to which raw images are first
+    resized.
 
     Attributes:
         encoders: modality -> trunk.
         projectors: modality -> head into the shared space.
         tasks: Names of the tasks of the method's own heads (``classifiers``); empty for a self-supervised method.
-        readouts: Name -> linear probe, if the model is a published artifact.
-        foreign: Whether it is from an artifact or an index, which may be a stranger's: no place that ``run`` names is
-            opened.
+        probes: Name -> linear probe, if the model is a published artifact.
+        foreign: Whether it is from an artifact or an index, maybe a stranger's: no place that ``run`` names is opened.
     """
 
     foreign = False
@@ -71,17 +61,15 @@ class Model(nn.Module):
         self.tasks = tuple(own)
         self.classifiers = nn.ModuleList(own.values())
         # Not in the state dict: the weights of a run are the same with and without published probes.
-        self.readouts: dict[str, LinearProbe] = {}
+        self.probes: dict[str, LinearProbe] = {}
         self.eval()
 
     @property
     def seed(self) -> int:
-        """Seed of the run."""
         return self.run.seed
 
     @property
     def title(self) -> str:
-        """Name of the method."""
         return self.run.method.name
 
     @property
@@ -104,22 +92,15 @@ class Model(nn.Module):
     def forward(
         self, *unnamed: Tensor, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False
     ) -> dict[str, Tensor]:
-        """Features of batches of images, with gradients, for fine-tuning.
+        """Features of batches of images, with gradients, for fine-tuning: modality -> [B, D].
 
         The features are those of ``embed``. After loading, the model is in eval mode: BatchNorm keeps its statistics.
-        ``train()`` changes that, as for any torch module.
+        ``train()`` changes that, as for any torch module. Images need the name of their modality.
 
         Args:
-            unnamed: Not allowed: images need the name of their modality.
             vision: Camera images [B, C, H, W], uint8 or float in [0, 1], e.g. a batch of ``transform("vision")``.
             touch: Tactile images, likewise. For models trained on difference images: the differences.
-            shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
-
-        Returns:
-            modality -> [B, D], or [B, E] with ``shared``.
-
-        Raises:
-            ValueError: If images do not fit the model.
+            shared: Return embeddings [B, E] in the space shared by both modalities, L2-normalised, instead of features.
         """
         if unnamed:
             raise ValueError(f"images need a name: {' or '.join(f'model({m}=images)' for m in self.encoders)}")
@@ -131,7 +112,6 @@ class Model(nn.Module):
         return result
 
     def _named(self, vision: Any, touch: Any) -> dict[str, Any]:
-        """modality -> what was given for it."""
         given = {m: v for m, v in (("vision", vision), ("touch", touch)) if v is not None}
         if not given:
             raise ValueError("no images given: give vision=..., touch=..., or both")
@@ -155,14 +135,9 @@ class Model(nn.Module):
     def transform(self, modality: str, *, normalize: bool = False, background: ImageInput | None = None) -> Preprocess:
         """The preprocessing of one image as a function, e.g. for the dataset of a ``DataLoader``.
 
-        Args:
-            modality: vision or touch.
-            normalize: Return the normalised input of ``trunk`` instead of the images that ``forward`` takes.
-            background: For models trained on difference images: the sensor without contact, one image, to subtract.
-
-        Returns:
-            A function from an image (path, PIL image, array, tensor) to uint8 [C, stored, stored], or with ``normalize``
-            to fp32 [C, S, S]. It can be pickled.
+        It takes a path, PIL image, array or tensor and gives uint8 [C, stored, stored] for ``forward``, or with
+        ``normalize`` the input fp32 [C, S, S] of ``trunk``. It can be pickled. For models trained on difference images,
+        ``background`` is one image of the sensor without contact, to subtract.
         """
         self.check_modality(modality)
         self._check_background(modality, background)
@@ -175,9 +150,6 @@ class Model(nn.Module):
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
 
         Its ``pretrained_cfg`` has the input size, mean and std that ``timm.data.resolve_model_data_config`` reads.
-
-        Raises:
-            ValueError: If the model has no such encoder, or it is not a single timm model.
         """
         self.check_modality(modality)
         channels, size = self.spec.channels(modality), self.run.augment.eval_size
@@ -186,17 +158,10 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
-        """Pooled features of images from a pack, without gradients.
+        """Pooled features [B, D] in fp32 of images from a pack (uint8 [B, C, H, W], or floats in [0, 1]), without gradients.
 
-        Args:
-            modality: vision or touch.
-            images: uint8 [B, C, H, W], as a pack stores them, or floats in [0, 1].
-            for_heads: Compute the features that ``project`` and ``classify`` take. They see images at the size of the
-                training views (``Augment.size``), while probes see them at ``Augment.whole``.
-            bf16: Compute in bf16.
-
-        Returns:
-            [B, D], fp32.
+        With ``for_heads`` they are those that ``project`` and ``classify`` take, of images at the size of the training
+        views (``Augment.size``); probes see images at ``Augment.eval_size``.
         """
         check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
@@ -214,22 +179,15 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Class probabilities [B, K] from the classifier that a supervised method trained with its encoders.
+        """Class probabilities [B, K] of one of ``tasks``, by the head that a supervised method trained.
 
-        Args:
-            task: One of ``tasks``, with classes.
-            features: modality -> ``features(..., for_heads=True)``.
+        ``features``: modality -> ``features(..., for_heads=True)``.
         """
         return self._answer(task, features).softmax(dim=1)
 
     @torch.no_grad()
     def estimate(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Values [B, T] in their units, from the head that a supervised method trained with its encoders.
-
-        Args:
-            task: One of ``tasks``, with values.
-            features: modality -> ``features(..., for_heads=True)``.
-        """
+        """Values [B, T] of one of ``tasks`` in their units, as for ``classify``."""
         return self._answer(task, features)
 
     def _answer(self, task: str, features: dict[str, Tensor]) -> Tensor:
@@ -266,9 +224,6 @@ class Model(nn.Module):
         Returns:
             modality -> [N, D], or [N, E] with ``shared``.
 
-        Raises:
-            ValueError: If images do not fit the model, or the model is in training mode.
-
         Example:
             >>> model.embed(touch=np.zeros((4, 240, 320, 3), np.uint8))["touch"].shape  # doctest: +SKIP
             torch.Size([4, 512])
@@ -280,7 +235,6 @@ class Model(nn.Module):
         return {m: self._embed(m, v, background if m == "touch" else None, shared) for m, v in given.items()}
 
     def _embed(self, modality: str, value: ImageInput, background: ImageInput | None, shared: bool) -> Tensor:
-        """Embeddings [N, D or E] of one modality."""
         prepare = self.transform(modality)
         chunks = []
         for batch in prepare.batches(value, background, EMBED_BATCH):
@@ -289,52 +243,44 @@ class Model(nn.Module):
         return torch.cat(chunks)
 
     def _check_background(self, modality: str, background: ImageInput | None) -> None:
-        window = self.spec.window
-        first = window.minus_first and "touch" in window.of
-        if background is not None and first and self.spec.difference:
-            raise ValueError(
-                "background: this model's touch is minus a background, then minus its first frame: give it as trained"
-            )
-        if background is not None and (modality != "touch" or not (self.spec.difference or first)):
+        if background is None:
+            return
+        first = self.spec.window.minus_first and "touch" in self.spec.window.of
+        if first and self.spec.difference:
+            what = "this model's touch is minus a background, then minus its first frame"
+            raise ValueError(f"background: {what}: give it as trained")
+        if modality != "touch":
+            raise ValueError("background cannot be used, there is no touch: leave it out")
+        if not (self.spec.difference or first):
             untrained = "this model was not trained on difference images of touch"
-            why = untrained if modality == "touch" else "there is no touch"
-            raise ValueError(f"background cannot be used, {why}: leave it out")
+            raise ValueError(f"background cannot be used, {untrained}: leave it out")
 
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None
     ) -> dict[str, Tensor]:
-        """Classify or measure raw images with the probes of a published artifact.
+        """Classify or measure raw images, given as for ``embed``, with the probes of a published artifact.
 
-        Args:
-            vision: As for ``embed``. If both modalities are given, the probes on both are used.
-            touch: As for ``embed``.
-            background: As for ``embed``.
-
-        Returns:
-            task -> class probabilities [N, K], or values [N, T] in the units of their targets. ``classes`` and ``targets``
-            name the columns.
-
-        Raises:
-            ValueError: As for ``embed``, or if the model has no probe on these modalities.
+        Returns task -> class probabilities [N, K], or values [N, T] in the units of their targets; ``classes`` and
+        ``targets`` name the columns. If both modalities are given, the probes on both are used.
         """
         given = self.embed(vision=vision, touch=touch, background=background)
         asked = "both" if len(given) == 2 else next(iter(given))
         if len({len(x) for x in given.values()}) > 1:
             raise ValueError(f"predict: got {len(given['vision'])} vision and {len(given['touch'])} touch images")
-        chosen = [r for r in self.readouts.values() if r.question.modality == asked]
+        chosen = [r for r in self.probes.values() if r.info.modality == asked]
         if not chosen:
             raise ValueError(f"this model has no probe on {asked}: load an artifact written by `mvitac publish`")
-        return {r.question.task: r(torch.cat([given[m].cpu() for m in r.question.modalities], dim=1)) for r in chosen}
+        return {r.info.task: r(torch.cat([given[m].cpu() for m in r.info.modalities], dim=1)) for r in chosen}
 
     @property
     def classes(self) -> dict[str, tuple[str, ...]]:
         """task -> class names, in the order of the columns of ``predict``."""
-        return {q.task: q.classes for r in self.readouts.values() if isinstance(q := r.question, ProbeInfo)}
+        return {q.task: q.classes for r in self.probes.values() if isinstance(q := r.info, ProbeInfo)}
 
     @property
     def targets(self) -> dict[str, tuple[Target, ...]]:
         """task -> names and units of its values, in the order of the columns of ``predict``."""
-        return {q.task: q.targets for r in self.readouts.values() if isinstance(q := r.question, ValueInfo)}
+        return {q.task: q.targets for r in self.probes.values() if isinstance(q := r.info, ValueInfo)}
 
     def open_data(self, *, quiet: bool = False) -> Pack:
         """Open the data that the model was trained on; ValueError if it is not here, or ``foreign`` names its place."""
@@ -350,18 +296,11 @@ class Model(nn.Module):
     def save(self, path: Path) -> None:
         """Write a .safetensors file with the run and the description of the data in its header."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
-        header = {
-            "format": FORMAT,
-            "run": json.dumps(to_json(self.run)),
-            "spec": json.dumps(to_json(self.spec)),
-            "stored": str(self.stored),
-            "digest": safetensors_digest(tensors),
-        }
-        header["header_digest"] = digest([header["run"], header["spec"], header["stored"]])
-        data = safetensors.torch.save(tensors, metadata=header)
-        write_atomic(path, lambda file: file.write(data))
+        about = json.dumps(to_json(self.run)), json.dumps(to_json(self.spec)), str(self.stored)
+        write_model(path, tensors, dict(zip(ABOUT, about, strict=True)))
 
 
+ABOUT = ("run", "spec", "stored")
 Which = Literal["last", "best"]
 
 
@@ -381,26 +320,15 @@ def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
 def load(path: str | Path, which: Which = "last") -> Model:
     """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
 
-    Args:
-        path: The folder or the file.
-        which: Weights of a run's folder: those after its last step, or the best on split val (``Run.eval_every``).
-
-    Raises:
-        ValueError: If there is no such model, or the file is damaged or was changed.
+    ``which``: weights of a run's folder after its last step, or the best on split val (``Run.eval_every``). ValueError if
+    there is no such model, or the file is damaged or was changed.
     """
     path = Path(path)
     file = weights_file(path, which) if path.is_dir() else path
     if not file.is_file():
         hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
         raise ValueError(f"no trained model at {file}{hint}")
-    header, tensors = read_safetensors(file)
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{file} was not written by mvitac: its header lacks format={FORMAT}")
-    if safetensors_digest(tensors) != header.get("digest"):
-        raise ValueError(f"{file} does not match its digest: the weights were changed or damaged")
-    given = digest([header.get("run"), header.get("spec"), header.get("stored")])
-    if header.get("header_digest", given) != given:
-        raise ValueError(f"{file} does not match its header's digest: it was changed or damaged")
+    header, tensors = read_model(file, ABOUT)
     try:
         run = Run.load(parse_json(header["run"]))
         spec: DataSpec = from_json(DataSpec, parse_json(header["spec"]), "spec")

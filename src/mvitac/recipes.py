@@ -1,7 +1,5 @@
 """Recipes: functions that return a complete ``Run``. Each changes another recipe, so the code shows the differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, replace
 
@@ -171,9 +169,8 @@ def _is_phased(data: DatasetConfig, phased: bool | None) -> bool:
     return data.open(quiet=True).phased if known is None else known
 
 
-RECIPES: dict[str, Callable[[DatasetConfig, bool | None], Run]] = {
-    f.__name__: f for f in (paper, authors, modern, demo, quick, smoke)
-}
+_ALL = (paper, authors, modern, demo, quick, smoke)
+RECIPES: dict[str, Callable[[DatasetConfig, bool | None], Run]] = {f.__name__: f for f in _ALL}
 
 
 def with_method(run: Run, method: str) -> Run:

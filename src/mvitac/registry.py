@@ -7,8 +7,6 @@ A *kind* is a direct subclass of ``Registered``. Each further subclass that has 
     find(MethodConfig, "mvitac") is MViTacConfig
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import importlib
@@ -85,9 +83,7 @@ def formerly(value: Any) -> dict[str, Any]:
 def to_json(config: Any, *, for_digest: bool = False) -> Any:
     """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``.
 
-    Args:
-        config: A config, or a container of configs and plain values.
-        for_digest: Leave out the fields of ``LATER_IN_DIGEST`` and ``formerly`` that older files lack.
+    With ``for_digest``, the fields of ``LATER_IN_DIGEST`` and ``formerly`` that older files lack are left out.
     """
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         written = [f for f in dataclasses.fields(config) if not _is_omitted(f, getattr(config, f.name), for_digest)]
@@ -107,15 +103,9 @@ def _is_omitted(field: dataclasses.Field, value: Any, for_digest: bool) -> bool:
 
 
 def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
-    """Rebuild a value written by ``to_json``.
+    """Rebuild a value of type ``annotation`` (a dataclass, container or plain type) that was written by ``to_json``.
 
-    Args:
-        annotation: Type to build: a dataclass, a container of supported types, or a plain type.
-        value: Parsed JSON.
-        where: Name of the field, for error messages.
-
-    Raises:
-        ValueError: If a value does not have the annotated type; the message names the field.
+    ValueError if a value does not have the annotated type; the message names the field, which begins with ``where``.
     """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (types.UnionType, typing.Union):

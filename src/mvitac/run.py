@@ -1,7 +1,5 @@
 """``Run``: every setting that decides the outcome of pre-training. It is stored with each result as run.json."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -181,16 +179,7 @@ class Run:
         return num_rows // self.batch_size
 
     def check(self, spec: DataSpec, num_rows: int, stored_size: int) -> None:
-        """Check the settings against each other and the data, before training starts.
-
-        Args:
-            spec: Description of the dataset.
-            num_rows: Number of training rows.
-            stored_size: Side in pixels of the pack's images.
-
-        Raises:
-            ValueError: If they do not fit.
-        """
+        """Check the settings against each other and the data (``stored_size`` in pixels), before training."""
         if num_rows < 2:
             raise ValueError(
                 f"dataset {spec.name!r} has {num_rows or 'no'} rows in split train or unlabelled:"
@@ -231,7 +220,7 @@ class Run:
         assert self.precision != "auto", "auto is resolved earlier (device.pick_precision)"
         return self.precision == "bf16"
 
-    def without_idle(self, spec: DataSpec) -> Run:
+    def without_idle(self, spec: DataSpec) -> "Run":
         """This run with every setting that has no effect on the dataset at a fixed value.
 
         Two runs that train alike on the dataset become equal.
@@ -250,7 +239,7 @@ class Run:
         return digest(value)
 
     @classmethod
-    def load(cls, value: Any) -> Run:
+    def load(cls, value: Any) -> "Run":
         """Create a run from the "run" object of a run.json."""
         return from_json(cls, value)
 
@@ -261,11 +250,7 @@ def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
 
 
 def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
-    """Read a run.json. Returns the ``Run`` and the whole record.
-
-    Raises:
-        ValueError: If the file is not a run's record. Names the file and the field.
-    """
+    """Read a run.json: the ``Run`` and the whole record. ValueError with the file and the field if it is none."""
     record = read_json(file, "a run's record")
     if not isinstance(record, dict) or "run" not in record:
         raise ValueError(f"{file} is not a run's record: give the run.json that `mvitac pretrain` wrote")

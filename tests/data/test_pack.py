@@ -26,7 +26,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.partial_pack import RowFile
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.probe import retrieved_rows
+from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.system import locks
 from support.toy import Counting, Toy, toy_pack
 

@@ -36,7 +36,8 @@ from mvitac.datasets.touch_and_go.lists import (
 from mvitac.datasets.touch_and_go.reader import CHUNK, TouchAndGoConfig, _columns, _spec
 from mvitac.datasets.touch_and_go.recordings import Recording
 from mvitac.evaluation.leaks import Scored, source_of
-from mvitac.evaluation.probe import retrieved_rows, split_rows
+from mvitac.evaluation.probe import split_rows
+from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from support.videos import numbered, read_number, write_video

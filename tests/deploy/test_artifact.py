@@ -25,7 +25,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.artifact import preprocessing, read_manifest, seal
 from mvitac.deploy.card import card
-from mvitac.deploy.publish import fit_readouts, push
+from mvitac.deploy.publish import fit_probes, push
 from mvitac.deploy.search import check_pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import pack_features
@@ -77,7 +77,7 @@ def test_predicts_what_the_probe_scored(smoke_run: Path, artifact: Path, pack: P
             found = model.predict(**{m: pack.images[m][rows] for m in names})[task.name]
             accuracy = float((found.argmax(1).numpy() == labels).mean())
             assert accuracy == pytest.approx(summary[task.name][modality]["mvitac"]["mean"])
-            assert accuracy == pytest.approx(model.readouts[f"{task.name}.{modality}"].question.accuracy)
+            assert accuracy == pytest.approx(model.probes[f"{task.name}.{modality}"].info.accuracy)
             torch.testing.assert_close(found.sum(1), torch.ones(len(rows)))
         assert model.classes[task.name] == task.classes
 
@@ -91,8 +91,8 @@ def test_a_probe_gives_scikit_learns_probabilities(smoke_run: Path, pack: Pack) 
         labels = pack.column(f"label_{task.name}").astype(int)
         x = {r: pack_features(model, pack, "touch", getattr(rows, r)).numpy() for r in ("train", "val", "test")}
         fitted, _ = fit_linear(x["train"], labels[rows.train], x["val"], labels[rows.val])
-        readout = fit_readouts(model, pack)[f"{task.name}.touch"]
-        np.testing.assert_allclose(readout(torch.from_numpy(x["test"])).numpy(), fitted(x["test"]), atol=1e-4)
+        probe = fit_probes(model, pack)[f"{task.name}.touch"]
+        np.testing.assert_allclose(probe(torch.from_numpy(x["test"])).numpy(), fitted(x["test"]), atol=1e-4)
 
 
 def test_publish_command_and_card(smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,7 +34,7 @@ def test_predicted_values_score_as_the_artifact_says(value_artifact: Path, measu
         for modality, names in (("touch", ["touch"]), ("both", ["vision", "touch"])):
             found = model.predict(**{m: measured.images[m][rows] for m in names})[task.name]
             again = score_predictions(measured, task, rows, found.numpy())
-            errors = model.readouts[f"{task.name}.{modality}"].question.errors
+            errors = model.probes[f"{task.name}.{modality}"].info.errors
             for target, error in zip(again["targets"], errors, strict=True):
                 assert (error.r2, error.mae) == pytest.approx((target["r2"], target["mae"]), abs=1e-4)
             assert again["r2"] == pytest.approx(summary[task.name][modality]["mvitac"]["mean"], abs=1e-4)
@@ -48,11 +48,11 @@ def test_the_spread_of_a_prediction_is_that_of_test_rows_in_its_range(
 ) -> None:
     monkeypatch.setattr(publish, "RANGE_ROWS", 5)
     model, task = mvitac.load(value_artifact), measured.spec.values[0]
-    model.readouts = publish.fit_readouts(model, measured)
+    model.probes = publish.fit_probes(model, measured)
     rows = split_rows(measured, task).test
     found = model.predict(touch=measured.images["touch"][rows])["light"][:, 0].numpy()
     off = found - measured.values(task)[rows, 0]
-    (error,) = model.readouts["light.touch"].question.errors
+    (error,) = model.probes["light.touch"].info.errors
     assert len(error.spread) == len(rows) // 5 > 2
     assert min(error.spread) <= error.rmse <= max(error.spread)
     for value in found:
@@ -65,7 +65,7 @@ def test_the_spread_of_a_prediction_is_that_of_test_rows_in_its_range(
 def test_the_card_has_errors_in_the_unit(value_artifact: Path) -> None:
     text = (value_artifact / "README.md").read_text()
     model = mvitac.load(value_artifact)
-    errors = model.readouts["both.touch"].question.errors
+    errors = model.probes["both.touch"].info.errors
     assert "Accuracy or R2 in percent" in text and "- both: level in levels, weight in N" in text
     assert f"{errors[1].mae:.3g} ({errors[1].rmse:.3g}) N" in text
     assert "| mean |" in text and "| untrained |" in text
@@ -99,12 +99,12 @@ def test_an_export_gives_the_models_values_with_unit_and_spread(
     for task, targets in model.targets.items():
         np.testing.assert_allclose(found[f"value_{task}"], said[task].numpy(), rtol=1e-3, atol=1e-3)
         assert [(t["name"], t["unit"]) for t in engine.values[task]] == [(t.name, t.unit) for t in targets]
-        (error, *_) = model.readouts[f"{task}.both"].question.errors
+        (error, *_) = model.probes[f"{task}.both"].info.errors
         assert spread_at(engine.values[task][0], 99.0) == error.spread_at(99.0)
     assert set(engine.classes) == set(model.classes)
     (light,) = engine.meta["report"]["values"]["light"]
     assert light["unit"] == "levels" and light["num"] == 24 and light["change"] < 1e-3 * light["allowed"]
-    assert light["export"] == pytest.approx(model.readouts["light.both"].question.errors[0].mae, rel=1e-3)
+    assert light["export"] == pytest.approx(model.probes["light.both"].info.errors[0].mae, rel=1e-3)
     spread = float(np.std(measured.values(measured.spec.values[0])[measured.rows("test")]))
     assert light["allowed"] == pytest.approx(0.1 * spread)
 

@@ -27,7 +27,7 @@ from mvitac.deploy.engine import Engine, cosines
 from mvitac.deploy.export import ExportConfig, export
 from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.parity import parity, reference
-from mvitac.deploy.publish import with_readouts
+from mvitac.deploy.publish import with_probes
 from mvitac.deploy.quantise import this_machine
 from mvitac.model import Model
 from mvitac.recipes import recipe
@@ -157,7 +157,7 @@ def test_torch_export_of_touch_alone(
     out = tmp_path / "touch"
     command = ["export", str(smoke_run), "--format", "torch", "--modality", "touch", "--out", str(out)]
     assert main([*command, "--threads", "1"]) == 0
-    model = with_readouts(mvitac.load(smoke_run), pack)
+    model = with_probes(mvitac.load(smoke_run), pack)
     images = pack.images["touch"][:3]
     used: list[int] = []
     with monkeypatch.context() as patch:
@@ -196,7 +196,7 @@ def test_rows_that_check_and_calibrate_are_of_every_class(
 def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "p", touch_channels=6, num=90)
     run = train(recipe("smoke", PackConfig(path=pack.path)), tmp_path / "r", quiet=True)
-    model = with_readouts(mvitac.load(run))
+    model = with_probes(mvitac.load(run))
     assert check(model, ExportModule(model), pack)["cosine"]["embedding_touch"]["min"] > 0.9999
 
 
@@ -255,7 +255,7 @@ def test_accuracy_is_of_classes_by_name(model: Model, pack: Pack) -> None:
     graph, other = ExportModule(model), reordered(pack)
     found = check(model, graph, other)["accuracy"]
     assert found == check(model, graph, pack)["accuracy"] and set(found) == {"pattern", "bright"}
-    assert found["pattern"]["original"] == 100 * model.readouts["pattern.both"].question.accuracy
+    assert found["pattern"]["original"] == 100 * model.probes["pattern.both"].info.accuracy
     other.spec = replace(pack.spec, tasks=pack.spec.tasks[:1])
     assert set(check(model, graph, other)["accuracy"]) == {"pattern"}
 

@@ -1,7 +1,5 @@
 """The board: one static page that compares results of one suite. Tasks down, encoders across, controls first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -75,12 +73,7 @@ class Board:
 
 
 def write_board(files: Sequence[Path], out: Path) -> Path:
-    """Write the page that compares the results in ``files``.
-
-    Raises:
-        ValueError: If a file is no result, was changed, is of another suite or version than the others or than the one
-            of this mvitac, has scores that its own sums do not give, or two results have one name.
-    """
+    """Write the page that compares the results in ``files``; ValueError if they do not hold or cannot be compared."""
     results: dict[str, dict[str, Any]] = {}
     for path in files:
         result = read_result(path)
@@ -133,10 +126,7 @@ def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: Su
     for modality in (m for m in ask.modalities if m in found):
         own = {**none, **found[modality]}
         lists = {name: cells.get((ask.name, modality, name)) or cells[ask.name, "none", name] for name in own}
-        few = {
-            name: [(s, each[modality][name]) for s, each in shares.items() if name in each.get(modality, ())]
-            for name in own
-        }
+        few = {n: [(s, at[modality][n]) for s, at in shares.items() if n in at.get(modality, ())] for n in own}
         whole = {name: [*line, (1.0, own[name])] for name, line in few.items() if line}
         rows.append(Row(task, tested_on({modality: own}, by), modality, lists, own, whole))
     return rows
@@ -213,18 +203,8 @@ def _scores(board: Board) -> str:
 
 
 def _encoders(board: Board) -> str:
-    columns = [
-        "",
-        "leak",
-        "parameters",
-        "images seen",
-        "licence",
-        "trained on",
-        "notes",
-        "seeds, input",
-        "weights",
-        "versions",
-    ]
+    columns = ["", "leak", "parameters", "images seen", "licence", "trained on", "notes"]
+    columns += ["seeds, input", "weights", "versions"]
     rows = []
     for name in board.encoders:
         result, encoder = board.results[name], board.results[name]["encoder"]
@@ -271,8 +251,6 @@ def _data(board: Board) -> str:
         for block in (block for block in result["blocks"] if "not_run" not in block):
             key = (block["set"], block["form"], block["data"]["rows"][:12])
             rows.setdefault(key, {})[f"{name} ({block['pinned']})"] = None
-    table = _text_table(
-        DATA, ["", "form", "digest of rows", "results"], [[*k, ", ".join(who)] for k, who in rows.items()]
-    )
+    table = _text_table(DATA, ["", "form", "digest of rows", "results"], [[*k, ", ".join(v)] for k, v in rows.items()])
     lost = page.fold(f"{len(board.not_run)} tasks that were not run", page.code("\n".join(board.not_run)))
     return table + (lost if board.not_run else "")

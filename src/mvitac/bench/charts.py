@@ -1,7 +1,5 @@
 """The board's charts: score against parameters, and against the number of labels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,9 +25,8 @@ def against_parameters(
     for number, (num, cell) in enumerate(points.values()):
         look: dict[str, Any] = {"color": colour(HUES[number % len(HUES)])}
         axes.plot([num / 1e6] * 2, [_cut(cell["low"]), _cut(cell["high"])], linewidth=1.2, **look)
-        handles += axes.plot(
-            num / 1e6, _cut(cell["mean"]), MARKERS[number // len(HUES) % len(MARKERS)], markersize=5, **look
-        )
+        marker = MARKERS[number // len(HUES) % len(MARKERS)]
+        handles += axes.plot(num / 1e6, _cut(cell["mean"]), marker, markersize=5, **look)
     names = [shorten(name, 26) for name in points]
     if level is not None:
         handles.append(axes.axhline(_cut(level), color=colour("grey2"), linestyle=":", linewidth=1.2))

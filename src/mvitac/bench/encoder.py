@@ -1,7 +1,5 @@
 """The encoder of a bench: load it, say what it is, score it, write its result."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,15 +39,8 @@ class About:
 def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:
     """Score an encoder on a suite and write <out>/<suite>-<name>.json; the same call continues an interrupted one.
 
-    Args:
-        places: Folders of runs or artifacts, or "external:...": the seeds of one encoder.
-        suite: The suite.
-        out: Folder of results.
-        root: Folder of real data; None = without.
-        about: What its owner says.
-
-    Raises:
-        ValueError: If the encoder cannot be loaded or reads no task, or the folder has other weights under this name.
+    ``places`` are its seeds: folders of runs or artifacts, or "external:...". ``root`` is the folder of real data, if
+    any.
     """
     models = [load(place) for place in places]
     encoder = describe(models, places, about)

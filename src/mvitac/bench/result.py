@@ -11,8 +11,6 @@ The digest shows that a file was changed by accident or by hand. It does not sho
 someone repeats them.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence
@@ -27,8 +25,7 @@ from mvitac.registry import from_json, to_json
 from mvitac.system.files import digest, read_json, write_atomic
 
 FORMAT, FORMAT_VERSION = "mvitac-bench", 1
-VOLATILE = ("digest", "about")
-"""Fields that the digest leaves out."""
+VOLATILE = ("digest", "about")  # fields that the digest leaves out
 KEPT = (
     *("source", "seed", "task", "modality", "probe", "accuracy", "balanced_accuracy", "macro_f1", "auroc", "num_test"),
     *("group_sizes", "group_correct", "r2", "targets", "group_sums", "C", "alpha", "steps"),

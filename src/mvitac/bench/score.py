@@ -4,8 +4,6 @@ Scores of a finished task are kept in <out>/parts until the result is written, s
 the controls stay: they are the same for every encoder of the folder.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -107,12 +105,8 @@ class Reader:
         model, pack = self.bound
         asked = [(task, m) for ask, task in self.opened.tasks for m in ask.modalities if modality in names_in(m, pack)]
         rows = np.unique(np.concatenate([split_rows(v, task, m).all for v in self.opened.packs for task, m in asked]))
-        z = joined(
-            [
-                features(model, v, modality, rows, maps=maps)
-                for v in sensors(pack, modality, model.spec.channels(modality))
-            ]
-        )
+        parts = sensors(pack, modality, model.spec.channels(modality))
+        z = joined([features(model, part, modality, rows, maps=maps) for part in parts])
         if z.ndim != 2 + maps or len(z) != len(rows):
             raise ValueError(
                 f"{self.name} gives features of shape {list(z.shape)} for {len(rows)} images of {modality}: give one"
@@ -170,15 +164,8 @@ class Entry:
 def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key: str) -> Iterator[dict[str, Any]]:
     """Score ``entry``, and yield a block for each task: "set", "task", and "not_run" or its records.
 
-    Args:
-        entry: The encoder.
-        suite: The suite.
-        root: Folder of the real data.
-        parts: Folder in which scores of finished tasks are kept.
-        key: Digest of the encoder.
-
-    Raises:
-        ValueError: If features are no finite numbers, or data is not that of the suite.
+    ``root`` holds the real data. Scores of finished tasks are kept in ``parts``, under ``key``, the digest of the
+    encoder.
     """
     here = provenance()
     random = [load_external(text) for text in suite.untrained]

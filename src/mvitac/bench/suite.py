@@ -4,8 +4,6 @@ A suite fixes data, rows, splits, probes, seeds and controls. Its digest covers 
 digests of the data that was measured. A definition that changes gets another name (sim-v2).
 """
 
-from __future__ import annotations
-
 import copy
 import tomllib
 from collections.abc import Sequence
@@ -34,12 +32,9 @@ Pinned = Literal["same", "other pixels", "other rows", "not pinned"]
 class SuiteTask:
     """A task of a set."""
 
-    name: str
-    """Its name in the data."""
-    modalities: tuple[Literal["touch", "vision", "both"], ...]
-    """Features to probe."""
-    labels: tuple[float, ...] = ()
-    """Fractions of the labels with which the linear probe is fitted once more."""
+    name: str  # its name in the data
+    modalities: tuple[Literal["touch", "vision", "both"], ...]  # features to probe
+    labels: tuple[float, ...] = ()  # fractions of the labels with which the linear probe is fitted once more
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +42,7 @@ class Form:
     """One way in which the data of a set exists."""
 
     name: str
-    data: dict[str, Any]
-    """Options of a dataset config, with its name."""
+    data: dict[str, Any]  # options of a dataset config, with its name
     at: dict[str, str] = field(default_factory=dict)
     """Option that names a place -> the place below --data-root. Empty: the data is simulated."""
     score_on: dict[str, Any] = field(default_factory=dict)
@@ -65,12 +59,9 @@ class SuiteSet:
     forms: tuple[Form, ...]
     """The first one that is found below --data-root is used. Scores of different forms are not compared."""
     tasks: tuple[SuiteTask, ...]
-    folds: int = 0
-    """Cross-validation over this number of folds of whole groups; 0 = the data's own split."""
-    val_every: int = 2
-    """Of the groups tested in the next fold, every n-th chooses the regularisation."""
-    names: tuple[str, ...] = ()
-    """What owners of encoders call this data in their list of training data."""
+    folds: int = 0  # cross-validation over this number of folds of whole groups; 0 = the data's own split
+    val_every: int = 2  # of the groups tested in the next fold, every n-th chooses the regularisation
+    names: tuple[str, ...] = ()  # what owners of encoders call this data in their list of training data
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +70,9 @@ class Suite:
 
     name: str
     title: str
-    probes: tuple[Probe, ...]
-    """Probes of encoders; the page shows the first. Controls have the linear one."""
-    seed: int
-    """Seed of the probes, and of which labels are kept."""
-    untrained: tuple[str, ...]
-    """The seeds of the control "untrained": external encoders with random weights."""
+    probes: tuple[Probe, ...]  # probes of encoders; the page shows the first. Controls have the linear one.
+    seed: int  # seed of the probes, and of which labels are kept
+    untrained: tuple[str, ...]  # the seeds of the control "untrained": external encoders with random weights
     sets: tuple[SuiteSet, ...]
 
     def __post_init__(self) -> None:
@@ -145,11 +133,7 @@ class Opened:
 
 
 def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
-    """Open the data of a set; the reason in one line if it is not there.
-
-    Raises:
-        ValueError: If the data is there, but not that of the suite.
-    """
+    """Open the data of a set; the reason in one line if it is not there. ValueError if it is not that of the suite."""
     for form in one.forms:
         if form.at and (root is None or not all((root / place).exists() for place in form.at.values())):
             continue
@@ -165,9 +149,7 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
         packs = _fold(pack, one) if one.folds else (pack,)
         found = {"rows": _rows_digest(packs, [task for _, task in tasks]), **_image_digests(made)}
         return Opened(form.name, packs, tasks, found, _compared(one, form, found))
-    places = " or ".join(
-        dict.fromkeys(str((root or Path()) / place) for form in one.forms for place in form.at.values())
-    )
+    places = " or ".join(dict.fromkeys(str((root or Path()) / p) for form in one.forms for p in form.at.values()))
     return f"{places} is not there" if root else f"no --data-root was given, where {places} would be"
 
 
@@ -193,9 +175,8 @@ def _fold(pack: Pack, one: SuiteSet) -> tuple[Pack, ...]:
     kept = sorted(set(groups[answered].tolist()))
     if one.folds > len(kept):
         raise ValueError(f"{one.name} has {len(kept)} labelled groups, the suite asks for {one.folds} folds")
-    columns = folds(
-        kept, [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept], one.folds, one.val_every
-    )
+    strata = [_stratum(pack, tasks[one.tasks[0].name], groups == group) for group in kept]
+    columns = folds(kept, strata, one.folds, one.val_every)
     found = []
     for column in columns.values():
         side = dict(zip(kept, column, strict=True))
@@ -230,7 +211,5 @@ def _rows_digest(packs: Sequence[Pack], tasks: Sequence[AnyTask]) -> str:
 
 def _image_digests(packs: Sequence[Pack]) -> dict[str, str]:
     """Digests of the images by modality; of the scored pack with the prefix "scored"."""
-    files = [
-        (prefix, *item) for prefix, pack in zip(("", "scored "), packs, strict=False) for item in pack.digests.items()
-    ]
+    files = [(by, *item) for by, pack in zip(("", "scored "), packs, strict=False) for item in pack.digests.items()]
     return {prefix + name.partition(".")[0]: found for prefix, name, found in files if name != "samples.parquet"}

@@ -37,9 +37,7 @@ complete -o default -F _mvitac mvitac
 def completion(argv: list[str]) -> None:
     """mvitac completion bash|zsh"""
     if argv not in (["bash"], ["zsh"]):
-        raise ValueError(
-            "name the shell: mvitac completion bash (or zsh); it prints a script, docs/install.md says where to"
-        )
+        raise ValueError("name the shell: mvitac completion bash (or zsh); docs/install.md says where the script goes")
     commands = dict.fromkeys(name.split()[0] for name in COMMANDS)
     lines = {
         "commands": " ".join(commands),

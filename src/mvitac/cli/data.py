@@ -24,8 +24,7 @@ from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.registry import default, unknown
 from mvitac.system.files import check_place, write_atomic
 
-OWN_COLUMNS = ("id", "group", "touch_group", "split", "sensor")
-"""Columns that packing adds to a table."""
+OWN_COLUMNS = ("id", "group", "touch_group", "split", "sensor")  # columns that packing adds to a table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,16 +75,8 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
             "a pack stores every frame once, so options of windows (--num-frames, --stride, ...) have no effect here:"
             " leave them out, and give them to the commands that read the pack"
         )
-    pack = build(
-        data.source(),
-        options.out,
-        size=data.size,
-        workers=data.workers,
-        store=data.store,
-        quality=data.quality,
-        max_damaged=options.max_damaged,
-        quiet=options.quiet,
-    )
+    given = {"max_damaged": options.max_damaged, "quiet": options.quiet, **data.build_options()}
+    pack = build(data.source(), options.out, **given)
     print(f"{pack.path}: {pack.num} samples at {pack.size} px")
     if lost := pack.meta["damaged"]:
         first = ": ".join(lost[0])
@@ -305,9 +296,8 @@ def show(argv: list[str]) -> None:
 
     check_place(out)
     pack = open_packs(options.pack)
-    found, num_all = contact_sheet.strips(
-        pack, options.by, split=options.split, num=options.num, limit=options.limit, seed=options.seed
-    )
+    drawn = {"num": options.num, "limit": options.limit, "seed": options.seed}
+    found, num_all = contact_sheet.strips(pack, options.by, split=options.split, **drawn)
     if out.suffix.lower() == ".html":
         text = contact_sheet.to_html(pack, found, num_all, side=options.side)
         write_atomic(out, lambda file: file.write(text.encode()))

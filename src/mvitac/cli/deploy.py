@@ -1,6 +1,6 @@
 """``mvitac publish`` and ``export``: a trained model for other people and other engines."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +12,7 @@ from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
 from mvitac.deploy.artifact import load, read_manifest
-from mvitac.deploy.publish import as_trained, own_data, with_readouts
+from mvitac.deploy.publish import as_trained, own_data, with_probes
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
 from mvitac.report.tables import print_summary
@@ -90,24 +90,15 @@ class _ExportOptions:
 def export(argv: list[str]) -> None:
     """mvitac export RUN|ARTIFACT --out DIR [--format torch|onnx|openvino] [--int8]"""
     options = parse(_ExportOptions, argv, "export")
-    config = exports.ExportConfig(
-        kind=options.kind,
-        precision=options.precision,
-        int8=options.int8,
-        target=options.target,
-        modalities=None if options.modality == "both" else (options.modality,),
-        min_cosine=options.min_cosine,
-        accuracy_loss=options.accuracy_loss,
-        value_loss=options.value_loss,
-        num_rows=options.num_rows,
-        threads=options.threads,
-    )
+    names = [field.name for field in fields(exports.ExportConfig) if field.name != "modalities"]
+    given = {name: getattr(options, name) for name in names}
+    config = exports.ExportConfig(**given, modalities=None if options.modality == "both" else (options.modality,))
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
     pack = as_trained(model, pack)
     with shown(Console(stderr=True)):
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
-        report = exports.export(with_readouts(model, pack), pack, options.out, config, calibrate=calibrate)
+        report = exports.export(with_probes(model, pack), pack, options.out, config, calibrate=calibrate)
     Console(markup=False).print(_table(options.out, report))
 
 

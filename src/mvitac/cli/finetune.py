@@ -42,18 +42,22 @@ class _AdaptOptions(_Options):
     config: Annotated[Adaptation, tyro.conf.arg(name="")] = Adaptation()
 
 
-def _parsed(kind: type[Any], argv: list[str], name: str, description: str) -> Any:
-    """The options of ``mvitac <name> MODEL --data D``."""
+def _run(kind: type[Any], work: Any, show: Any, argv: list[str], name: str, about: str) -> tuple[Any, dict[str, Any]]:
+    """Parse ``mvitac <name> MODEL --data D``, do the ``work`` and ``show`` its result; return options and result."""
     chosen, rest = selectors(argv, ("--data",))
     names = "|".join(DatasetConfig.choices)
     if "--data" not in chosen and not asks_help(rest):
         raise ValueError(f"name the data: --data {names}")
     data = default(DatasetConfig, chosen.get("--data", "pack"))
     usual = kind(model=Path("MODEL"), data=data, out=Path("runs") / f"{name.removesuffix('e')}ed")
-    options = parse(kind, rest, name, default=usual, description=f"{description}\n\n  --data {names}  (required)")
+    options = parse(kind, rest, name, default=usual, description=f"{about}\n\n  --data {names}  (required)")
     if options.model == usual.model:
         raise ValueError(f"name the model: the folder of a run or an artifact (see mvitac {name} --help)")
-    return options
+    console = Console(markup=False, highlight=False)
+    more = {"resume": options.resume, "quiet": options.quiet, "say": partial(console.print, soft_wrap=True)}
+    result = work(options.model, options.data, options.config, options.out, **more)
+    show(result, console)
+    return options, result
 
 
 def finetune(argv: list[str]) -> None:
@@ -62,13 +66,8 @@ def finetune(argv: list[str]) -> None:
         "Train a model's encoders with labels. Settings are chosen on held-out groups of train. Training from random weights"
         " and a linear probe on the frozen encoders get the same labels."
     )
-    options = _parsed(_FinetuneOptions, argv, "finetune", about)
-    console = Console(markup=False, highlight=False)
-    say = partial(console.print, soft_wrap=True)
-    arguments = (options.model, options.data, options.config, options.out)
-    result = run_finetune(*arguments, resume=options.resume, quiet=options.quiet, say=say)
-    print_finetuning(result, console)
-    say(f"scores: {options.out / 'scores.json'}\nnext: mvitac publish {result['models'][-1]} ARTIFACT")
+    options, result = _run(_FinetuneOptions, run_finetune, print_finetuning, argv, "finetune", about)
+    print(f"scores: {options.out / 'scores.json'}\nnext: mvitac publish {result['models'][-1]} ARTIFACT")
 
 
 def adapt(argv: list[str]) -> None:
@@ -77,9 +76,5 @@ def adapt(argv: list[str]) -> None:
         "Adapt a model to data of a new sensor without labels: new statistics of BatchNorm, then a few steps of its own"
         " method. Prints what it gains on the new data and what it forgets of the old."
     )
-    options = _parsed(_AdaptOptions, argv, "adapt", about)
-    console = Console(markup=False, highlight=False)
-    say = partial(console.print, soft_wrap=True)
-    arguments = (options.model, options.data, options.config, options.out)
-    print_adaptation(run_adapt(*arguments, resume=options.resume, quiet=options.quiet, say=say), console)
-    say(f"scores: {options.out / 'adapted.json'}\nnext: mvitac probe {options.out}")
+    options, _ = _run(_AdaptOptions, run_adapt, print_adaptation, argv, "adapt", about)
+    print(f"scores: {options.out / 'adapted.json'}\nnext: mvitac probe {options.out}")

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from mvitac.live.display import Window
     from mvitac.live.predictor import Live
 
-_REDRAW = 0.1
-"""Seconds between two pictures of the terminal or the window."""
+_REDRAW = 0.1  # seconds between two pictures of the terminal or the window
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +76,7 @@ def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
     from mvitac.deploy.engine import frame_shapes
     from mvitac.live.display import Window
+    from mvitac.live.predictor import Live
     from mvitac.live.recorder import Recorder, finish
 
     if argv[:1] == ["--finish"] and len(argv) == 2:
@@ -95,14 +95,16 @@ def live(argv: list[str]) -> None:
     if options.plot and not engine.values:
         raise ValueError(f"--plot draws values over time, and {options.model} predicts classes only: leave it out")
     nearest = _nearest(options, engine)
-    streams = _streams(options, engine)
+    streams: Any = _streams(options, engine)
     if not (options.vision or options.touch):
         print("no --vision, no --touch: all sensors are simulated")
     recorder = None
     if options.record:
         channels = {m: s[2] for m, s in frame_shapes(engine).items()}
         recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
-    loop = _loop(engine, streams, options.live, console, nearest=nearest, record=recorder)
+    # Faults are printed above the picture, so that they stay in the scrollback and in a log file.
+    tell = lambda event: _say(console, event.text, "yellow")  # noqa: E731
+    loop = Live(engine, streams, options.live, nearest=nearest, record=recorder, tell=tell)
     said: list[Any] = []
     with _lines(options.predictions) as write:
         _run(loop, console, window, options.seconds, lambda new: (write(new), options.plot and said.append(new)))
@@ -155,16 +157,6 @@ def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
         pairs = zip(names, texts, strict=True)
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
     return streams
-
-
-def _loop(engine: "Engine", streams: dict[str, Any], config: LiveConfig, console: Console, **options: Any) -> "Live":
-    from mvitac.live.predictor import Live
-
-    # Printed above the picture, so that events stay in the scrollback and in a log file.
-    def tell(event: Any) -> None:
-        _say(console, event.text, "yellow")
-
-    return Live(engine, streams, config, tell=tell, **options)
 
 
 @contextmanager
@@ -240,22 +232,15 @@ def sources(
 ) -> dict[str, tuple[str, ...]]:
     """The sources by modality: those that were given, or simulated sensors if there are none.
 
-    Args:
-        inputs: shapes [S, S, C] of the engine's inputs, by modality.
-        vision: source of the camera.
-        touch: sources of the touch sensors.
-
-    Raises:
-        ValueError: only some inputs have a source; a simulated sensor must not pass for a real one.
+    ``inputs``: modality -> shape [S, S, C] of an input. ValueError if only some have a source: a simulated sensor must
+    not pass for a real one.
     """
     given: dict[str, tuple[str, ...]] = {"vision": (vision,) if vision else (), "touch": tuple(touch)}
     given = {modality: texts for modality, texts in given.items() if texts}
     if not given:
         return {m: tuple(f"sim:{i}" for i in range(shape[2] // 3)) for m, shape in inputs.items()}
     for modality in inputs.keys() - given.keys():
-        raise ValueError(
-            f"the model takes {modality} too: give --{modality} SOURCE (--{modality} sim for a simulated one)"
-        )
+        raise ValueError(f"the model takes {modality} too: give --{modality} SOURCE (--{modality} sim simulates one)")
     for modality in given.keys() - inputs.keys():
         raise ValueError(f"the model has no input for {modality}: leave --{modality} out")
     return given
@@ -266,8 +251,8 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     from mvitac.deploy.artifact import load
     from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, import_openvino, lists_bf16
     from mvitac.deploy.export import export
-    from mvitac.deploy.publish import own_data, with_readouts
-    from mvitac.model import safetensors_digest
+    from mvitac.deploy.publish import own_data, with_probes
+    from mvitac.nn.weights import safetensors_digest
     from mvitac.registry import to_json
     from mvitac.system.files import cache_dir, digest
 
@@ -278,13 +263,13 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
         return engine
     loaded = load(model)
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
-    probes = [[to_json(r.question), safetensors_digest(dict(r.state_dict()))] for r in loaded.readouts.values()]
+    probes = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
     key = digest([FORMAT_VERSION, loaded.weights_digest(), probes])
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
         console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
         pack = own_data(loaded, "`mvitac export MODEL --on PACK --out DIR` first, and give DIR")
-        export(with_readouts(loaded, pack), pack, folder)
+        export(with_probes(loaded, pack), pack, folder)
     return Engine(folder, threads=threads)
 
 
@@ -328,9 +313,8 @@ def view(loop: "Live") -> Any:
     wide = max([10, *map(len, titles.values()), *(len(reading.name) for reading in values)])
     for task, (name, confidence) in loop.answers(touch).items():
         sure = "" if confidence >= loop.config.min_confidence else "  unsure"
-        lines.append(
-            Text(f"{titles[task]:{wide}} {name:18} {'#' * round(20 * confidence):20} {100 * confidence:3.0f} %{sure}")
-        )
+        bar = "#" * round(20 * confidence)
+        lines.append(Text(f"{titles[task]:{wide}} {name:18} {bar:20} {100 * confidence:3.0f} %{sure}"))
     lines += [Text(f"{reading.name:{wide}} {reading}") for reading in values]
     if touch and touch.known:
         lines.append(Text("like: " + "; ".join(touch.known)))
@@ -355,9 +339,7 @@ def _print_summary(summary: dict[str, Any]) -> None:
     age = summary["age_ms"]
     if age["p50"] is not None:
         print("end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**age))
-    print(
-        f"{summary['predictions']} predictions in {summary['touches']} touches; {summary['stale']} frames too old to use"
-    )
+    print("{predictions} predictions in {touches} touches; {stale} frames too old to use".format(**summary))
     for name, s in summary["streams"].items():
         print(f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged")
     if summary["events"]:

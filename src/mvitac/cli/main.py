@@ -12,45 +12,7 @@ from pathlib import Path
 
 from mvitac.system.terminal import plain_output
 
-HELP = """\
-usage: mvitac COMMAND [OPTIONS]     (mvitac COMMAND --help explains one)
-
-Learn from paired camera and optical-tactile images without labels, and measure
-how good the features are.
-
-  demo                 simulate, pre-train, probe, report: all in minutes
-  data simulate KIND   simulate materials or grasps into a pack
-  data pack            read any dataset (--data NAME) into a pack
-  data shard PACK URL  write a pack in shards, for --data stream
-  data info PACK       what is in a pack
-  data check PACK      what is wrong with a pack, or with --data NAME
-  data sheet KIND      a picture of what the simulator makes
-  data show PACK       contact sheet of the pairs in a pack (PNG, HTML)
-  data export-lerobot  write a PACK as a LeRobotDataset v3
-  pretrain             pre-train encoders (--method, --data, --recipe)
-  finetune MODEL       train its encoders with labels, next to controls
-  adapt MODEL          go on without labels on the data of a new sensor
-  probe RUN...         linear probes next to their controls
-  compare              many runs into the paper's tables (--plan NAME or FILE)
-  bench MODEL          any encoder on a fixed suite of tasks, as one JSON file
-  bench board FILE...  a page that compares such results
-  bench check FILE...  check their digests and sums
-  report RUN...        one HTML page with curves, tables and pictures
-  publish RUN OUT      weights, probes, model card: one folder, or on the Hub
-  export MODEL         for torch, ONNX or OpenVINO; checked on real inputs
-  live MODEL           a prediction for every touch, from cameras or files
-  explore RUN          a local page: the map of features, neighbours, mistakes
-  embed PACK           embeddings of every row, as .npz or .parquet
-  index PACK           make a pack searchable
-  find IMAGE           the nearest known touches to a picture, and back
-  completion bash      a script for completion by TAB in bash and zsh
-
-First steps:
-  mvitac demo                                        # no data needed
-  mvitac pretrain --data materials --recipe demo --out runs/first
-  mvitac probe runs/first
-  mvitac report runs/first                           # open the page it names
-"""
+HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
 
 COMMANDS = {
     "demo": "demo:demo",
@@ -83,12 +45,8 @@ COMMANDS = {
 """Command -> module of this package:function, imported when called."""
 
 
-LEAST_MEMORY = 1 << 30
-"""Bytes of address space that any command needs."""
-_NO_MEMORY = (
-    "out of memory|can't allocate memory|cannot allocate memory|failed to map segment|can't start new thread"
-    "|std::bad_alloc"
-)
+LEAST_MEMORY = 1 << 30  # bytes of address space that any command needs
+_NO_MEMORY = "(out of|can(no|')t allocate) memory|failed to map segment|can't start new thread|std::bad_alloc"
 """What torch, the loader of shared libraries and threads say when memory (``ulimit -v``) runs out."""
 
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-STDOUT = Path("-")
-"""The --json FILE that means stdout."""
+STDOUT = Path("-")  # the --json FILE that means stdout
 
 
 def parse(
@@ -31,9 +30,7 @@ def parse(
     """
     import tyro
 
-    argv = [
-        re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", w) for w in argv
-    ]  # 0.1.0's name
+    argv = [re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", w) for w in argv]
     argv = [re.sub(r"^(--[\w.-]+=)(~.*)", lambda m: m[1] + os.path.expanduser(m[2]), w) for w in argv]  # no shell does
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
     if default is not None:

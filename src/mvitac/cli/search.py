@@ -27,8 +27,7 @@ from mvitac.system.progress import shown
 if TYPE_CHECKING:
     from mvitac.deploy.search import Index
 
-_SIDE = 160
-"""Pixels: side of one picture in the sheet of what was found."""
+_SIDE = 160  # pixels: side of one picture in the sheet of what was found
 
 
 @dataclass(frozen=True, kw_only=True)

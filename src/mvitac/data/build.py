@@ -5,8 +5,6 @@ bytes. The finished folder is renamed, so a folder with a pack.json is a complet
 pack, one builds it and the others wait. This module does not import torch.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io
@@ -37,8 +35,7 @@ from mvitac.system.progress import shown
 from mvitac.system.progress import work as progress
 from mvitac.system.provenance import provenance
 
-NUM_PART_ITEMS = 32
-"""Samples per part: the most that an interruption costs each process."""
+NUM_PART_ITEMS = 32  # samples per part: the most that an interruption costs each process
 
 
 def check_request(
@@ -222,12 +219,9 @@ class _Contents:
     """What all parts together say of the pack's rows."""
 
     columns: list[dict[str, Any]] = field(default_factory=list)
-    damaged: list[list[Any]] = field(default_factory=list)
-    """Item number and reason."""
-    lost: list[list[str]] = field(default_factory=list)
-    """Sample name and reason."""
-    runs: list[tuple[int, int]] = field(default_factory=list)
-    """First row and number of rows of each part."""
+    damaged: list[list[Any]] = field(default_factory=list)  # item number and reason
+    lost: list[list[str]] = field(default_factory=list)  # sample name and reason
+    runs: list[tuple[int, int]] = field(default_factory=list)  # first row and number of rows of each part
     numbers: dict[str, list[int]] = field(default_factory=dict)
     """Columns crc_<modality> and, of JPEGs, bytes_<modality>."""
 

@@ -1,7 +1,5 @@
 """Makes the parts of a pack, in several processes: reads items, checks and resizes images, writes rows and checksums."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -55,8 +53,7 @@ def make_parts(work: Work, parts: Sequence[Part], workers: int) -> Iterator[int]
             raise
 
 
-_work: Work
-"""The work of this worker process."""
+_work: Work  # the work of this worker process
 
 
 def _start_worker(work: Work) -> None:
@@ -75,10 +72,8 @@ def _make_part(work: Work, part: Part) -> int:
     with contextlib.suppress(ValueError, KeyError, TypeError, FileNotFoundError):  # missing or damaged
         known = part.read()
         num = len(known["columns"])
-        found = {
-            m: [zlib.crc32(row) for row in rows.found(part, num, known.get("bytes", {}).get(m, []))]
-            for m, rows in work.files.items()
-        }
+        sizes = known.get("bytes", {})
+        found = {m: [zlib.crc32(r) for r in rows.found(part, num, sizes.get(m, []))] for m, rows in work.files.items()}
         if found == known["crc"]:  # false if the machine lost power before all data reached the disk
             return num
     return _write_part(work, part)

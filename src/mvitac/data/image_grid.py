@@ -1,7 +1,5 @@
 """Labelled grids of images, drawn as one picture: contact sheets and search results."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -13,11 +11,9 @@ from PIL import Image, ImageDraw, ImageFont
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
 
-GAP, EDGE = 8, 3
-"""Pixels between pictures, and of the coloured frame around one."""
+GAP, EDGE = 8, 3  # pixels between pictures, and of the coloured frame around one
 INK, SOFT = "#1d232b", "#5a6470"
-MISSING, CROSS = (225, 225, 225), (150, 150, 150)
-"""Colours of the tile that stands for a missing image."""
+MISSING, CROSS = (225, 225, 225), (150, 150, 150)  # colours of the tile that stands for a missing image
 
 
 @dataclass(frozen=True)
@@ -48,14 +44,10 @@ def font(size: int) -> ImageFont.FreeTypeFont:
 def draw(
     title: str, blocks: Sequence[Block], *, heads: Sequence[str] = (), width: int = 1280, across: int = 1
 ) -> Image.Image:
-    """Draw ``blocks`` as one picture.
+    """Draw ``blocks``, ``across`` of them side by side, as one picture.
 
-    Args:
-        title: Text above all blocks.
-        blocks: What to draw. Within a block, pictures fill rows of equal length.
-        heads: Headings of the columns of pictures, above the first block.
-        width: Largest width in pixels, if it has room for one picture.
-        across: Number of blocks side by side.
+    Within a block, pictures fill rows of equal length. ``heads`` are headings of the columns of pictures. ``width`` in
+    pixels is kept if it has room for one picture.
     """
     tiles = [tile for block in blocks for tile in block.tiles]
     cell = max((_framed(tile).width for tile in tiles), default=width // across - GAP)
@@ -75,10 +67,8 @@ def draw(
 
 
 def _block(block: Block, cell: int, columns: int, room: int) -> Image.Image:
-    cells = [
-        _stack([_framed(tile), *([_text(tile.caption, cell, 12, INK)] if tile.caption else [])], 2)
-        for tile in block.tiles
-    ]
+    captions = [[_text(tile.caption, cell, 12, INK)] if tile.caption else [] for tile in block.tiles]
+    cells = [_stack([_framed(tile), *under], 2) for tile, under in zip(block.tiles, captions, strict=True)]
     rows = [_row(cells[i : i + columns], cell, GAP) for i in range(0, len(cells), columns)]
     heading = [_text(block.heading, room, 14, INK)] if block.heading else []
     return _stack([*heading, *rows], 4)

@@ -1,7 +1,5 @@
 """Functions on images: decode, resize to a square, subtract a background."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import BinaryIO
@@ -72,11 +70,7 @@ def _check_end(image: Image.Image) -> None:
 
 
 def to_rgb(image: Image.Image) -> Image.Image:
-    """An opened image as RGB, by the rules of ``decode``; ``image`` itself is not changed.
-
-    Raises:
-        ValueError: If its values are floating-point, or lie outside 16 bits.
-    """
+    """An opened image as RGB, by the rules of ``decode``; ``image`` itself is not changed. Raises as ``decode``."""
     if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
         image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I"):

@@ -3,8 +3,6 @@
 This module does not import torch.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -20,11 +18,8 @@ from mvitac.system.files import brief
 class JoinedPack(Pack):
     """Train and val rows of ``learn`` followed by test rows of ``score``.
 
-    Tasks are those that both packs have, with the classes of ``learn``.
-
-    Raises:
-        ValueError: If the packs have no common task, other image shapes, classes in ``score`` that ``learn`` does not
-            have, or a group in both (its test rows would not be unseen).
+    Tasks are those that both packs have, with the classes of ``learn``. ValueError if there is none, or the packs have
+    other image shapes, classes that ``learn`` lacks, or a group in both (its test rows would not be unseen).
     """
 
     def __init__(self, learn: Pack, score: Pack) -> None:
@@ -34,9 +29,8 @@ class JoinedPack(Pack):
         _check_shapes(learn, score)
         tasks = _common_tasks(learn, score)
         columns = {"split", *(task.split for task, _ in tasks)}
-        self.table = _joined(
-            _side(learn, tasks, columns, "learned", {"train", "val"}), _side(score, tasks, columns, "scored", {"test"})
-        )
+        learned = _side(learn, tasks, columns, "learned", {"train", "val"})
+        self.table = _joined(learned, _side(score, tasks, columns, "scored", {"test"}))
         theirs = score.spec.controls
         self.spec = replace(
             learn.spec,

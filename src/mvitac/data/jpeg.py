@@ -5,8 +5,6 @@ placed below each other in one JPEG of three channels. A black image, which also
 This module does not import torch.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import os
@@ -21,8 +19,7 @@ from PIL import Image
 from mvitac.system.files import brief
 
 QUALITY = 95
-FEW = 8
-"""Up to this number of images, one thread is faster than several."""
+FEW = 8  # up to this number of images, one thread is faster than several
 
 
 def encode(image: np.ndarray, quality: int) -> bytes:

@@ -3,8 +3,6 @@
 This module does not import torch.
 """
 
-from __future__ import annotations
-
 import copy
 import functools
 import itertools
@@ -73,9 +71,8 @@ class MixedPack(Pack):
                 raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
             notes.append(found)
         self.spec = mixed_spec(self.parts, tasks, channels, notes)
-        self.images: dict[str, Images] = {
-            m: MixedImages([_of(pack, m) for pack in packs], self.size, channels[m]) for m in self.spec.modalities
-        }
+        pieces = {m: [_of(pack, m) for pack in packs] for m in self.spec.modalities}
+        self.images: dict[str, Images] = {m: MixedImages(each, self.size, channels[m]) for m, each in pieces.items()}
 
     def has(self, modality: str) -> np.ndarray:
         return self._has[modality]
@@ -131,10 +128,7 @@ class MixedPack(Pack):
 class MixedImages(Lazy):
     """uint8 [N, S, S, C]: the images of several packs, one after another, resized to one side.
 
-    Args:
-        pieces: Images of each pack; a number stands for so many rows without an image, which are zeros.
-        size: Side S in pixels.
-        channels: C.
+    A number among ``pieces`` stands for so many rows without an image, which are zeros.
     """
 
     def __init__(self, pieces: Sequence[Images | int], size: int, channels: int) -> None:

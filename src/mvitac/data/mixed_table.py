@@ -1,7 +1,5 @@
 """The table and the tasks of several packs as one (``data/mixed_pack.py``). This module does not import torch."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -15,8 +13,7 @@ from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
 OWN = re.compile(r"(id|group|touch_group|press|part|sensor|(has|crc|bytes|label)_.*)")
 """Columns that are not taken over as they are."""
 
-Renamed = Mapping[str, Mapping[str, str]]
-"""Part -> column of its table -> name of that column in the mix."""
+Renamed = Mapping[str, Mapping[str, str]]  # part -> column of its table -> name of that column in the mix
 
 
 def renamed_columns(parts: Mapping[str, Pack]) -> Renamed:
@@ -31,10 +28,9 @@ def renamed_columns(parts: Mapping[str, Pack]) -> Renamed:
         for column in pack.table.schema:
             if not OWN.fullmatch(column.name) and not pa.types.is_null(column.type):
                 kinds.setdefault(column.name, set()).add(_kind(column.type) + uses.get(column.name, ""))
-    return {
-        part: {n: n if len(kinds[n]) == 1 else f"{part}/{n}" for n in pack.table.column_names if n in kinds}
-        for part, pack in parts.items()
-    }
+    same = {name for name, found in kinds.items() if len(found) == 1}
+    taken = {part: [n for n in pack.table.column_names if n in kinds] for part, pack in parts.items()}
+    return {part: {n: n if n in same else f"{part}/{n}" for n in names} for part, names in taken.items()}
 
 
 def _kind(column: pa.DataType) -> str:
@@ -51,11 +47,8 @@ class MixedTasks:
     """
 
     def __init__(self, parts: Mapping[str, Pack], columns: Renamed) -> None:
-        given = {
-            (part, task.name): _renamed(task, columns[part])
-            for part, pack in parts.items()
-            for task in pack.spec.all_tasks
-        }
+        tasks = [(part, task) for part, pack in parts.items() for task in pack.spec.all_tasks]
+        given = {(part, task.name): _renamed(task, columns[part]) for part, task in tasks}
         alike: dict[str, set[object]] = {}
         for (_, name), task in given.items():
             alike.setdefault(name, set()).add(_meaning(task))
@@ -110,9 +103,8 @@ def mixed_table(parts: Mapping[str, Pack], columns: Renamed, tasks: MixedTasks) 
     """
     splits = {task.split for task in tasks.of.values()} - {"split"}
     filters = {name for task in tasks.of.values() for name in task.only}
-    numbers = {t.name for task in tasks.values for t in task.targets} | {
-        c for used in tasks.controls.values() for c in used
-    }
+    numbers = {target.name for task in tasks.values for target in task.targets}
+    numbers |= {column for used in tasks.controls.values() for column in used}
     labels = {task.name for task in tasks.tasks}
     pressed = all("press" in pack.table.column_names for pack in parts.values())
     tables = []

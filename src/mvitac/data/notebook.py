@@ -1,7 +1,5 @@
 """How packs and models show themselves in a notebook: small HTML tables, a pack with a few of its pairs."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterable, Sequence
@@ -23,7 +21,7 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[str] = ()) -> str:
     return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 
-def pack_html(pack: Pack) -> str:
+def pack_html(pack: "Pack") -> str:
     """Rows, groups, labels and values of every split, and a few pairs from all over the pack."""
     rows, tasks = [], pack.spec.tasks
     for split in dict.fromkeys(pack.column("split").tolist()):
@@ -38,7 +36,7 @@ def pack_html(pack: Pack) -> str:
     return f"<p>{escape(repr(pack))}</p>{table(rows, head)}{pictures}"
 
 
-def measured(pack: Pack, rows: np.ndarray) -> list[tuple[int, float, float]]:
+def measured(pack: "Pack", rows: np.ndarray) -> list[tuple[int, float, float]]:
     """Number, lowest and highest value of each target of each task among ``rows``; NaN without any."""
     found = []
     for task in pack.spec.values:
@@ -48,12 +46,11 @@ def measured(pack: Pack, rows: np.ndarray) -> list[tuple[int, float, float]]:
     return found
 
 
-def _strip(pack: Pack, modality: str, rows: np.ndarray) -> str:
+def _strip(pack: "Pack", modality: str, rows: np.ndarray) -> str:
     """Images of ``rows`` side by side, as one inline PNG; of two touch sensors the left one."""
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(np.concatenate([pack.images[modality][int(row)][..., :3] for row in rows], axis=1)).save(
-        file, "PNG"
-    )
+    rgb = [pack.images[modality][int(row)][..., :3] for row in rows]
+    Image.fromarray(np.concatenate(rgb, axis=1)).save(file, "PNG")
     return f'<img alt="{modality}" src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'

@@ -10,8 +10,6 @@ A pack stored as JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``data/j
 This module opens and checks packs; ``data/build.py`` builds them. It does not import torch.
 """
 
-from __future__ import annotations
-
 import functools
 import warnings
 import zlib
@@ -33,8 +31,7 @@ from mvitac.system.files import brief, digest, digest_file, read_json
 
 FORMAT = "mvitac-pack"
 SHARDED = "mvitac-shards"
-FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}
-"""Format version by how images are stored."""
+FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}  # format version by how images are stored
 SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}
 
 Store = Literal["raw", "jpeg"]
@@ -57,7 +54,7 @@ class Pack:
     format: ClassVar[str] = FORMAT
     window: int = 0
     """Number of shards whose rows training mixes at a time; 0 = all rows (shards: ``data/streaming.py``)."""
-    parts: Mapping[str, Pack] = MappingProxyType({})
+    parts: "Mapping[str, Pack]" = MappingProxyType({})
     """Name -> pack, for several packs that are opened as one (``data/mixed_pack.py``)."""
 
     def __init__(self, path: str | Path, *, verify: bool = True) -> None:
@@ -85,36 +82,33 @@ class Pack:
         """Return the content of pack.json; ValueError unless it describes a pack that this version reads."""
         if not self.path.is_dir():
             raise ValueError(f"no pack at {self.path}: make one with `mvitac data simulate` or `mvitac data pack`")
-        meta = read_json(self.path / "pack.json", "a pack's description")
+        meta = read_json(path := self.path / "pack.json", "a pack's description")
         if isinstance(meta, dict) and meta.get("format") == SHARDED != self.format:
             raise ValueError(f"{self.path} is a pack in shards: read it with --data stream --data.url {self.path}")
         if not isinstance(meta, dict) or meta.get("format") != self.format:
-            raise ValueError(f"{self.path / 'pack.json'} does not describe a pack: choose a folder `mvitac data` wrote")
+            raise ValueError(f"{path} does not describe a pack: choose a folder `mvitac data` wrote")
         if (version := meta.get("format_version")) not in FORMAT_VERSIONS.values():
             known = " and ".join(map(str, FORMAT_VERSIONS.values()))
             raise ValueError(f"{self.path} has pack format {version}, this version reads {known}: re-pack it")
         rest = {key: value for key, value in meta.items() if key != "digest"}
         if meta.get("digest", given := digest(rest)) != given:
-            raise ValueError(
-                f"{self.path / 'pack.json'} does not match its digest: it was changed or damaged, re-pack it"
-            )
+            raise ValueError(f"{path} does not match its digest: it was changed or damaged, re-pack it")
         return meta
 
     def _read_table(self) -> pa.Table:
         """Return the content of samples.parquet, checked."""
-        self._check_digest(name := "samples.parquet")
+        self._check_digest("samples.parquet")
+        path = self._file("samples.parquet")
         try:
-            table = pq.read_table(self._file(name))
+            table = pq.read_table(path)
         except Exception as error:  # arrow raises several kinds for a damaged file
-            raise ValueError(
-                f"{self.path / name} cannot be read ({brief(error)}): the pack is damaged, make it again"
-            ) from None
+            raise ValueError(f"{path} cannot be read ({brief(error)}): the pack is damaged, make it again") from None
         if table.num_rows != self.num:
-            raise ValueError(f"{self.path / name} has {table.num_rows} rows, pack.json promises {self.num}: re-pack it")
+            raise ValueError(f"{path} has {table.num_rows} rows, pack.json promises {self.num}: re-pack it")
         try:
             check_table(table, self.spec)
         except ValueError as error:
-            raise ValueError(f"{self.path / name}: {error} (make the pack again)") from None
+            raise ValueError(f"{path}: {error} (make the pack again)") from None
         return table
 
     def __repr__(self) -> str:
@@ -237,11 +231,7 @@ class Pack:
 
     @functools.cached_property
     def presses(self) -> np.ndarray:
-        """int64 [N], number of each row's press (column press): its rows are moments of one press.
-
-        Raises:
-            ValueError: If the pack has no such column.
-        """
+        """int64 [N], number of each row's press: its rows are moments of one press. ValueError without that column."""
         if "press" not in self.table.column_names:
             raise ValueError(
                 "same-press positives need a column 'press', which says which rows are moments of one press: simulate"

@@ -1,7 +1,5 @@
 """What every reader of a pack's table relies on, checked. This module does not import torch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

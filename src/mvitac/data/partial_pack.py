@@ -5,8 +5,6 @@ each part writes its JPEGs to a file of its own, and these are joined in order. 
 resumed build (``data/build.py``) verifies the checksums and repeats the parts that fail. This module does not import torch.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -60,7 +58,7 @@ class RowFile:
         """Return the bytes to write for ``image``."""
         return image.data
 
-    def put(self, part: Part, start: int, rows: Iterable[Buffer]) -> None:
+    def put(self, part: "Part", start: int, rows: Iterable[Buffer]) -> None:
         """Write rows of ``part``, beginning with its row ``start``."""
         self.write(part.first + start, rows)
 
@@ -75,11 +73,11 @@ class RowFile:
         """Return all rows, memory-mapped for reading."""
         return np.load(self.path, mmap_mode="r", allow_pickle=False)
 
-    def found(self, part: Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
+    def found(self, part: "Part", num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
         """Return the ``num`` rows of ``part`` that are on disk; ``lengths`` are used by JPEGs only."""
         return (image.data for image in self.map()[part.first : part.first + num])
 
-    def join(self, part: Part, num: int) -> Buffer:
+    def join(self, part: "Part", num: int) -> Buffer:
         """Return the bytes of the ``num`` rows of ``part``, which are in their final position already."""
         return self.map()[part.first : part.first + num].data
 
@@ -126,24 +124,24 @@ class JpegFile:
         """Return the bytes to write for ``image``."""
         return encode(image, self.quality)
 
-    def part_file(self, part: Part) -> Path:
+    def part_file(self, part: "Part") -> Path:
         """Return the file of the rows of ``part``."""
         return part.path.with_suffix(f".{self.path.name}")
 
-    def put(self, part: Part, start: int, rows: Iterable[Buffer]) -> None:
+    def put(self, part: "Part", start: int, rows: Iterable[Buffer]) -> None:
         """Write rows of ``part``, beginning with its row ``start``; call in order."""
         path = self.part_file(part)
         with naming(path), path.open("ab" if start else "wb") as file:
             for row in rows:
                 file.write(row)
 
-    def found(self, part: Part, num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
+    def found(self, part: "Part", num: int, lengths: Sequence[int]) -> Iterator[Buffer]:
         """Yield the ``num`` rows of ``part`` that are on disk; each has one of ``lengths`` bytes."""
         if num:
             with self.part_file(part).open("rb") as file:
                 yield from map(file.read, lengths)
 
-    def join(self, part: Part, num: int) -> Buffer:
+    def join(self, part: "Part", num: int) -> Buffer:
         """Append the rows of ``part`` to those of earlier parts, and return their bytes."""
         jpegs = self.part_file(part).read_bytes() if num else b""
         with naming(self.path), self.path.open("ab") as file:
@@ -161,14 +159,12 @@ class Part:
     path: Path
     items: tuple[int, int]
     first: int
-    stamp: str | None = None
-    """Digest of the stamps of the files that the items are read from, if any."""
+    stamp: str | None = None  # digest of the stamps of the files that the items are read from, if any
 
     def read(self) -> dict[str, Any]:
-        """Return what the part's file says: columns, damaged, lost, and by modality crc and bytes (JPEG) of each row.
+        """What the part's file says: columns, damaged, lost, and by modality crc and bytes (JPEG) of each row.
 
-        Raises:
-            ValueError: If the file does not exist, or is about other rows or about files that have changed.
+        ValueError if the file does not exist, or is about other rows or about files that have changed.
         """
         known = read_json(self.path, "a part of an unfinished pack")
         if (known["items"], known["first"], known.get("stamp")) != ([*self.items], self.first, self.stamp):

@@ -1,7 +1,5 @@
 """Hashes of ids and groups of rows, by which packs find rows of each other. This module does not import torch."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np
@@ -26,6 +24,5 @@ def row_hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
 def _hash(texts: np.ndarray, name: str, weak: bool) -> np.ndarray:
     unique, inverse = np.unique(texts, return_inverse=True)
     named = (f"{name}/{text}" if weak or text.isdigit() else text for text in unique.tolist())
-    return np.array([int.from_bytes(hashlib.blake2b(t.encode(), digest_size=8).digest()) for t in named], np.uint64)[
-        inverse
-    ]
+    hashes = [int.from_bytes(hashlib.blake2b(t.encode(), digest_size=8).digest()) for t in named]
+    return np.array(hashes, np.uint64)[inverse]

@@ -1,7 +1,5 @@
 """Writes a pack as shards for ``data/streaming.py``, to a folder or any store that fsspec supports."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -16,24 +14,14 @@ from mvitac.data.streaming import reach, shard_name
 from mvitac.system.files import brief, digest
 from mvitac.system.progress import shown, work
 
-MAX_SHARD_MB = 1_000_000
-"""A terabyte: a shard is read whole."""
+MAX_SHARD_MB = 1_000_000  # a terabyte: a shard is read whole
 
 
 def write_shards(pack: Pack, url: str, *, shard_mb: float = 64, seed: int = 0, quiet: bool = False) -> int:
-    """Write ``pack`` to ``url`` in shards and return their number.
+    """Write ``pack`` to ``url`` (a folder, or what fsspec supports) in shards and return their number.
 
-    pack.json is written last, so an interrupted call leaves no valid pack and can be repeated.
-
-    Args:
-        pack: The pack to write.
-        url: A folder, or a URL that fsspec supports.
-        shard_mb: Largest size of a shard in MB, all modalities together.
-        seed: Random seed for the order of touch groups.
-        quiet: Show no progress bar.
-
-    Raises:
-        ValueError: If ``url`` has a pack already or cannot be written.
+    pack.json is written last, so an interrupted call leaves no valid pack and can be repeated. ``shard_mb`` is the
+    largest size of a shard, all modalities together; ``seed`` is that of the order of touch groups.
     """
     if not 0 < shard_mb <= MAX_SHARD_MB:
         raise ValueError(f"shard_mb {shard_mb}: give a number of megabytes above 0, at most {MAX_SHARD_MB:,}")

@@ -3,8 +3,6 @@
 Each worker process gets a copy of the source, so a source must be picklable and its module must not import torch.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 import zlib
@@ -40,8 +38,7 @@ class Count:
     what: str
     published: int
     found: int
-    detail: str = ""
-    """What is missing or extra, if known."""
+    detail: str = ""  # what is missing or extra, if known
 
 
 @dataclass(frozen=True)
@@ -52,8 +49,7 @@ class Lost:
     why: str
 
 
-Stamp = tuple[int, ...]
-"""Size and modification time (ns) of a file, to detect changes without reading it."""
+Stamp = tuple[int, ...]  # size and modification time (ns) of a file, to detect changes without reading it
 
 
 def stamp_of(path: str) -> Stamp:

@@ -1,7 +1,5 @@
 """Description of a dataset: modalities, tasks, groups, owner. Packing workers import it, so it does not import torch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,8 +8,7 @@ from typing import Literal
 from mvitac.registry import LATER
 
 MODALITIES = ("vision", "touch")
-PHASES = ("before", "during", "after")
-"""Values of column phase: the moments of a grasp."""
+PHASES = ("before", "during", "after")  # values of column phase: the moments of a grasp
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,9 +145,8 @@ class DataSpec:
         units: dict[str, str] = {}
         for target in (target for task in self.values for target in task.targets):
             if units.setdefault(target.name, target.unit) != target.unit:
-                raise ValueError(
-                    f"{target.name!r} has two units, {units[target.name]} and {target.unit}: give a column one unit"
-                )
+                unit = units[target.name]
+                raise ValueError(f"{target.name!r} has two units, {unit} and {target.unit}: give a column one unit")
 
     @property
     def all_tasks(self) -> tuple[AnyTask, ...]:

@@ -9,8 +9,6 @@ Touch groups are in random order and each in one shard (if it fits), so any few 
 (``data/sharding.py`` writes them). A ``StreamedPack`` has the interface of ``Pack``. This module does not import torch.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 import itertools
@@ -31,10 +29,8 @@ from mvitac.data.pack import SHARDED, SUFFIXES, Images, Pack
 from mvitac.registry import from_json
 from mvitac.system.files import brief, check_place, digest_file
 
-NUM_FETCHING = 4
-"""Number of files fetched at a time."""
-HEADER = 128
-"""Bytes of a .npy header; numpy pads it to this length for any number of rows."""
+NUM_FETCHING = 4  # number of files fetched at a time
+HEADER = 128  # bytes of a .npy header; numpy pads it to this length for any number of rows
 
 
 def reach(url: str) -> tuple[Any, str]:
@@ -60,13 +56,9 @@ class StreamedPack(Pack):
     format: ClassVar[str] = SHARDED
 
     def __init__(self, url: str, cache: Path, *, limit: int, window: int) -> None:
-        """Open ``url``. Each file is verified after it is fetched.
+        """Open ``url``, whose files are verified and kept in ``cache``, at most ``limit`` bytes: two windows must fit.
 
-        Args:
-            url: Location of the shards.
-            cache: Folder for fetched shards.
-            limit: Largest size of the cache in bytes; two windows must fit.
-            window: Number of shards whose rows training mixes at a time.
+        ``window`` is the number of shards whose rows training mixes at a time.
         """
         self.url, self.window, self._limit = url, window, limit
         self._fetched: list[int] = []
@@ -85,9 +77,7 @@ class StreamedPack(Pack):
         try:
             super().__init__(folder, verify=False)
         except ValueError as error:
-            (folder / "samples.parquet").unlink(
-                missing_ok=True
-            )  # else it would remain after the one at the URL is repaired
+            (folder / "samples.parquet").unlink(missing_ok=True)  # else it would outlive a repair at the URL
             raise ValueError(str(error).replace(str(folder), url)) from None
 
     @property
@@ -192,13 +182,9 @@ class Cache:
     """A folder of limited size. Threads load the expected files; others are deleted, least recently used first."""
 
     def __init__(self, folder: Path, sizes: dict[str, int], limit: int, load: Callable[[str], Images]) -> None:
-        """Create a cache.
+        """A cache in ``folder``, of this process only. ``sizes``: file name -> bytes; ``limit`` of their sum in bytes.
 
-        Args:
-            folder: The folder, used by this process only.
-            sizes: File name -> bytes.
-            limit: Largest total size in bytes.
-            load: Fetches a file into ``folder``, if it is not there, and opens it.
+        ``load`` fetches a file into ``folder``, if it is not there, and opens it.
         """
         self._folder, self._sizes, self._limit, self._load = folder, sizes, limit, load
         self._mutex, self._pool = threading.Lock(), ThreadPoolExecutor(NUM_FETCHING, "shards")

@@ -5,8 +5,6 @@ nominal frame rate. The decoder starts at the last key frame before a run of wan
 runs, so a few touches in an hour of video are cheap. Packing workers import this module, so it does not import torch.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os
@@ -36,16 +34,11 @@ class Packets:
     displayed, so they do not count as frames.
     """
 
-    dts: np.ndarray
-    """[P] int64 decoding times."""
-    places: np.ndarray
-    """[P] int64 positions in the file."""
-    keys: np.ndarray
-    """[K] int64 ascending numbers of the packets at which decoding can start."""
-    before: np.ndarray
-    """[P + 1] int64 number of frames stored before each packet, and in total."""
-    shape: tuple[int, int]
-    """Height and width of the frames according to the container."""
+    dts: np.ndarray  # [P] int64 decoding times
+    places: np.ndarray  # [P] int64 positions in the file
+    keys: np.ndarray  # [K] int64 ascending numbers of the packets at which decoding can start
+    before: np.ndarray  # [P + 1] int64 number of frames stored before each packet, and in total
+    shape: tuple[int, int]  # height and width of the frames according to the container
 
     @property
     def num(self) -> int:
@@ -70,17 +63,10 @@ def frame_shape(path: str | Path) -> tuple[int, int]:
 def frames(
     path: str | Path, wanted: Iterable[int], size: int | None = None, *, lost: dict[int, str] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the ``wanted`` frames in ascending order as (i, uint8 RGB [H, W, 3]).
+    """Yield the ``wanted`` frames in ascending order as (i, uint8 RGB [H, W, 3]), resized to ``size`` if it is given.
 
-    Args:
-        path: The video.
-        wanted: Frame numbers, from 0.
-        size: Resize frames to [size, size, 3].
-        lost: Receives the reason for each frame that is missing or damaged; without it, such a frame is an error.
-
-    Raises:
-        ValueError: If a frame is missing or damaged and ``lost`` is not given.
-        OSError: If the file cannot be read.
+    ``lost`` receives the reason for each frame that is missing or damaged; without it, such a frame is a ValueError.
+    OSError if the file cannot be read.
     """
     pending = _Pending(path, wanted, lost)
     with _opened(path) as (container, stream):
@@ -166,10 +152,8 @@ class _Run:
     def __init__(self, container: InputContainer, stream: VideoStream, packets: Packets, key: int) -> None:
         self._context, self._packets = stream.codec_context, packets
         self._context.flush_buffers()
-        self.fed = int(packets.keys[key])
-        """Number of the packet given to the decoder last."""
-        self.trouble = ""
-        """Error in the stream that affects frames up to the next key frame; "" = none."""
+        self.fed = int(packets.keys[key])  # number of the packet given to the decoder last
+        self.trouble = ""  # error in the stream that affects frames up to the next key frame; "" = none
         self._hurt = 0  # display time of the damaged frame
         self._demuxed = _from(container, stream, int(packets.dts[self.fed]))
         # Frames displayed before a key frame may be stored directly after it. They refer to packets before the key

@@ -4,8 +4,6 @@ A pack stores every frame once. ``windowed`` opens it so that ``pack.images`` gi
 read. A window never crosses the edge of a touch (column touch_group, else group). This module does not import torch.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 
@@ -19,20 +17,14 @@ from mvitac.data.spec import Window
 from mvitac.registry import unknown
 from mvitac.system.files import digest
 
-ORDER = ("frame", "seq", "time")
-"""Columns that order the frames of a touch, by default the first that exists."""
+ORDER = ("frame", "seq", "time")  # columns that order the frames of a touch, by default the first that exists
 
 
 def windowed(pack: Pack, window: Window) -> Pack:
     """Return ``pack`` with windows as images: channels 0 to 2 are the current frame, then come earlier ones.
 
-    Args:
-        pack: A pack on disk. It is not changed.
-        window: Number of frames, their distance, and what is done at the start of a touch.
-
-    Raises:
-        ValueError: If the pack has no column that orders its frames, two frames of a touch have the same place, the
-            frames of a touch are farther apart than the stride, or no touch is as long as a window.
+    ValueError if no column orders the frames, two frames of a touch have the same place, the frames of a touch are
+    farther apart than the stride, or no touch is as long as a window.
     """
     if not window.active and window.order is None:
         return pack
@@ -133,9 +125,7 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
         place = np.full(pack.num, np.nan)
     if not np.isfinite(place).all():
         row = int(np.flatnonzero(~np.isfinite(place))[0])
-        raise ValueError(
-            f"frames: column {name!r} is not a number in row {row}: give one in every row, or another order"
-        )
+        raise ValueError(f"frames: column {name!r} is not a number in row {row}: give all rows one, or another order")
     return name, place
 
 

@@ -1,11 +1,9 @@
 """The base class of dataset configs. A config gives a source of samples; all other code reads the pack made from it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from mvitac.data.build import build, check_request, stored_as
 from mvitac.data.jpeg import QUALITY
@@ -62,14 +60,12 @@ class DatasetConfig(Registered, ABC):
     def frame_window(self) -> Window:
         """The frames that a row shows."""
         of = ("vision", "touch") if self.frames_of == "both" else (self.frames_of,)
-        return Window(
-            frames=self.num_frames,
-            stride=self.stride,
-            of=of,
-            order=self.order,
-            short=self.short,
-            minus_first=self.minus_first,
-        )
+        same = {name: getattr(self, name) for name in ("stride", "order", "short", "minus_first")}
+        return Window(frames=self.num_frames, of=of, **same)
+
+    def build_options(self) -> dict[str, Any]:
+        """How ``build`` stores the pack."""
+        return {name: getattr(self, name) for name in ("size", "workers", "store", "quality")}
 
     @property
     def without_effect(self) -> tuple[str, ...]:
@@ -110,13 +106,4 @@ class DatasetConfig(Registered, ABC):
             check_place(path)
         except ValueError as error:
             raise ValueError(f"the cache of packs: {error} with MVITAC_CACHE") from None
-        return build(
-            source,
-            path,
-            size=self.size,
-            workers=self.workers,
-            quiet=quiet,
-            store=self.store,
-            quality=self.quality,
-            exist_ok=True,
-        )
+        return build(source, path, quiet=quiet, exist_ok=True, **self.build_options())

@@ -21,8 +21,6 @@ split folders, split. A manifest is checked completely before the first image is
 the header.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal

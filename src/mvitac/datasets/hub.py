@@ -5,8 +5,6 @@
 Class numbers are replaced by the class names in the file's metadata (ClassLabel).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several packs as one training set."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence
@@ -52,9 +50,7 @@ class MixConfig(DatasetConfig):
         if len(given) > 1:
             raise ValueError(f"parts {' '.join(self.parts)}: give every part a weight (NAME=FOLDER:WEIGHT), or none")
         if True in given and self.temperature != 1:
-            raise ValueError(
-                f"temperature {self.temperature} has no effect on parts with weights: leave one of both out"
-            )
+            raise ValueError(f"temperature {self.temperature} has no effect on parts with weights: leave one out")
 
     def named_parts(self) -> list[tuple[str, Path, float | None]]:
         """Name, folder and weight of each part."""
@@ -63,9 +59,8 @@ class MixConfig(DatasetConfig):
             name, folder, weight = re.fullmatch(r"(?:([\w.-]+)=)?(.*?)(?::([^:/]*))?", text).groups()  # type: ignore
             if not folder:
                 raise ValueError(f"part {text!r} names no folder: give NAME=FOLDER or NAME=FOLDER:WEIGHT")
-            found.append(
-                (name or Path(folder).resolve().name, Path(folder), None if weight is None else _weight(weight, text))
-            )
+            weighs = None if weight is None else _weight(weight, text)
+            found.append((name or Path(folder).resolve().name, Path(folder), weighs))
         return found
 
     def source(self) -> Source:

@@ -1,7 +1,5 @@
 """Packs as datasets: a folder on disk (``pack``) or shards at a URL (``stream``)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal

@@ -9,8 +9,6 @@ Layout of ``git clone https://github.com/clear-nus/octopi``:
 The labels are read from the owners' Python file without running it.
 """
 
-from __future__ import annotations
-
 import ast
 from dataclasses import dataclass
 from pathlib import Path

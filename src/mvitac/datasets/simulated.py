@@ -3,8 +3,6 @@
 They are the default data: every experiment runs without a download. Results are not comparable with the paper's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import product

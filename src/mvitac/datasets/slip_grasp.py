@@ -9,8 +9,6 @@ Layout of ``git clone https://github.com/wkoa/slip_detection``:
                              gelsight_lab_imgw...                          a colour conversion; not used
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ More than half of the folders are copies of others, some with slip.txt and some 
 content of their videos. If copies disagree, the recording has no label and label_conflict = 1.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +21,7 @@ from mvitac.datasets.table.video_times import num_frames, spread
 from mvitac.system.files import digest_file
 
 FINGERS = {"left": "camera_0.avi", "right": "camera_2.avi"}
-ALIASES = {"bag_of_peanuts": "bag_peanuts"}
-"""Names of the same object, which must not be in different splits."""
+ALIASES = {"bag_of_peanuts": "bag_peanuts"}  # names of the same object, which must not be in different splits
 
 
 @dataclass(frozen=True, kw_only=True)

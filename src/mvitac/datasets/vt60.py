@@ -8,8 +8,6 @@ Layout of ``git clone https://github.com/Exhor/deep_visuotactile_classification`
 Photos and touches were not taken together. A pair is **weak**: the k-th touch of an object with its (k mod n)-th photo.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -8,8 +8,6 @@ Members with the same name up to the first dot are one sample:
 Images are read from inside the tar. A .json gives a column per scalar, .cls and .txt one column each.
 """
 
-from __future__ import annotations
-
 import tarfile
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -65,9 +63,7 @@ class WebDatasetConfig(RowsConfig):
                     if f".{last}" in IMAGES:
                         column = name or self.pictures
                         if column in places.setdefault(key, {}):
-                            raise ValueError(
-                                f"{shard} has two {column} images of {key}: names must differ between shards"
-                            )
+                            raise ValueError(f"{shard} has two {column} images of {key}: names must differ")
                         places[key][column] = TarMember(str(shard), member.offset_data, member.size)
                     elif last in ("json", "cls", "txt"):
                         file = tar.extractfile(member)
@@ -82,8 +78,5 @@ def _known(text: str, vectors: Collection[str]) -> dict[str, str]:
     value = parse_json(text)
     if not isinstance(value, dict):
         return {}
-    return {
-        name: text_of(v)
-        for name, v in value.items()
-        if isinstance(v, (str, int, float, bool)) or v is None or name in vectors
-    }
+    plain = (str, int, float, bool, type(None))
+    return {name: text_of(v) for name, v in value.items() if isinstance(v, plain) or name in vectors}

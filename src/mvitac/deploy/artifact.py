@@ -10,8 +10,6 @@
 against its digest before it is parsed, and no file with another name is opened.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path
@@ -65,14 +63,8 @@ class PublishedModel(Model, ModelHubMixin):
     @classmethod
     def from_pretrained(
         cls, pretrained_model_name_or_path: str | Path, *, revision: str | None = None, **options: Any
-    ) -> PublishedModel:
-        """The artifact in a folder, or of "owner/name" on the Hub.
-
-        Args:
-            pretrained_model_name_or_path: folder or Hub id.
-            revision: branch, tag or commit on the Hub.
-            options: those of ``huggingface_hub.snapshot_download`` (token, cache_dir, local_files_only, force_download).
-        """
+    ) -> "PublishedModel":
+        """The artifact in a folder or on the Hub ("owner/name"); options of ``huggingface_hub.snapshot_download``."""
         local = Path(pretrained_model_name_or_path)
         return read(local if local.is_dir() else pull(str(pretrained_model_name_or_path), revision, **options))
 
@@ -150,7 +142,7 @@ def read(folder: Path) -> PublishedModel:
                 f"{folder}: artifact.json says {name} {given.get(name)}, its model was trained with {asked.get(name)}:"
                 " predictions would be wrong, publish it again"
             )
-    model.readouts = read_probes(folder, manifest, model)
+    model.probes = read_probes(folder, manifest, model)
     return PublishedModel(model, folder).eval()
 
 
@@ -212,24 +204,24 @@ def read_probes(folder: Path, manifest: dict[str, Any], model: Model) -> dict[st
         values: tuple[ValueInfo, ...] = from_json(tuple[ValueInfo, ...], manifest.get("values", []), "values")
     except ValueError as error:
         raise ValueError(f"{folder / MANIFEST} is damaged ({error}): publish it again") from None
-    questions = (*classes, *values)
-    if not questions:
+    infos = (*classes, *values)
+    if not infos:
         return {}
     path = folder / "probes.safetensors"
     if path.name not in manifest["files"]:
         raise ValueError(f"{folder / MANIFEST} describes probes but names no {path.name}: publish it again")
     tensors = safetensors.torch.load_file(path)
-    expected = {f"{q.name}.{part}" for q in questions for part in ("weight", "bias")}
+    expected = {f"{q.name}.{part}" for q in infos for part in ("weight", "bias")}
     for name in sorted(expected ^ tensors.keys()):
         where = "is missing" if name in expected else "does not belong"
         raise ValueError(f"{path}: tensor {name!r} {where}: publish the artifact again")
-    readouts = {}
-    for question in questions:
-        if unknown := set(question.modalities) - set(model.encoders):
-            raise ValueError(f"{path}: probe {question.name} needs {unknown}, which this model has no encoder for")
-        dim = sum(int(model.encoders[m].num_features) for m in question.modalities)  # type: ignore[arg-type]
-        weight = tensors[f"{question.name}.weight"]
+    probes = {}
+    for info in infos:
+        if unknown := set(info.modalities) - set(model.encoders):
+            raise ValueError(f"{path}: probe {info.name} needs {unknown}, which this model has no encoder for")
+        dim = sum(int(model.encoders[m].num_features) for m in info.modalities)  # type: ignore[arg-type]
+        weight = tensors[f"{info.name}.weight"]
         if weight.shape[-1] != dim:
-            raise ValueError(f"{path}: probe {question.name} reads {weight.shape[-1]} features, the model gives {dim}")
-        readouts[question.name] = LinearProbe(question, weight, tensors[f"{question.name}.bias"])
-    return readouts
+            raise ValueError(f"{path}: probe {info.name} reads {weight.shape[-1]} features, the model gives {dim}")
+        probes[info.name] = LinearProbe(info, weight, tensors[f"{info.name}.bias"])
+    return probes

@@ -1,7 +1,5 @@
 """The model card of an artifact: what the model is, an example, scores next to controls, preprocessing, data."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 
@@ -86,7 +84,7 @@ def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
     if not scores["summary"]:
         return ["No task has labelled rows in train and test.", ""]
     by = scores["group_by"]
-    leaks = dict.fromkeys(r.question.leak for r in model.readouts.values() if r.question.leak)
+    leaks = dict.fromkeys(r.info.leak for r in model.probes.values() if r.info.leak)
     unseen = f"{by}s that neither encoders nor probes saw"
     if leaks:
         unseen = f"test rows. LEAK, what the encoders saw of them: {'; '.join(leaks)}"
@@ -101,19 +99,19 @@ def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
         lines += [f"| {name} ({tested_on(task, by)}) | {' | '.join(columns)} |", "|---" + "|---:" * len(columns) + "|"]
         lines += [f"| {s} | {' | '.join(cell_text(task, s, m) for m in columns)} |" for s in sources_of(task)]
         lines.append("")
-        lines += _errors([r.question for r in model.readouts.values() if r.question.task == name])
+        lines += _errors([r.info for r in model.probes.values() if r.info.task == name])
     return [*lines, *(line for note in scores["notes"] for line in (f"Note: {note}.", ""))]
 
 
-def _errors(questions: list[Any]) -> list[str]:
+def _errors(infos: list[Any]) -> list[str]:
     """A Markdown table of the errors of one task's probes, in the unit of each target; nothing for classes."""
-    questions = [q for q in questions if isinstance(q, ValueInfo)]
-    if not questions:
+    infos = [q for q in infos if isinstance(q, ValueInfo)]
+    if not infos:
         return []
-    head = f"| mean absolute error (root mean square) | {' | '.join(q.modality for q in questions)} |"
-    lines = [head, "|---" + "|---:" * len(questions) + "|"]
-    for t, target in enumerate(questions[0].targets):
-        found = [f"{q.errors[t].mae:.3g} ({q.errors[t].rmse:.3g}) {target.unit}" for q in questions]
+    head = f"| mean absolute error (root mean square) | {' | '.join(q.modality for q in infos)} |"
+    lines = [head, "|---" + "|---:" * len(infos) + "|"]
+    for t, target in enumerate(infos[0].targets):
+        found = [f"{q.errors[t].mae:.3g} ({q.errors[t].rmse:.3g}) {target.unit}" for q in infos]
         lines.append(f"| {target.name} | {' | '.join(found)} |")
     return [*lines, ""]
 

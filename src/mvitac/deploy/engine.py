@@ -8,8 +8,6 @@
 Pickles in a torch export are refused. torch still calls its format unsafe, so open only exports that you trust.
 """
 
-from __future__ import annotations
-
 import bisect
 import os
 import re
@@ -204,9 +202,7 @@ def _torch(path: Path, precision: str, threads: int) -> Call:
         torch.set_num_threads(threads)
         try:
             with torch.inference_mode():
-                return [
-                    x.numpy() for x in module(*(torch.tensor(a) for a in arrays))
-                ]  # a copy: memory-mapped images are read-only
+                return [x.numpy() for x in module(*(torch.tensor(a) for a in arrays))]  # a copy: images are read-only
         finally:
             torch.set_num_threads(before)
 

@@ -4,8 +4,6 @@ The reference is ``Model.features`` and its probes, the code that computed the p
 written file, opened again by the engine that will run it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging
@@ -90,21 +88,11 @@ class ExportConfig:
 def export(
     model: Model, pack: Pack, out: Path, config: ExportConfig = ExportConfig(), *, calibrate: Pack | None = None
 ) -> dict[str, Any]:
-    """Write ``model`` with its probes for another engine into the new folder ``out``.
+    """Write ``model`` with its probes for another engine into the new folder ``out``, checked on test rows of ``pack``.
 
-    Args:
-        model: a trained model; its probes are exported with it.
-        pack: data whose test rows check the export.
-        out: the new folder.
-        config: engine, arithmetic, inputs and allowed differences.
-        calibrate: data whose train rows set the ranges of int8 (default: ``pack``).
-
-    Returns:
-        The report: cosines, accuracies, errors of values in their units, size in MB, latency in ms.
-
-    Raises:
-        Busy: another process writes ``out``.
-        ValueError: the export is not possible, or differs by more than ``config`` allows; ``out`` is not made.
+    ``calibrate``: data whose train rows set the ranges of int8 (default: ``pack``). Returns the report: cosines,
+    accuracies, errors of values in their units, size in MB, latency in ms. Raises Busy if another process writes
+    ``out``; ValueError if the export is not possible, or differs by more than ``config`` allows.
     """
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
         raise ValueError(

@@ -6,8 +6,6 @@ embedding_<modality> [B, D], shared_<modality> [B, E] (L2-normalised; absent wit
 probability_<task> [B, K], value_<task> [B, T] in the units of its T targets.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -37,15 +35,15 @@ class ExportModule(nn.Module):
         asked = "both" if len(self.modalities) == 2 else self.modalities[0]
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.modalities})
         self.projectors = nn.ModuleDict({m: p for m, p in model.projectors.items() if m in self.modalities})
-        self.readouts = nn.ModuleList([r for r in model.readouts.values() if r.question.modality == asked])
-        questions = [r.question for r in self.readouts]
-        self.classes = {q.task: list(q.classes) for q in questions if isinstance(q, ProbeInfo)}
-        self.values = {q.task: _targets(q) for q in questions if isinstance(q, ValueInfo)}
+        self.probes = nn.ModuleList([r for r in model.probes.values() if r.info.modality == asked])
+        infos = [r.info for r in self.probes]
+        self.classes = {q.task: list(q.classes) for q in infos if isinstance(q, ProbeInfo)}
+        self.values = {q.task: _targets(q) for q in infos if isinstance(q, ValueInfo)}
         self.inputs = {m: (model.stored, model.stored, model.spec.channels(m)) for m in self.modalities}
         self.outputs = tuple(
             [f"embedding_{m}" for m in self.modalities]
             + [f"shared_{m}" for m in self.projectors]
-            + [output_of(r) for r in self.readouts]  # type: ignore[arg-type]
+            + [output_of(r) for r in self.probes]  # type: ignore[arg-type]
         )
         sides = model.run.augment
         # Heads need views of the size they were trained on.
@@ -74,18 +72,18 @@ class ExportModule(nn.Module):
             wanted = {m: self.encoders[m](self.view(given[m], self.head_filter)) for m in self.projectors}
         shared = [F.normalize(head(wanted[m]), dim=1) for m, head in self.projectors.items()]
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
-        return (*features.values(), *shared, *(readout(joined) for readout in self.readouts))
+        return (*features.values(), *shared, *(probe(joined) for probe in self.probes))
 
 
-def output_of(readout: LinearProbe) -> str:
+def output_of(probe: LinearProbe) -> str:
     """The name of the output of a probe."""
-    kind = "probability" if isinstance(readout.question, ProbeInfo) else "value"
-    return f"{kind}_{readout.question.task}"
+    kind = "probability" if isinstance(probe.info, ProbeInfo) else "value"
+    return f"{kind}_{probe.info.task}"
 
 
-def _targets(question: ValueInfo) -> list[dict[str, Any]]:
+def _targets(info: ValueInfo) -> list[dict[str, Any]]:
     """Name, unit, and errors by range of the predicted value (``Error``) of each target, JSON-ready."""
-    named = zip(question.targets, question.errors, strict=True)
+    named = zip(info.targets, info.errors, strict=True)
     return [{"name": t.name, "unit": t.unit, "edges": list(e.edges), "spread": list(e.spread)} for t, e in named]
 
 

@@ -1,7 +1,5 @@
 """Whether an export is the trained model: its outputs on test rows next to those of the code that was scored."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -32,7 +30,7 @@ def reference(
         found |= {
             f"shared_{m}": model.project(m, model.features(m, images[m], for_heads=True)) for m in graph.projectors
         }
-        found |= {output_of(r): r(joined) for r in graph.readouts}  # type: ignore[arg-type]
+        found |= {output_of(r): r(joined) for r in graph.probes}  # type: ignore[arg-type]
         chunks.append(found)
         advance(len(chunk))
     return {name: torch.cat([c[name] for c in chunks]).numpy() for name in graph.outputs}
@@ -45,16 +43,13 @@ def parity(
     pack: Pack,
     rows: np.ndarray,
     wanted: dict[str, np.ndarray],
-    config: ExportConfig,
+    config: "ExportConfig",
     advance: Callable[[int], object] = lambda num: None,
 ) -> dict[str, Any]:
     """Compare the outputs of ``call`` for pack rows with ``wanted``.
 
-    Returns:
-        num_rows; cosine by embedding (min, mean); accuracy by task (original, export, num labelled rows).
-
-    Raises:
-        ValueError: they differ by more than ``config`` allows; the message names the likeliest reason.
+    Returns num_rows; cosine by embedding (min, mean); accuracy by task (original, export, num labelled rows).
+    ValueError with the likeliest reason if they differ by more than ``config`` allows.
     """
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 16)):  # batches of another size than the traced one

@@ -7,8 +7,6 @@
 Follows LeRobot's convention: images are [B, 3, H, W] (or [B, T, 3, H, W]), float in [0, 1] or uint8, RGB.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch
@@ -27,15 +25,12 @@ class ObservationEncoder(nn.Module):
     """
 
     def __init__(self, model: Model, keys: Mapping[str, str], *, state: int = 0, tune: bool = False) -> None:
-        """
+        """Encode with ``model``; ValueError if a modality or the number of its keys does not fit it.
+
         Args:
-            model: a trained model.
             keys: modality of each observation key. Two gels of one gripper are two keys of "touch", left first.
             state: length of "observation.state" to append; 0 = none.
             tune: let the policy's loss train the encoders (BatchNorm keeps its statistics); otherwise they are frozen.
-
-        Raises:
-            ValueError: a modality or the number of its keys does not fit the model.
         """
         super().__init__()
         self.keys: dict[str, list[str]] = {}
@@ -57,7 +52,7 @@ class ObservationEncoder(nn.Module):
         features = (int(e.num_features) for e in self.encoders.values())  # type: ignore[arg-type]
         self.out_features = sum(features) + state
 
-    def train(self, mode: bool = True) -> ObservationEncoder:
+    def train(self, mode: bool = True) -> "ObservationEncoder":
         """As for any module, but the encoders stay in eval mode: small batches of a policy would spoil their BatchNorm."""
         super().train(mode)
         self.encoders.eval()
@@ -71,9 +66,8 @@ class ObservationEncoder(nn.Module):
             for name in names:
                 image = self._get(observation, name)
                 if image.ndim not in (4, 5) or image.shape[-3] != 3:
-                    raise ValueError(
-                        f"{name}: expected images [B, 3, H, W] or [B, T, 3, H, W], got {tuple(image.shape)}"
-                    )
+                    shape = tuple(image.shape)
+                    raise ValueError(f"{name}: expected images [B, 3, H, W] or [B, T, 3, H, W], got {shape}")
                 self._check_range(name, image)
                 lead = image.shape[:-3]
                 views.append(encoder_input(resized(image.flatten(0, -4), self.stored), self.size))

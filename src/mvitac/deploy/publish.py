@@ -1,7 +1,5 @@
 """Publish runs: fit the probes on a finished run's data, write one artifact folder, and push it to the Hub."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -37,13 +35,13 @@ NUM_RANGES, RANGE_ROWS = 8, 20
 """Most ranges of a predicted value that have an error of their own, and fewest test rows in one."""
 
 
-def fit_readouts(model: Model, pack: Pack) -> dict[str, LinearProbe]:
+def fit_probes(model: Model, pack: Pack) -> dict[str, LinearProbe]:
     """The linear probe of every task and modality of ``pack`` by name, fitted and scored exactly as by ``mvitac probe``.
 
     That of a task with values is ridge regression. A task without labelled rows in train and test has none: a probe that
     cannot be scored is not published.
     """
-    return {readout.question.name: readout for readout, _ in _fit_all(model, pack)}
+    return {probe.info.name: probe for probe, _ in _fit_all(model, pack)}
 
 
 def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]]]:
@@ -53,13 +51,13 @@ def _fit_all(model: Model, pack: Pack) -> list[tuple[LinearProbe, dict[str, Any]
     sources = [*modalities, *(["both"] if len(modalities) == 2 else [])]
     with work("fitting probes", len(pack.spec.all_tasks) * len(sources), "probes") as advance:
         for task, source in product(pack.spec.all_tasks, sources):
-            fitted = _fit_readout(model, pack, task, source, modalities if source == "both" else [source])
+            fitted = _fit_probe(model, pack, task, source, modalities if source == "both" else [source])
             found += [fitted] if fitted else []
             advance()
     return found
 
 
-def _fit_readout(
+def _fit_probe(
     model: Model, pack: Pack, task: AnyTask, source: str, modalities: list[str]
 ) -> tuple[LinearProbe, dict[str, Any]] | None:
     """One task's linear probe on features of ``modalities``, and its record; None without rows in train and test."""
@@ -82,8 +80,8 @@ def _fit_values(
     known = {"task": task.name, "modality": source}
     scored = zip(record["targets"], true.T, guess.T, strict=True)
     errors = tuple(_error(target, t[~np.isnan(t)], g[~np.isnan(t)]) for target, t, g in scored)
-    question = ValueInfo(**known, targets=task.targets, errors=errors, num_test=len(rows.test))
-    return from_ridge(question, *fitted.weights()), {**known, "probe": "linear", **record}
+    info = ValueInfo(**known, targets=task.targets, errors=errors, num_test=len(rows.test))
+    return from_ridge(info, *fitted.weights()), {**known, "probe": "linear", **record}
 
 
 def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error:
@@ -114,8 +112,8 @@ def _fit_classes(
         return constant(ProbeInfo(**given, accuracy=record["accuracy"]), label, x.shape[1]), {**known, **record}
     fitted, _ = fit_linear(learn, labels[rows.train], choose, labels[rows.val])
     record = score_rows(pack, task, rows.test, spread_out(fitted(test), np.unique(seen), len(task.classes)))
-    question = ProbeInfo(**given, accuracy=record["accuracy"])
-    return from_logistic(question, fitted.model, fitted.mean, fitted.std), {**known, **record}
+    info = ProbeInfo(**given, accuracy=record["accuracy"])
+    return from_logistic(info, fitted.model, fitted.mean, fitted.std), {**known, **record}
 
 
 def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, Any]:
@@ -164,10 +162,10 @@ def as_trained(model: Model, pack: Pack) -> Pack:
     return pack if pack.spec.window.active else windowed(pack, model.spec.window)
 
 
-def with_readouts(model: Model, pack: Pack | None = None) -> Model:
+def with_probes(model: Model, pack: Pack | None = None) -> Model:
     """``model`` with probes: its own if it has some (an artifact), else fitted on ``pack`` (default: the run's data)."""
-    if not model.readouts:
-        model.readouts = fit_readouts(model, as_trained(model, pack) if pack else model.open_data())
+    if not model.probes:
+        model.probes = fit_probes(model, as_trained(model, pack) if pack else model.open_data())
     return model
 
 
@@ -176,30 +174,20 @@ def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tup
     tasks = {task.name: task for task in scorable(pack)}
     learned, scored = check_unseen([run], [model], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
     fitted = _fit_all(model, pack)
-    for readout, record in fitted:
-        q = readout.question
+    for probe, record in fitted:
+        q = probe.info
         record["leak"] = scored.leak(learned, split_rows(pack, tasks[q.task], q.modality).test)
-        readout.question = replace(q, leak=record["leak"])
-    model.readouts = {readout.question.name: readout for readout, _ in fitted}
+        probe.info = replace(q, leak=record["leak"])
+    model.probes = {probe.info.name: probe for probe, _ in fitted}
     return learned, _scores(run, model, pack, [record for _, record in fitted])
 
 
 def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool = False) -> Path:
-    """Write the artifact of a finished run.
+    """Write the artifact of a finished run into the new folder ``out``.
 
-    Args:
-        run: the run's folder.
-        out: the new folder.
-        pack: data to fit the probes on (default: the data the run was trained on).
-        allow_leak: score also rows or groups of ``pack`` that the run was trained on; the card says LEAK beside scores.
-
-    Returns:
-        ``out``. The artifact was loaded once, as a check, before it got this name.
-
-    Raises:
-        Busy: another process writes ``out``.
-        ValueError: ``out`` exists or cannot be written, the run or its data is missing, or the run was trained on what
-            ``pack`` would score.
+    It is loaded once, as a check, before it gets its name. ``pack``: data to fit the probes on (default: the data the
+    run was trained on). With ``allow_leak``, its rows or groups may be some that the run was trained on; the card says
+    LEAK beside scores. Raises Busy if another process writes ``out``, else ValueError.
     """
     with new_folder(out) as partial:
         model = load(run)
@@ -221,8 +209,8 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
 
 def _write_weights(model: Model, folder: Path) -> None:
     model.save(folder / "model.safetensors")
-    if model.readouts:
-        tensors = {f"{r.question.name}.{k}": v for r in model.readouts.values() for k, v in r.state_dict().items()}
+    if model.probes:
+        tensors = {f"{r.info.name}.{k}": v for r in model.probes.values() for k, v in r.state_dict().items()}
         data = safetensors.torch.save(tensors)
         write_atomic(folder / "probes.safetensors", lambda file: file.write(data))
 
@@ -231,13 +219,13 @@ def _describe(model: Model, pack: Pack) -> dict[str, Any]:
     """artifact.json without its files and digest."""
     sensors = sorted(set(pack.column("sensor").astype(str))) if "sensor" in pack.table.column_names else []
     keys = ("name", "licence", "source")
-    questions = [r.question for r in model.readouts.values()]
+    infos = [r.info for r in model.probes.values()]
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "preprocessing": preprocessing(model, tuple(sensors)),
-        "probes": [to_json(q) for q in questions if isinstance(q, ProbeInfo)],
-        **({"values": values} if (values := [to_json(q) for q in questions if isinstance(q, ValueInfo)]) else {}),
+        "probes": [to_json(q) for q in infos if isinstance(q, ProbeInfo)],
+        **({"values": values} if (values := [to_json(q) for q in infos if isinstance(q, ValueInfo)]) else {}),
         "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},
         "trained_on": {key: getattr(model.spec, key) for key in keys},
     }

@@ -4,8 +4,6 @@ A CPU without VNNI adds pairs of 8-bit products in 16 bits, and larger sums are 
 of 7 bits the sums fit; this is onnxruntime's ``reduce_range`` and OpenVINO's overflow fix.
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any, Literal

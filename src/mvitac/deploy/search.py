@@ -9,8 +9,6 @@
 Shapes: N rows, Q queries, E dimensions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -30,8 +28,7 @@ from mvitac.system.progress import work
 from mvitac.transforms.preprocess import ImageInput
 
 FORMAT, FORMAT_VERSION = "mvitac-index", 1
-BLOCK = 1 << 16
-"""Rows compared at once: 128 MB of float32 at E = 512, the largest part of a search's memory."""
+BLOCK = 1 << 16  # rows compared at once: 128 MB of float32 at E = 512, the largest part of a search's memory
 
 
 def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str, np.ndarray]], list[str]]:
@@ -53,16 +50,9 @@ def neighbours(index: Any, k: int, inputs: Iterable[str]) -> Callable[[dict[str,
 
 
 def nearest(bank: np.ndarray, queries: np.ndarray, k: int, *, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
-    """The ``k`` nearest rows by cosine: an exact search.
+    """Row numbers and cosines [Q, k] of the ``k`` nearest rows (or all), best first, equal ones in row order.
 
-    Args:
-        bank: float32 [N, E], unit length; may be memory-mapped.
-        queries: float32 [Q, E], unit length.
-        k: number of rows to find; all rows if there are fewer.
-        block: rows compared at once.
-
-    Returns:
-        Row numbers and cosines, both [Q, k], best first; equal cosines in row order.
+    An exact search. ``bank`` [N, E], which may be memory-mapped, and ``queries`` [Q, E] are float32 of unit length.
     """
     if queries.ndim != 2 or queries.shape[1] != bank.shape[1]:
         raise ValueError(f"queries are {queries.shape}, the index holds {bank.shape[1]} dimensions: embed them alike")
@@ -127,21 +117,11 @@ def describe(pack: Pack, rows: np.ndarray) -> pa.Table:
     return pack.table.select(names).take(rows).append_column("row", pa.array(rows, pa.int64()))
 
 
-def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> Index:
-    """Index the complete pairs of a pack.
+def build(model: Model, pack: Pack, out: Path, splits: tuple[str, ...] = ()) -> "Index":
+    """Index the complete pairs of a pack in the new folder ``out``, with a copy of the model for queries.
 
     A model with a space that both modalities share is indexed there, so that touch finds vision and vision finds touch;
-    any other by features, where each modality finds only itself.
-
-    Args:
-        model: embeds the rows; a copy is kept for queries.
-        pack: rows to index.
-        out: the new folder.
-        splits: index only these; none = all.
-
-    Raises:
-        Busy: another process writes ``out``.
-        ValueError: ``out`` exists, or the pack does not fit the model.
+    any other by features, where each modality finds only itself. Only ``splits`` are indexed, if some are given.
     """
     with new_folder(out) as partial:
         _fill(model, pack, partial, splits)
@@ -227,18 +207,10 @@ class Index:
         *,
         background: ImageInput | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest indexed images of modality ``target`` to ``images`` of modality ``source``.
+        """The ``k`` nearest indexed images of modality ``target`` to ``images`` of modality ``source``.
 
-        Args:
-            model: that of ``model()``.
-            images: Q queries, as for ``Model.embed``.
-            source: modality of the queries.
-            target: modality to search.
-            k: number of rows to find.
-            background: the touch sensor without contact, as for ``Model.embed``.
-
-        Returns:
-            Row numbers and cosines, both [Q, k], best first.
+        ``model`` is that of ``model()``; ``images`` [Q] and ``background`` are as for ``Model.embed``. Returns row
+        numbers and cosines, both [Q, k], best first.
         """
         for name in (source, target):
             if name not in self.banks:

@@ -3,8 +3,6 @@
 Shapes: features [N, D]. A fitted classifier is a function from features to class probabilities [N, K].
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,10 +18,8 @@ from torch import Tensor
 
 Classifier = Callable[[np.ndarray], np.ndarray]
 
-STRENGTHS = (0.001, 0.01, 0.1, 1.0)
-"""Candidate values of C, the inverse regularisation strength of logistic regression."""
-EPOCHS, BATCH, DROPOUT = 60, 256, 0.2
-"""Training settings of the paper's probe (appendix A)."""
+STRENGTHS = (0.001, 0.01, 0.1, 1.0)  # candidate values of C, the inverse regularisation strength of logistic regression
+EPOCHS, BATCH, DROPOUT = 60, 256, 0.2  # training settings of the paper's probe (appendix A)
 
 
 @dataclass(frozen=True)
@@ -39,12 +35,9 @@ class Logistic:
 
 
 def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray) -> tuple[Logistic, float]:
-    """Fit logistic regression on standardised features.
+    """Fit logistic regression on standardised features; returns the classifier and C.
 
     C is chosen on the validation rows. The final fit uses the training and validation rows together.
-
-    Returns:
-        The classifier and the chosen C.
     """
     mean, std = x.mean(0), x.std(0) + 1e-6
     x, x_val = (x - mean) / std, (x_val - mean) / std
@@ -68,12 +61,7 @@ def train_heads(
 
     All tasks and seeds that share rows are trained at once. Adam updates each weight independently, so every head ends
     as if it were trained alone. A model's seed sets its batch order and dropout, which all its tasks share.
-
-    Args:
-        features: Features of S models, [S, N, D]. Training runs on their device.
-        labels: Labels of T tasks, [T, N].
-        num_classes: Number of classes of each task.
-        seeds: One seed per model.
+    ``features`` [S, N, D] are of S models, with a seed each, on the device to train on; ``labels`` [T, N] of T tasks.
 
     Returns:
         For each model a list of T weight matrices [num_classes, D + 1]; the last column is the bias.

@@ -3,8 +3,6 @@
 Controls are the most common class, raw pixels, the image border, the dataset's own confounds and an untrained trunk.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +16,6 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task, ValueTask
 from mvitac.evaluation.probe import (
     ProbeSplit,
-    cross_modal,
     labels_of,
     names_in,
     probe_all,
@@ -29,6 +26,7 @@ from mvitac.evaluation.probe import (
     score_rows,
     split_rows,
 )
+from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.sensors import Standardise
 from mvitac.model import Model, fresh
 from mvitac.nn.encoders import SCRATCH
@@ -66,20 +64,11 @@ def controls_of(
     specs: Sequence[DataSpec] = (),
     standardise: tuple[Standardise, ...] = (),
 ) -> tuple[Records, Records]:
-    """Score every control for ``runs``.
+    """Score every control for ``runs``: probe records and retrieval records, each with its "source" and "seed".
 
-    Args:
-        runs: The runs whose trunks before training are controls.
-        pack: The data to probe on.
-        tasks: Tasks to probe.
-        modalities: Modalities to probe.
-        probes: Probes of the trunks; all other controls get logistic regression.
-        imagenet: A file of ImageNet weights for one more trunk.
-        specs: What the runs were trained on, where that is not ``pack``.
-        standardise: As for the runs (``sensors.touch_features``), for the trunks.
-
-    Returns:
-        Probe records and retrieval records, each with its "source" and "seed".
+    ``probes`` are those of the trunks; all other controls get logistic regression. ``imagenet`` is a file of weights
+    for one more trunk. ``specs``: what the runs were trained on, where that is not ``pack``. ``standardise``: as for
+    the runs (``sensors.touch_features``), for the trunks.
     """
     records = label_controls(pack, tasks)
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)

@@ -3,8 +3,6 @@
 Shapes: features [N, D] of one modality. Row i of vision and row i of touch are a pair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -74,8 +72,7 @@ def knn_accuracy(
     return float((votes.argmax(1) == test_labels).float().mean())
 
 
-ALPHAS = (10.0, 100.0, 1e3, 1e4, 1e5)
-"""Candidate strengths of the ridge regularisation of ``linear_probe``."""
+ALPHAS = (10.0, 100.0, 1e3, 1e4, 1e5)  # candidate strengths of the ridge regularisation of ``linear_probe``
 
 
 def linear_probe(

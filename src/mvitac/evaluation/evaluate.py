@@ -1,7 +1,5 @@
 """Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,17 +15,9 @@ from mvitac.evaluation.controls import Records, controls_of, scratch, start_weig
 from mvitac.evaluation.events import check_event, with_event
 from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
-from mvitac.evaluation.probe import (
-    PROBES,
-    cross_modal,
-    probe_model,
-    probes_of,
-    retrieved_rows,
-    seen_by,
-    split_rows,
-    with_classes,
-)
+from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows, with_classes
 from mvitac.evaluation.probe_config import ProbeConfig
+from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import describe_statistics, sensor_records
@@ -93,26 +83,14 @@ def probe_runs(
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
-    Example:
-        >>> result = probe_runs([Path("runs/first")], ProbeConfig(probes=("linear", "knn")))
-        >>> result["summary"]["category"]["touch"]["mvitac"]["mean"]
-
-    Args:
-        paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
-        session: What to probe.
-        pack: Other data to probe on. Default: the data the runs were trained on.
-        allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
-        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
-        encoders: Other people's encoders to probe beside the runs ("external:..."). They need ``pack``.
+    ``pack`` is other data than the runs were trained on; ``encoders`` ("external:...") need it. With ``allow_leak``, its
+    test rows may be rows, or of groups, that a run was trained on. The result of the best ``weights`` is in
+    probe.best.json. ValueError if the runs and the data do not fit together.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
         "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has
         a "leak", which is empty unless its test rows, or their groups, were trained on.
-
-    Raises:
-        ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
-            trained on rows or groups that other data than its own would score.
     """
     if paths or not encoders:
         _check_paths(paths)
@@ -151,9 +129,8 @@ def probe_runs(
         result["statistics"] = describe_statistics(pack, session.standardise)
     if session.sensors:
         found_by = zip(names, models, strict=True)
-        result["sensors"] = [
-            {"source": n, "seed": m.run.seed, **r} for n, m in found_by for r in sensor_records(m, pack)
-        ]
+        found_of = ((n, m, r) for n, m in found_by for r in sensor_records(m, pack))
+        result["sensors"] = [{"source": n, "seed": m.run.seed, **r} for n, m, r in found_of]
     for path in paths:
         write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
     return Scores(result)
@@ -186,9 +163,7 @@ def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
         return pack
     packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
-        raise ValueError(
-            "these runs were trained on different data: probe them one by one, or give one pack for all with --on"
-        )
+        raise ValueError("these runs were trained on different data: probe them one by one, or on one pack with --on")
     return packs[0]
 
 
@@ -263,9 +238,8 @@ def check_unseen(
 ) -> list[list[Source] | None]:
     """What each run at ``paths`` learned from; None where that is not known.
 
-    Raises:
-        ValueError: If a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
-            its own data follows from the split that was chosen, so there the scores only say LEAK.
+    ValueError if a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
+    its own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
     for path, model in zip(paths, models, strict=True):
@@ -311,8 +285,7 @@ def _probe_run(
 def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     """Names of the runs: the method, the recipe if recipes differ, and the folder if runs of one name differ further.
 
-    Raises:
-        ValueError: If two runs are the same, since they would count as two seeds.
+    ValueError if two runs are the same, since they would count as two seeds.
     """
     several = len({model.run.recipe for model in models}) > 1
     names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]

@@ -8,8 +8,6 @@ The onset is the first frame labelled with the class. Where the whole recording 
 the recording's last frame stands for it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -23,8 +21,7 @@ from mvitac.data.windows import places
 from mvitac.registry import unknown
 
 NUM_FOLDS = 5
-NUM_TRACES = 4
-"""Recordings of each kind whose scores a record keeps for the report."""
+NUM_TRACES = 4  # recordings of each kind whose scores a record keeps for the report
 
 
 def with_event(task: Task, event: Event) -> Task:
@@ -37,9 +34,8 @@ def with_event(task: Task, event: Event) -> Task:
 def check_event(pack: Pack, task: Task, fitted: np.ndarray, test: np.ndarray) -> None:
     """Check that the event of ``task`` can be scored on pack rows ``test`` by probes of rows ``fitted``.
 
-    Raises:
-        ValueError: If frames have no order, there are fewer than three groups to fit on, or test has no recording with the
-            event, or train or test has none without it.
+    ValueError if frames have no order, there are fewer than three groups to fit on, or test has no recording with the
+    event, or train or test has none without it.
     """
     assert task.event
     _times(pack, task.event)
@@ -73,19 +69,11 @@ def group_folds(groups: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np
 def score_event(
     pack: Pack, task: Task, fitted: np.ndarray, held: np.ndarray, test: np.ndarray, predicted: np.ndarray
 ) -> dict[str, Any]:
-    """Score the event of ``task`` on pack rows ``test``.
+    """Score the event of ``task`` on pack rows ``test``, with class probabilities ``predicted`` [len(test), K].
 
-    Args:
-        pack: The data.
-        task: A task with an event.
-        fitted: Rows of train and val.
-        held: Class probabilities [len(fitted), K], each row's by a probe that was fitted on other groups.
-        test: Rows to score.
-        predicted: Class probabilities [len(test), K].
-
-    Returns:
-        "threshold", "unit" of times, "recordings" (their name, group, onset, first alarm and highest score; None = there is
-        none), and "traces": times and scores of some of them, drawn at random.
+    ``held`` [len(fitted), K] are those of train and val, each row's by a probe that was fitted on other groups. Returns
+    "threshold", "unit" of times, "recordings" (their name, group, onset, first alarm and highest score; None = there is
+    none), and "traces": times and scores of some of them, drawn at random.
     """
     assert task.event
     k = task.classes.index(task.event.happens)

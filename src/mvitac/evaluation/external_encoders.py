@@ -1,7 +1,5 @@
 """Probes of other people's encoders (``mvitac.external``), beside those of our runs and under the same protocol."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,24 +11,18 @@ from mvitac.evaluation.probe import probe_model, probes_of
 from mvitac.external import ExternalModel, load_external
 from mvitac.system.progress import work
 
-Bound = tuple[ExternalModel, Pack]
-"""An encoder and the data, bound to each other."""
+Bound = tuple[ExternalModel, Pack]  # an encoder and the data, bound to each other
 
 
 def open_encoders(texts: Sequence[str], pack: Pack | None) -> list[Bound]:
-    """Open the encoders that ``texts`` name, for ``pack``.
-
-    Raises:
-        ValueError: If one cannot be opened or used on this data, or two have one title and seed.
-    """
+    """Open the encoders that ``texts`` name, for ``pack``; ValueError if two have one title and seed."""
     if texts and pack is None:
         raise ValueError("an encoder has no data of its own: name a pack with --on PACK")
     found: list[Bound] = []
     for model in map(load_external, texts):
         if any((model.title, model.seed) == (other.title, other.seed) for other, _ in found):
-            raise ValueError(
-                f"{model.text}: {model.title!r} with seed {model.seed} is given twice: give it a title=NAME"
-            )
+            who = f"{model.title!r} with seed {model.seed}"
+            raise ValueError(f"{model.text}: {who} is given twice: give it a title=NAME")
         assert pack is not None
         found.append(model.on(pack))
     return found

@@ -1,7 +1,5 @@
 """Features of a pack's rows from a frozen model, with a cache on disk."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 from collections.abc import Callable
@@ -16,8 +14,7 @@ from mvitac.system.files import cache_dir, digest, write_atomic
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
 
-HALF = (-65504.0, 65504.0)
-"""Range of fp16."""
+HALF = (-65504.0, 65504.0)  # range of fp16
 
 
 def pack_features(
@@ -31,12 +28,10 @@ def pack_features(
     maps: bool = False,
     advance: Callable[[int], object] = lambda num: None,
 ) -> Tensor:
-    """Compute ``Model.features`` of pack rows in chunks on the model's device; with ``maps``, ``last_map`` instead.
+    """``Model.features`` [len(rows), D] of pack rows, computed in chunks on the model's device, on the CPU.
 
-    ``advance`` is called after each chunk with the number of its rows.
-
-    Returns:
-        Features [len(rows), D], or maps [len(rows), P, D] of fp16, on the CPU.
+    With ``maps``, ``last_map`` instead: [len(rows), P, D] of fp16. ``advance`` is called with each chunk's number of
+    rows.
     """
     device = next(model.parameters()).device
     if device.type == "cpu":

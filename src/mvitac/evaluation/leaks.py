@@ -7,8 +7,6 @@ The first source of a run is its own training rows. A run that starts from anoth
 model. A source without rows stands for weights of which nothing says what they were trained on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,20 +24,16 @@ from mvitac.run import Run
 from mvitac.system.files import brief, write_atomic
 
 FILE = "trained_on.safetensors"
-UNKNOWN = "unknown"
-"""A leak that cannot be checked, because nothing says what the run was trained on."""
+UNKNOWN = "unknown"  # a leak that cannot be checked, because nothing says what the run was trained on
 
 
 @dataclass(frozen=True)
 class Source:
     """Rows of a dataset that a model learned from."""
 
-    name: str
-    """Name of the dataset."""
-    ids: np.ndarray
-    """uint64, sorted: hashes of the rows' ids."""
-    groups: np.ndarray
-    """uint64, sorted: hashes of the rows' groups."""
+    name: str  # name of the dataset
+    ids: np.ndarray  # uint64, sorted: hashes of the rows' ids
+    groups: np.ndarray  # uint64, sorted: hashes of the rows' groups
 
 
 def source_of(pack: Pack, rows: np.ndarray) -> Source:
@@ -77,27 +71,17 @@ def write_sources(folder: Path, sources: Sequence[Source]) -> None:
 
 
 def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list[Source] | None:
-    """What the run in ``folder`` learned from.
+    """What the run in ``folder`` learned from; None if that is not known.
 
-    Runs of version 0.1.0 have no such file. Their rows are computed from their data if it is ``pack`` or is still there.
-
-    Args:
-        folder: Folder of the run.
-        run: Its settings.
-        digest: Digest of the pack it was trained on, from run.json.
-        pack: The data to score, which may be the same.
-
-    Returns:
-        The sources, or None if they are not known.
+    Runs of version 0.1.0 have no such file. Their rows are computed from their data, whose ``digest`` is in run.json,
+    if it is ``pack`` (the data to score) or is still there.
     """
     if (folder / FILE).exists():
         try:
             with safetensors.safe_open(folder / FILE, framework="numpy") as file:
                 names = file.metadata()
-                return [
-                    Source(names[i], *(file.get_tensor(f"{i}.{k}") for k in ("ids", "groups")))
-                    for i in sorted(names, key=int)
-                ]
+                tensors = file.get_tensor
+                return [Source(names[i], tensors(f"{i}.ids"), tensors(f"{i}.groups")) for i in sorted(names, key=int)]
         except Exception as error:  # safetensors raises several types for damaged files
             raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
     own = pack if pack.digest == digest else _own_pack(folder, run)
@@ -133,9 +117,8 @@ class Scored:
         found = []
         for source in sources:
             groups = np.unique(self._groups[rows])
-            num_rows, num_groups = (
-                int(np.isin(a, b).sum()) for a, b in ((self._ids[rows], source.ids), (groups, source.groups))
-            )
+            both = (self._ids[rows], source.ids), (groups, source.groups)
+            num_rows, num_groups = (int(np.isin(a, b).sum()) for a, b in both)
             if num_rows or num_groups:
                 by = self.pack.spec.group_by
                 found.append(

@@ -1,9 +1,7 @@
-"""Probes of one model's frozen features on one pack: linear classifiers, kNN and cross-modal retrieval.
+"""Probes of one model's frozen features on one pack: linear classifiers, regression, kNN and small networks.
 
 Nothing is chosen on test rows: regularisation is chosen on held-out groups of train. Shapes: features [N, D].
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,11 +10,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from scipy.special import softmax
-from torch import Tensor
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
-from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import Classifier, fit_knn, fit_linear, fit_papers, spread_out
 from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
@@ -35,11 +31,8 @@ mlp, attentive: small networks on features, or on the trunk's last map (``traine
 Probe = Literal["linear", "paper", "knn", "mlp", "attentive"]
 VALUE_PROBES = ("linear", "knn", *TRAINED)
 """Probes of tasks with values: ridge regression, alpha chosen on validation groups, the mean of the 20 nearest, networks."""
-MIN_GALLERY = 11
-"""Least number of test groups for retrieval. With fewer, the first five are half of all groups or more."""
 
-FeatureSource = Callable[[str, np.ndarray], np.ndarray]
-"""(modality, pack rows) -> features [len(rows), D]."""
+FeatureSource = Callable[[str, np.ndarray], np.ndarray]  # (modality, pack rows) -> features [len(rows), D]
 
 
 @dataclass(frozen=True)
@@ -62,17 +55,10 @@ class ProbeSplit:
 
 
 def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
-    """Labelled (or measured) rows of ``task`` by split.
+    """Labelled (or measured) rows of ``task`` by split, with an image of ``modality`` ("both": of both, "none": any).
 
-    Without a validation split, a fifth of the training groups is set aside for it.
-
-    Args:
-        pack: The data.
-        task: The task whose labels, row filter and split column apply.
-        modality: Rows must have an image of this modality; "both" asks for both, "none" for no image.
-
-    Raises:
-        ValueError: If no labelled row is left in train or in test, or a target has no different values there.
+    Without a validation split, a fifth of the training groups is set aside for it. ValueError if no labelled row is
+    left in train or in test, or a target has no different values there.
     """
     having = names_in(modality, pack)
     known = pack.answered(task)
@@ -170,8 +156,7 @@ def fit_probe(
 ) -> tuple[Classifier, dict[str, Any]]:
     """Fit one probe on features ``x`` of ``rows.fitted``.
 
-    Returns:
-        A function from features [N, D] to class probabilities [N, K], and what was chosen (C of ``linear``).
+    Returns a function from features [N, D] to class probabilities [N, K], and what was chosen (C of ``linear``).
     """
     labels = labels_of(pack, task)
     y, y_whole, num = labels[rows.train], labels[rows.fitted], len(task.classes)
@@ -195,8 +180,7 @@ def fit_values(
 ) -> tuple[Regressor, dict[str, Any]]:
     """Fit one probe of a task with values on features ``x`` of ``rows.fitted``.
 
-    Returns:
-        A function from features [N, D] to values [N, T], and what was chosen (alpha of ``linear``, which is ridge).
+    Returns a function from features [N, D] to values [N, T], and what was chosen (alpha of ``linear``, which is ridge).
     """
     y = pack.values(task)[rows.fitted]
     if kind == "linear":
@@ -220,20 +204,16 @@ def probe_model(
     probes: Sequence[str],
     standardise: tuple[Standardise, ...] = (),
 ) -> list[dict[str, Any]]:
-    """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
+    """Probe every task and modality that ``model`` has an encoder for, and its own heads ("own") where it has some.
 
-    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones.
-
-    Returns:
-        One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
-        model's own head is "own".
+    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones. Returns one
+    record per (task, modality, probe): these names and the scores of ``scores.score``.
     """
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
         return []
-    needed = np.unique(
-        np.concatenate([split_rows(pack, t, m).all for t in tasks for m in seen_by(pack, t, modalities)])
-    )
+    parts = [split_rows(pack, task, m).all for task in tasks for m in seen_by(pack, task, modalities)]
+    needed = np.unique(np.concatenate(parts))
     own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
 
     def source_of(maps: bool) -> FeatureSource:
@@ -293,15 +273,15 @@ def with_classes(tasks: Sequence[AnyTask]) -> list[Task]:
 
 def score_predictions(pack: Pack, task: ValueTask, rows: np.ndarray, predicted: np.ndarray) -> dict[str, Any]:
     """Score values ``predicted`` [len(rows), T] of pack ``rows``."""
-    return score_values(pack.values(task)[rows], predicted, _group_numbers(pack, rows), task.targets)
+    return score_values(pack.values(task)[rows], predicted, group_numbers(pack, rows), task.targets)
 
 
 def score_rows(pack: Pack, task: Task, rows: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
     """Score class ``probabilities`` [len(rows), K] of pack ``rows``."""
-    return score(labels_of(pack, task)[rows], probabilities, _group_numbers(pack, rows), len(task.classes))
+    return score(labels_of(pack, task)[rows], probabilities, group_numbers(pack, rows), len(task.classes))
 
 
-def _group_numbers(pack: Pack, rows: np.ndarray) -> np.ndarray:
+def group_numbers(pack: Pack, rows: np.ndarray) -> np.ndarray:
     """The groups of ``rows``, numbered 0 .. G-1."""
     return np.unique(pack.column("group")[rows].astype(str), return_inverse=True)[1]
 
@@ -355,47 +335,3 @@ def _papers(
             fitted = fit_papers(source(modality, rows), ys, [len(task.classes) for task in group], seed)
             found.update({(task.name, modality): predict for task, predict in zip(group, fitted, strict=True)})
     return found
-
-
-def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor]:
-    """Projections [len(rows), E] of each modality into the space that they share, on the CPU."""
-    device = next(model.parameters()).device
-    z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in ("touch", "vision")}
-    return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
-
-
-def retrieved_rows(pack: Pack) -> np.ndarray:
-    """Test rows with all modalities, of the phase that the first task is about."""
-    only = pack.spec.tasks[0].only if pack.spec.tasks else None
-    return pack.rows("test", only=only, having=pack.spec.modalities)
-
-
-def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
-    """Retrieval of groups across modalities, in both directions, among ``rows`` (default: ``retrieved_rows``).
-
-    Returns:
-        One record per direction: R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. Empty without a
-        shared space, on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
-    """
-    if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
-        return []
-    rows = retrieved_rows(pack) if rows is None else rows
-    sizes = np.bincount(_group_numbers(pack, rows))
-    if len(sizes) < MIN_GALLERY:
-        return []
-    z, groups = shared_space(model, pack, rows), torch.from_numpy(_group_numbers(pack, rows))
-    records = []
-    for query, gallery in (("vision", "touch"), ("touch", "vision")):
-        ranks = diagnostics.retrieval_ranks(z[query], z[gallery], groups)
-        hits = np.bincount(groups.numpy(), weights=(ranks < 5).numpy(), minlength=len(sizes)).astype(int)
-        records.append(
-            {
-                "direction": f"{query} -> {gallery}",
-                **diagnostics.recall_at(ranks),
-                "chance R@5": min(1.0, 5 / len(sizes)),
-                "num_groups": len(sizes),
-                "group_sizes": sizes.tolist(),
-                "group_correct": hits.tolist(),
-            }
-        )
-    return records

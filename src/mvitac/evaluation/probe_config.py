@@ -1,7 +1,5 @@
 """``ProbeConfig``: what `mvitac probe` and ``mvitac.probe`` are asked to score."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal

@@ -4,8 +4,6 @@ Shapes: features [N, D], values [N, T] in the task's units, NaN = not measured. 
 it. A fitted regressor is a function from features to values [N, T].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -25,13 +23,10 @@ ALPHAS = tuple(10.0**k for k in range(-1, 6))
 NEIGHBOURS = 20
 
 
-def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Joined, list[float]]:
-    """Fit ridge regression on standardised features and targets.
+def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> "tuple[Joined, list[float]]":
+    """Fit ridge regression on standardised features and targets; returns the regressor and each target's alpha.
 
-    Each target's alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
-
-    Returns:
-        The regressor and the chosen alpha of each target.
+    Each alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
     """
     fitted = _fit_each(x, y, num_val, lambda: [])
     return Joined(fitted), [float(pipeline[-1].alpha_) for pipeline, _, _ in fitted]

@@ -5,8 +5,6 @@ scores within one name only. The exception is the pair in ``LEAK``: its differen
 split by groups.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -35,8 +33,7 @@ from mvitac.transforms.denoise import denoise, noise_level
 SHARES = {"1 % of labels": 0.01, "10 % of labels": 0.1}
 """Fraction of the labelled training and validation rows that a probe sees; at least one row per class, two of values."""
 NOISE = "noisy images"
-NOISE_LEVELS = 20.0
-"""Standard deviation of the noise added to each 8-bit channel of test images."""
+NOISE_LEVELS = 20.0  # standard deviation of the noise added to each 8-bit channel of test images
 CLEANED = "noisy images, cleaned"
 """The same images, denoised (``transforms.denoise``), and their features given the mean and standard deviation of clean
 ones. Level of noise and statistics come from noisy images of training rows, without labels."""
@@ -50,8 +47,7 @@ LEAK = {"unseen groups": False, "groups seen in training": True}
 PREPARED = {lost: f"{DROPOUT}, {name}" for lost, name in MISSING.items()}
 STRESSES = (*SHARES, NOISE, CLEANED, *MISSING.values(), DROPOUT, *PREPARED.values(), *LEAK)
 
-Scores = Iterator[tuple[str, dict[str, Any]]]
-"""(name of the stress, scores)."""
+Scores = Iterator[tuple[str, dict[str, Any]]]  # (name of the stress, scores)
 
 
 @dataclass(frozen=True)
@@ -170,17 +166,12 @@ def _dropout(case: _Case) -> Scores:
 
 def _without(lost: str, clean: dict[str, np.ndarray], num: int) -> np.ndarray:
     """Features of both modalities [N, D], those of ``lost`` replaced by the mean of its first ``num`` rows."""
-    return np.concatenate(
-        [np.broadcast_to(z[:num].mean(0), z.shape) if m == lost else z for m, z in clean.items()], axis=1
-    )
+    means = {m: np.broadcast_to(z[:num].mean(0), z.shape) if m == lost else z for m, z in clean.items()}
+    return np.concatenate([*means.values()], axis=1)
 
 
 def _few(rows: ProbeSplit, labels: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, ProbeSplit]:
-    """Keep ``share`` of the training and validation rows, and all test rows.
-
-    Returns:
-        Positions to keep in [train, val, test], and the rows that are left.
-    """
+    """Keep ``share`` of the training and validation rows, and all test rows: positions, and these rows by split."""
     rng = np.random.default_rng([seed, round(1000 * share)])
 
     def some(part: np.ndarray) -> np.ndarray:

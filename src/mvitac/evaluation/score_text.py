@@ -3,8 +3,6 @@
 A task's summary is modality -> method or control -> cell (``scores.summarise``).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -9,8 +9,6 @@ narrow when a few seeds happen to agree, so an interval is never narrower than t
 their level with few groups, few seeds and groups of unequal size (benchmarks/calibration.py), which a bootstrap does not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -212,7 +210,7 @@ class _Variance:
     value: float
     freedom: float
 
-    def __add__(self, other: _Variance) -> _Variance:
+    def __add__(self, other: "_Variance") -> "_Variance":
         """The variance of a sum of independent terms, with Satterthwaite's degrees of freedom."""
         total, parts = self.value + other.value, [part for part in (self, other) if part.value]
         return _Variance(total, total**2 / sum(p.value**2 / p.freedom for p in parts) if parts else self.freedom)
@@ -253,8 +251,7 @@ def _p(mean: float, variance: _Variance) -> float:
     return 2 * float(stdtr(variance.freedom, -abs(mean) / variance.value**0.5))
 
 
-Cell = tuple[str, str, str]
-"""(task, modality, source)."""
+Cell = tuple[str, str, str]  # (task, modality, source)
 
 
 def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[dict[str, Any]]]:

@@ -3,8 +3,6 @@
 All statistics come from images without labels. Shapes: features [N, D].
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from functools import partial
@@ -25,12 +23,9 @@ from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, le
 from mvitac.transforms.preprocess import encoder_input
 
 Standardise = Literal["colours", "batch-norm", "features"]
-NUM_STATISTICS = 256
-"""Images of a sensor that statistics are taken from, at most."""
-MIN_GALLERY = 11
-"""Least number of presses for retrieval."""
-MAX_LOOKS = 4
-"""Known sensors in whose colours a new one is shown, at most."""
+NUM_STATISTICS = 256  # images of a sensor that statistics are taken from, at most
+MIN_GALLERY = 11  # least number of presses for retrieval
+MAX_LOOKS = 4  # known sensors in whose colours a new one is shown, at most
 
 
 def unlabelled_rows(pack: Pack, sensor: int, num: int = NUM_STATISTICS) -> np.ndarray:
@@ -57,17 +52,11 @@ def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> lis
 def touch_features(
     model: Model, pack: Pack, modality: str, rows: np.ndarray, standardise: tuple[Standardise, ...] = (), *, maps: bool
 ) -> np.ndarray:
-    """``features`` of pack rows, those of touch in the statistics of each row's own sensor.
+    """``features`` of pack rows (ascending), or ``maps`` [N, P, D]; those of touch by each sensor's statistics.
 
-    Args:
-        model: The model.
-        pack: The data.
-        modality: vision (nothing is changed) or touch.
-        rows: Pack rows, ascending.
-        standardise: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
-            each sensor. features: each sensor's features are standardised by their own mean and standard deviation.
-            colours: those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``.
-        maps: Return the trunk's last feature maps [N, P, D] instead of features [N, D].
+    ``standardise``: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
+    each sensor. features: each sensor's features are standardised by their own mean and standard deviation. colours:
+    those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``. Features of vision stay as they are.
     """
     if modality != "touch" or not standardise:
         return features(model, pack, modality, rows, maps=maps)
@@ -95,10 +84,7 @@ def touch_features(
 def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     """A copy of ``model`` whose touch encoder has the BatchNorm statistics of the touch images of ``rows``.
 
-    Source: Schneider et al., https://arxiv.org/abs/2006.16971.
-
-    Raises:
-        ValueError: If the encoder has no BatchNorm.
+    Source: Schneider et al., https://arxiv.org/abs/2006.16971. ValueError if the encoder has no BatchNorm.
     """
     made = copy.deepcopy(model)
     trunk = made.encoders["touch"]
@@ -148,9 +134,7 @@ class RecolouredPack(JoinedPack):
             raise ValueError("--standardise colours knows single images of one gel only: leave it out")
         self.new = {n for n, name in enumerate(self.sensor_names) if name not in learn.sensor_names}
         if not self.new:
-            raise ValueError(
-                f"--standardise colours: all sensors of {score.path} are in {learn.path} too, leave it out"
-            )
+            raise ValueError(f"--standardise colours: all sensors of {score.path} are in {learn.path}, leave it out")
         rows = np.bincount(self.sensors[: learn.num], minlength=len(self.sensor_names))
         old = np.argsort(-rows, kind="stable")[: min(len(learn.sensor_names), MAX_LOOKS)]
         learned = {number: _colours_of(self, number) for number in self.new}

@@ -7,8 +7,6 @@ instead of normalised within each image, because force is also in a feature's si
 Shapes: N or B rows, P places, D features, H heads, K classes or targets.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -21,12 +19,10 @@ from torch import Tensor, nn
 from mvitac.methods.supervised import ValueHead
 
 TRAINED = ("mlp", "attentive")
-STEPS = (100, 300, 1000)
-"""Candidate lengths of training. One is chosen on held-out groups of train."""
+STEPS = (100, 300, 1000)  # candidate lengths of training. One is chosen on held-out groups of train.
 BATCH, RATE, DECAY, MEMORY = 128, 1e-3, 0.01, 0.99
 """AdamW: rows per step, learning rate, weight decay. What is used is a running mean of the weights, with this memory."""
-HIDDEN = 512
-"""Hidden units of the MLP."""
+HIDDEN = 512  # hidden units of the MLP
 
 
 def fit_network(
@@ -38,21 +34,16 @@ def fit_network(
     their own. The final network is trained for as many steps on all rows.
 
     Args:
-        kind: mlp or attentive.
         x: Features [N, D] for mlp, maps [N, P, D] for attentive.
-        y: Labels [N], or values [N, K] with NaN = not measured.
-        num_val: Number of rows to choose on.
-        num_out: Number of classes or targets K.
-        seed: Seed of initial weights and batches.
+        y: Labels [N], or values [N, K] with NaN = not measured; ``num_out`` is the number of classes or targets K.
 
     Returns:
         A function from features or maps to logits [M, K], or values [M, K] in their units; and the number of steps.
     """
     build = partial(_network, kind, x, y, num_out, seed)
     answers, num = torch.from_numpy(y), len(x) - num_val
-    held = [
-        _loss_on(network, x[num:], answers[num:]) for network in _trained(build(), x[:num], answers[:num], STEPS, seed)
-    ]
+    networks = _trained(build(), x[:num], answers[:num], STEPS, seed)
+    held = [_loss_on(network, x[num:], answers[num:]) for network in networks]
     steps = STEPS[int(np.argmin(held))]
     (network,) = _trained(build(), x, answers, (steps,), seed)
     return partial(_outputs, network), steps
@@ -94,9 +85,7 @@ class Standardised(nn.Module):
         super().__init__()
         self.network = network
         places = x.reshape(-1, x.shape[-1])
-        parts = np.array_split(
-            places, -(-len(places) // 4096)
-        )  # fp16 maps of many rows would fill the memory as floats
+        parts = np.array_split(places, -(-len(places) // 4096))  # all rows' maps as floats may not fit
         mean = sum(part.sum(0, dtype=float) for part in parts) / len(places)
         std = np.sqrt(sum(((part - mean) ** 2).sum(0) for part in parts) / len(places))
         self.register_buffer("mean", torch.from_numpy(mean).float())

@@ -3,8 +3,6 @@
 Like accuracy, R2 is computed from sums over each test group, so that intervals can leave groups out (``scores``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -64,10 +62,9 @@ def score_values(y: np.ndarray, predicted: np.ndarray, groups: np.ndarray, targe
 
 def pool_values(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Pool the records of cross-validation folds, whose test groups differ, into the scores of all groups together."""
-    sums = {
-        name: [[x for part in parts for x in part["group_sums"][name][t]] for t in range(len(parts[0]["targets"]))]
-        for name in SUMS
-    }
+    num, sums = len(parts[0]["targets"]), {}
+    for name in SUMS:
+        sums[name] = [[x for part in parts for x in part["group_sums"][name][t]] for t in range(num)]
     points = [[pair for part in parts for pair in part["points"][t]] for t in range(len(parts[0]["targets"]))]
     targets = []
     for t, target in enumerate(parts[0]["targets"]):

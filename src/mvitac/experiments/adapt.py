@@ -4,8 +4,6 @@ First the running statistics of BatchNorm are estimated anew on the new data (ar
 goes on from its weights for a few steps. The result is a run like any other, with all scores in adapted.json.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +15,8 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import scratch
 from mvitac.evaluation.evaluate import check_channels, check_unseen
 from mvitac.evaluation.leaks import Scored, Source, read_sources
-from mvitac.evaluation.probe import cross_modal, probe_model, retrieved_rows, scorable, split_rows
+from mvitac.evaluation.probe import probe_model, scorable, split_rows
+from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.model import Model, load
 from mvitac.nn.initial import Init
 from mvitac.run import Run
@@ -58,23 +57,14 @@ def adapt(
     quiet: bool = False,
     say: Callable[[str], object] = print,
 ) -> dict[str, Any]:
-    """Adapt the model at ``ancestor`` to ``data``, and score both models on the new and on the old data.
+    """Adapt the model at ``ancestor`` (a run or an artifact) to ``data``, and score both on the new and the old data.
 
-    Args:
-        ancestor: Folder of a finished run, or of an artifact.
-        data: Data of the new sensor. Labels are only used for scores.
-        asked: How far.
-        out: Folder of the new run.
-        resume: Continue in ``out``.
-        quiet: Show no progress bar.
-        say: Called with lines of progress.
+    Labels are only used for scores. ``say`` is called with lines of progress. ValueError if the data does not fit the
+    model, or the model saw what would be scored.
 
     Returns:
-        The content of adapted.json: "records", each with "data" (what it was scored on), "source" (before or after), "task"
-        (R@5 for retrieval), "modality" (or direction) and its scores.
-
-    Raises:
-        ValueError: If the data does not fit the model, or the model saw what would be scored.
+        The content of adapted.json: "records", each with "data" (what it was scored on), "source" (before or after),
+        "task" (R@5 for retrieval), "modality" (or direction) and its scores.
     """
     check_out(out, resume)
     model, pack = load(ancestor), data.open(quiet=quiet)

@@ -10,8 +10,6 @@ Finished runs are skipped and interrupted ones resumed. A run whose loss became 
 kept as failed.json and named below the table.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,20 +38,11 @@ from mvitac.training.views import gel_mirror
 
 
 def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str = "auto") -> Work:
-    """The jobs of ``plan``, ordered by seed and then by row.
+    """The jobs of ``plan``, whose data is ``pack``, ordered by seed and then by row.
 
     Rows that need what the data lacks (labels, a camera) and rows equal to an earlier one are left out. A row may read
-    the same samples differently (difference images of touch), but not other samples.
-
-    Args:
-        plan: The plan; its data must be set.
-        pack: The plan's data.
-        out: Folder of the comparison.
-        session: How to score each run.
-        device: Device of every run.
-
-    Raises:
-        ValueError: If no row is possible, or ``out`` holds other runs.
+    the same samples differently (difference images of touch), but not other samples. ValueError if no row is possible,
+    or ``out`` holds other runs.
     """
     assert plan.data is not None
     chosen(pack, session)
@@ -107,18 +96,12 @@ def _same_samples(own: Pack, pack: Pack) -> Pack:
     """Return ``own`` if it has the samples, splits and labels of ``pack``."""
     for name in ("id", "group", "split", *(f"label_{task.name}" for task in pack.spec.tasks)):
         if name not in own.table.column_names or not np.array_equal(own.column(name), pack.column(name)):
-            raise ValueError(
-                f"its data {own.path} has another column {name} than {pack.path}: compare the same samples"
-            )
+            raise ValueError(f"its data {own.path} has another column {name} than {pack.path}: give the same samples")
     return own
 
 
 def gather(work: Work, out: Path, session: ProbeConfig) -> dict[str, Any]:
-    """Collect the finished runs and the controls into the result that tables are made from.
-
-    Raises:
-        ValueError: If no run is finished.
-    """
+    """Collect the finished runs and the controls into the result that tables are made from; ValueError without runs."""
     failed = {job.name: job.failure for job in work.jobs if job.failure}
     finished = [job for job in work.jobs if job.done and not job.failure]
     if not finished:
@@ -295,6 +278,5 @@ def _time_left(work: Work, todo: Sequence[Job], images: dict[str, int], measure:
     usual = statistics.fmean(1 / speed for found in speeds.values() for speed in found)
     paces = {label: statistics.fmean(1 / speed for speed in found) for label, found in speeds.items()}
     seconds = sum(images[job.label] * paces.get(job.label, usual) for job in todo)
-    return (
-        f"{len(todo)} runs left, about {duration(seconds)} of training one after another ({told}); scoring comes on top"
-    )
+    left = f"{len(todo)} runs left, about {duration(seconds)} of training one after another"
+    return f"{left} ({told}); scoring comes on top"

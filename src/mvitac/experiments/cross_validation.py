@@ -3,8 +3,6 @@
 Each fold has its own folder of runs and controls. A plan without folds is one fold with an empty name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +13,7 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
-from mvitac.evaluation.probe import MIN_GALLERY
+from mvitac.evaluation.retrieval import MIN_GALLERY
 from mvitac.evaluation.scores import pool
 from mvitac.experiments.collect import gather, lay_out
 from mvitac.experiments.jobs import Work
@@ -27,8 +25,7 @@ from mvitac.system.files import digest
 def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "auto") -> list[Work]:
     """The work of every fold of ``plan``. A row that one fold does not allow is left out of all.
 
-    Raises:
-        ValueError: If two folds test the same group, or no row is left.
+    ValueError if two folds test the same group, or no row is left.
     """
     works: list[Work] = []
     tested: dict[tuple[str, str], str] = {}
@@ -40,9 +37,8 @@ def lay_out_folds(plan: Plan, out: Path, session: ProbeConfig, device: str = "au
         work = lay_out(part, pack, out / fold, session, device)
         works.append(replace(work, jobs=[replace(job, fold=fold) for job in work.jobs]))
     left_out = {label: reason for work in works for label, reason in work.left_out.items()}
-    works = [
-        replace(work, jobs=[job for job in work.jobs if job.label not in left_out], left_out=left_out) for work in works
-    ]
+    keep = [[job for job in work.jobs if job.label not in left_out] for work in works]
+    works = [replace(work, jobs=jobs, left_out=left_out) for work, jobs in zip(works, keep, strict=True)]
     if not works[0].jobs:
         raise ValueError(f"plan {plan.name!r} has no row that all folds allow: {next(iter(left_out.values()))}")
     return works
@@ -74,9 +70,8 @@ def gather_folds(plan: Plan, works: Sequence[Work], out: Path, session: ProbeCon
     if len(results) == 1:
         return {**results[0], "plan": to_json(plan)}
     retrieval = [r for result in results for r in result["retrieval"] if r["num_groups"] >= MIN_GALLERY]
-    merged = {
-        key: [value for result in results for value in result[key]] for key in ("notes", "run_commits", "run_devices")
-    }
+    lists = ("notes", "run_commits", "run_devices")
+    merged = {key: [value for result in results for value in result[key]] for key in lists}
     return {
         **results[0],
         "plan": to_json(plan),

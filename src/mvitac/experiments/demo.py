@@ -1,7 +1,5 @@
 """``mvitac demo``: simulate materials, pre-train, probe, write a report. Resumable."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Sequence
@@ -26,15 +24,8 @@ from mvitac.training.loop import Interrupted, train
 def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     """Pre-train ``run`` with several seeds, probe the features, and write a report. Finished parts are not repeated.
 
-    Args:
-        run: The run of the first seed.
-        out: Folder for the runs (seed0, seed1, ...), probe.json (all scores), summary.json (task -> modality -> method or
-            control -> mean, low, high, seeds, groups) and report/.
-        num_seeds: Number of seeds.
-        console: Where progress is printed.
-
-    Returns:
-        Path of the report.
+    ``out`` gets the runs (seed0, seed1, ...), probe.json (all scores), summary.json (task -> modality -> method or
+    control -> mean, low, high, seeds, groups) and report/. Returns the path of the report's page.
     """
     if num_seeds < 1:
         raise ValueError(f"seeds {num_seeds}: give at least 1")

@@ -11,8 +11,6 @@ steps, then whether the heads start as linear probes (LP-FT, arXiv:2202.10054). 
 groups. A call that is repeated with ``resume`` continues.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -92,23 +90,14 @@ def finetune(
     quiet: bool = False,
     say: Callable[[str], object] = print,
 ) -> dict[str, Any]:
-    """Fine-tune the model at ``ancestor`` on the labels of ``data``, and score it next to what it must beat.
+    """Fine-tune the model at ``ancestor`` (a run or an artifact) on the labels of ``data``, and score it with controls.
 
-    Args:
-        ancestor: Folder of a finished run, or of an artifact.
-        data: The labelled data.
-        asked: What to train.
-        out: Folder for the runs and scores.
-        resume: Continue in ``out``.
-        quiet: Show no progress bars.
-        say: Called with lines of progress.
+    ``say`` is called with lines of progress. ValueError if the labels, the data and the model do not fit together, or
+    there are too few groups.
 
     Returns:
-        The content of scores.json: "records", each with its "fraction"; "chosen" (fraction -> source -> settings); "models"
-        (folders of the fine-tuned models of the last fraction); "leaks".
-
-    Raises:
-        ValueError: If the labels, the data and the model do not fit together, or there are too few groups.
+        The content of scores.json: "records", each with its "fraction"; "chosen" (fraction -> source -> settings);
+        "models" (folders of the fine-tuned models of the last fraction); "leaks".
     """
     check_place(out / "scores.json")
     if out.exists() and any(out.iterdir()) and not resume:
@@ -162,8 +151,7 @@ class _Job:
     asked: Finetuning
     model: Model
     pack: Pack
-    run: Run
-    """With all labels."""
+    run: Run  # with all labels
     tasks: tuple[AnyTask, ...]
     modality: str
     out: Path

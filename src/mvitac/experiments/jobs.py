@@ -4,8 +4,6 @@ Jobs can be killed at any time and resume. A run whose loss became NaN or infini
 failed.json. A run that fails otherwise is reported, and the next call tries it again.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
@@ -59,9 +57,8 @@ class Job:
     @property
     def asked(self) -> dict[str, Any]:
         """The probes, tasks and modalities to score, as stored with the scores."""
-        return to_json(
-            ProbeConfig(probes=self.session.probes, tasks=self.session.tasks, modalities=self.session.modalities)
-        )
+        asked = self.session
+        return to_json(ProbeConfig(probes=asked.probes, tasks=asked.tasks, modalities=asked.modalities))
 
     @property
     def failure(self) -> str:
@@ -136,9 +133,8 @@ def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -
         records = stress(load(job.out), pack, *chosen(pack, job.session))
         own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
         write_json(job.out / "stress.json", {"asked": job.asked, "records": [{**own, **record} for record in records]})
-    write_json(
-        job.out / "scores.json", {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
-    )
+    scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
+    write_json(job.out / "scores.json", scores)
     job.drop_checkpoint()
     return f"{seconds_of(job.out):.0f} s of training"
 
@@ -165,16 +161,8 @@ class _Reporter:
 def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Console | None = None) -> None:
     """Run the unfinished jobs, ``num_jobs`` at a time, each on its own GPU if there are several.
 
-    Args:
-        work: The jobs.
-        num_jobs: Number of parallel processes.
-        say: Receives a line about each job.
-        console: Shows progress and the time left; None shows nothing.
-
-    Raises:
-        Exception: The first error of a failed job, after all other jobs ran.
-        ValueError: If a process was killed.
-        Interrupted: After Ctrl-C, once the active runs have saved their checkpoints.
+    ``say`` receives a line about each job. The first error of a failed job is raised after all other jobs ran;
+    ValueError if a process was killed; Interrupted after Ctrl-C, once the active runs have saved their checkpoints.
     """
     todo = [job for job in work.jobs if not job.done]
     for job in work.jobs:
@@ -200,7 +188,7 @@ def do_all(work: Work, num_jobs: int, say: Callable[[str], None], console: Conso
         raise report.errors[0]
 
 
-def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: _Progress, *, quiet: bool) -> None:
+def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: "_Progress", *, quiet: bool) -> None:
     for job in todo:
         report.say(f"{job.name} ...")
         pack = work.pack if job.run.data == work.plan.data else None
@@ -209,7 +197,7 @@ def _one_by_one(work: Work, todo: Sequence[Job], report: _Reporter, progress: _P
         progress.update([])
 
 
-def _side_by_side(todo: Sequence[Job], num_jobs: int, report: _Reporter, progress: _Progress) -> None:
+def _side_by_side(todo: Sequence[Job], num_jobs: int, report: _Reporter, progress: "_Progress") -> None:
     gpus = torch.cuda.device_count()
     devices = [f"cuda:{i}" for i in range(gpus)] if gpus > 1 else ()
     with side_by_side(num_jobs, devices) as pool:

@@ -1,7 +1,5 @@
 """Plans that ship with the package: the paper's Tables I and II, the ablation, the recipes."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The description of a comparison: rows, tasks, probes, seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -14,10 +12,8 @@ from mvitac.registry import LATER, to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import parse_json
 
-Printed = dict[str, dict[str, float]]
-"""modality -> task -> top-1 accuracy in percent as printed in the paper."""
-ONE_ROW = "one row"
-"""Where the pairs of a run are from if its positives are views of the same image, as in the paper."""
+Printed = dict[str, dict[str, float]]  # modality -> task -> top-1 accuracy in percent as printed in the paper
+ONE_ROW = "one row"  # where the pairs of a run are from if its positives are views of the same image, as in the paper
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +35,7 @@ class Row:
 
     def __post_init__(self) -> None:
         if self.encoder and (self.method, self.recipe, self.set) != ("mvitac", None, {}):
-            raise ValueError(
-                f"row {self.label!r} has an encoder, which is not trained: leave out method, recipe and set"
-            )
+            raise ValueError(f"row {self.label!r} is an encoder, not trained: leave out method, recipe and set")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +99,7 @@ class Plan:
         if self.rows[labels.index(self.reference)].encoder:
             raise ValueError(f"reference {self.reference!r} is another's encoder: choose a row that is trained")
 
-    def only(self, labels: Sequence[str]) -> Plan:
+    def only(self, labels: Sequence[str]) -> "Plan":
         """The plan with only these rows and the reference; all rows if none is given."""
         known = [row.label for row in self.rows]
         for label in labels:
@@ -114,15 +108,14 @@ class Plan:
         wanted = {*labels, self.reference} if labels else set(known)
         return replace(self, rows=tuple(row for row in self.rows if row.label in wanted))
 
-    def in_folds(self) -> list[tuple[str, Plan]]:
+    def in_folds(self) -> "list[tuple[str, Plan]]":
         """(name, plan) of each fold; the plan itself with an empty name if it has no folds."""
         if not self.folds:
             return [("", self)]
         assert self.data is not None
         whole = recipe(self.recipe, self.data, phased=False)  # for its data alone
-        parts = [
-            {f"data.{k}": v for k, v in (setting(pair, "fold") for pair in fold.split(","))} for fold in self.folds
-        ]
+        pairs = [dict(setting(pair, "fold") for pair in fold.split(",")) for fold in self.folds]
+        parts = [{f"data.{name}": value for name, value in pair.items()} for pair in pairs]
         names = [slug(" ".join(str(value) for value in part.values())) for part in parts]
         if len(set(names)) < len(names):
             names = [slug(fold) for fold in self.folds]

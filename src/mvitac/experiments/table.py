@@ -1,7 +1,5 @@
 """A comparison's result as the lines and cells of a table."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,12 +24,9 @@ class Cell:
     printed: float | None
     difference: tuple[float, float, float, float | None] | None
     """To the reference row: mean, low, high, p (``paired_difference``)."""
-    leak: str = ""
-    """Which test rows were trained on (``evaluation.leaks``)."""
-    score: str = "accuracy"
-    """"accuracy", or "R2" of values."""
-    target: dict[str, Any] | None = None
-    """Unit, MAE and RMSE of one target (``target_lines``)."""
+    leak: str = ""  # which test rows were trained on (``evaluation.leaks``)
+    score: str = "accuracy"  # "accuracy", or "R2" of values
+    target: dict[str, Any] | None = None  # unit, MAE and RMSE of one target (``target_lines``)
 
 
 @dataclass(frozen=True)

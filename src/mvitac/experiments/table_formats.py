@@ -1,7 +1,5 @@
 """The table of a comparison as Markdown, LaTeX, CSV and a figure."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -342,8 +340,6 @@ def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
     panels: dict[str, list[Dot]] = {}
     for line in lines:
         for task, cell in line.cells.items():
-            dot = Dot(
-                line.source, line.modality, cell.mean, cell.low, cell.high, cell.printed, line.control, cell.score
-            )
-            panels.setdefault(task, []).append(dot)
+            known = cell.mean, cell.low, cell.high, cell.printed, line.control, cell.score
+            panels.setdefault(task, []).append(Dot(line.source, line.modality, *known))
     return to_png(comparison(panels), dpi=110)

@@ -4,8 +4,6 @@ A ``Source`` opens, reads and closes; clocks, threads and faults are in ``live/s
 [H, W, 3].
 """
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from abc import ABC, abstractmethod
@@ -28,10 +26,8 @@ class Ended(Exception):
 class Source(ABC):
     """A source of frames. ``read`` raises OSError if the device is gone, ValueError for one damaged frame."""
 
-    fps: float = 30.0
-    """Nominal rate."""
-    paced: bool = True
-    """Whether ``read`` itself waits for the next frame."""
+    fps: float = 30.0  # nominal rate
+    paced: bool = True  # whether ``read`` itself waits for the next frame
 
     @abstractmethod
     def open(self) -> None: ...
@@ -181,15 +177,10 @@ MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d
 
 
 def source(text: str, modality: str) -> Source:
-    """The source that ``text`` names.
+    """The source that ``text`` names; ValueError if there is none, or its file cannot be read.
 
-    Args:
-        text: a camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` after it requests that mode), a video
-            file, a folder[@fps], or ``sim``[:seed].
-        modality: vision or touch, for a simulated sensor.
-
-    Raises:
-        ValueError: there is no such source, or its file cannot be read.
+    A camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` after it requests that mode), a video file, a
+    folder[@fps], or ``sim``[:seed] of this modality.
     """
     if text == "sim" or text.startswith("sim:"):
         seed = text.partition(":")[2] or "0"

@@ -1,7 +1,5 @@
 """Contact detection: the background of one touch sensor, and whether something touches it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +7,7 @@ from PIL import Image
 
 from mvitac.data.images import fit
 
-SIDE = 32
-"""Side in pixels of the small gray pictures in which contact is detected."""
+SIDE = 32  # side in pixels of the small gray pictures in which contact is detected
 
 
 @dataclass(frozen=True, kw_only=True)

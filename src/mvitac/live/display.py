@@ -3,8 +3,6 @@
 ``draw`` needs neither a display nor OpenCV, so it can be tested; ``Window`` needs both, and its error names the missing one.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from types import ModuleType
@@ -28,9 +26,8 @@ def draw(loop: Live) -> np.ndarray:
     width = SIDE * max(2, len(loop.all))
     touch = loop.touch or loop.last
     answers = loop.answers(touch)
-    picture = Image.new(
-        "RGB", (width, SIDE + LINE * (2 + len(loop.engine.classes) + sum(map(len, loop.engine.values.values())))), BACK
-    )
+    rows = 2 + len(loop.engine.classes) + sum(map(len, loop.engine.values.values()))
+    picture = Image.new("RGB", (width, SIDE + LINE * rows), BACK)
     pen, face = ImageDraw.Draw(picture), font(13)
     for i, stream in enumerate(loop.all):
         left, state = i * SIDE, loop.state(stream)

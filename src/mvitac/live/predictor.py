@@ -7,8 +7,6 @@ frame. Time comes from a clock passed as an argument.
 Shapes: frames uint8 RGB [H, W, 3].
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections import Counter
@@ -34,11 +32,9 @@ class Reading:
     name: str
     unit: str
     value: float
-    spread: float
-    """Root mean squared error of test rows whose prediction was in the range of ``value``."""
+    spread: float  # root mean squared error of test rows whose prediction was in the range of ``value``
     low: float
-    high: float
-    """Lowest and highest value of the touch so far."""
+    high: float  # lowest and highest value of the touch so far
 
     def __str__(self) -> str:
         return f"{self._digits(self.value)} {self.unit} +- {self._digits(self.spread)}"
@@ -62,10 +58,8 @@ class Touch:
     end: float | None = None
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
-    values: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    """task -> newest, lowest and highest values [T]."""
-    known: list[str] = field(default_factory=list)
-    """The most similar known touches, if there is an index."""
+    values: dict[str, list[np.ndarray]] = field(default_factory=dict)  # task -> newest, lowest and highest values [T]
+    known: list[str] = field(default_factory=list)  # the most similar known touches, if there is an index
 
     def add(self, probabilities: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
@@ -95,25 +89,17 @@ class Live:
         record: Callable[[dict[str, np.ndarray], dict[str, Any]], None] | None = None,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> None:
-        """
-        Args:
-            engine: the exported model.
-            streams: one stream per camera and sensor, by modality; two touch sensors are stacked in channels.
-            config: contact detection and display.
-            clock: time in seconds, that of the streams.
-            nearest: turns the engine's outputs into descriptions of known touches.
-            record: called with every pair that was used (images, columns).
-            tell: called with every fault as it happens, in the thread that noticed it.
+        """``streams``: one per camera and sensor, by modality; two touch sensors are stacked in channels.
 
-        Raises:
-            ValueError: the engine takes other inputs.
+        ``clock`` is that of the streams, in seconds. ``nearest`` turns the engine's outputs into descriptions of known
+        touches. ``record`` is called with every pair that was used (images, columns), ``tell`` with every fault as it
+        happens, in the thread that noticed it. ValueError if the engine takes other inputs.
         """
         _check_inputs(engine, streams)
         self.engine, self.streams, self.config, self.clock = engine, streams, config, clock
         self.nearest, self.record, self.tell = nearest, record, tell
         self.all = [s for several in streams.values() for s in several]
-        self.leading = (streams.get("touch") or streams["vision"])[0]
-        """The stream whose new frames start predictions."""
+        self.leading = (streams.get("touch") or streams["vision"])[0]  # the stream whose new frames start predictions
         _check_window(engine)
         self.minus_rest = engine.difference or _minus_first(engine)
         """Whether the learned background is subtracted from touch."""
@@ -154,10 +140,8 @@ class Live:
             self._lose(now)
             return False
         self.contact = self._contact(frames.get("touch", []))
-        images = {
-            m: np.concatenate([fit(f.image, self.engine.inputs[m][0]) for f in found if f], axis=2)
-            for m, found in frames.items()
-        }
+        seen = {m: [fit(f.image, self.engine.inputs[m][0]) for f in found if f] for m, found in frames.items()}
+        images = {m: np.concatenate(several, axis=2) for m, several in seen.items()}
         if self.contact:
             self._predict(frames, images, now)
         else:

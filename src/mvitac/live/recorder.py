@@ -1,8 +1,6 @@
 """Record live input: pairs are written to a temporary folder, the spool, and become a pack or a LeRobotDataset at the end
 (after a crash: later, by ``mvitac live --finish``)."""
 
-from __future__ import annotations
-
 import io
 import shutil
 from collections.abc import Callable, Sequence
@@ -18,8 +16,7 @@ from mvitac.datasets.lerobot.writer import check_fps, write_lerobot
 from mvitac.registry import from_json, to_json
 from mvitac.system.files import check_place, digest_file, read_json, write_atomic, write_json
 
-SPOOL = 64
-"""Pairs per file of the spool: the number that a crash can lose."""
+SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
 
 class Recorder:
@@ -28,15 +25,9 @@ class Recorder:
     def __init__(
         self, out: Path, channels: dict[str, int], *, fps: float = 10.0, form: Literal["pack", "lerobot"] = "pack"
     ) -> None:
-        """
-        Args:
-            out: the new folder.
-            channels: number of channels C by modality, of images uint8 [S, S, C].
-            fps: maximum number of pairs per second; a whole number for lerobot.
-            form: format of ``out``.
+        """Record into the new folder ``out``; ``channels``: modality -> C of its images, uint8 [S, S, C].
 
-        Raises:
-            ValueError: ``out`` exists or cannot be written, or ``fps`` is not possible.
+        ``fps`` is the maximum number of pairs per second, a whole number for lerobot.
         """
         if not fps > 0:
             raise ValueError(f"fps {fps:g}: give pairs a second, more than 0")

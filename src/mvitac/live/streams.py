@@ -4,8 +4,6 @@ A ``Stream`` keeps the newest frame of its source (``live/cameras.py``), counts 
 comes from a clock passed as an argument, so tests use a fake one. Frames are uint8 RGB [H, W, 3].
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter, deque
@@ -52,15 +50,10 @@ class Stream:
         frozen_after: float = 1.0,
         retry_every: float = 1.0,
     ) -> None:
-        """
-        Args:
-            name: the stream's name in events.
-            origin: where frames come from.
-            clock: time in seconds.
-            tell: called with every event, in the thread that noticed it.
-            stale_after: age in seconds from which a frame is no longer used.
-            frozen_after: seconds for which pictures may be identical to the last byte.
-            retry_every: seconds between attempts to open a lost device.
+        """``tell`` is called with every event, in the thread that noticed it. Times are in seconds.
+
+        A frame older than ``stale_after`` is no longer used, pictures may be identical to the last byte for
+        ``frozen_after``, and a lost device is tried again ``retry_every``.
         """
         self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
         self.stale_after, self.frozen_after, self.retry_every = stale_after, frozen_after, retry_every

@@ -3,8 +3,6 @@
 Shapes: B images in a batch, V views of each image, C channels, H x W pixels, D features.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
@@ -168,17 +166,7 @@ class MethodConfig(Registered, ABC):
         share: tuple[str, ...] = (),
         width: tuple[str, ...] = (),
     ) -> None:
-        """Check the ranges of the named fields.
-
-        Args:
-            positive: Fields that must be > 0.
-            weight: Fields that must be >= 0.
-            share: Fields that must be in [0, 1], or None.
-            width: Fields that must be from 1 to 65536.
-
-        Raises:
-            ValueError: For the first field out of range.
-        """
+        """Check that ``positive`` fields are > 0, ``weight`` >= 0, ``share`` in [0, 1] or None, ``width`` 1 to 65536."""
         for name in positive:
             if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
                 raise ValueError(f"{name} {getattr(self, name)}: give a positive number")

@@ -4,8 +4,6 @@ The online tower and a predictor q predict, from one view, the momentum (target)
 both directions: L = |q(z) - z'|^2 of normalised vectors = 2 - 2 cos. The predictor and the moving target prevent collapse.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -38,7 +36,7 @@ class BYOLConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> BYOL:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "BYOL":
         return BYOL(self, spec, encoder)
 
 
@@ -63,11 +61,8 @@ class BYOL(Contrastive):
         self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.online.items()})
 
     def queries(self, batch: Views) -> Embeddings:
-        return {
-            ("q", m, i): self.predictor[m](online(batch.images[m][i]))
-            for m, online in present(self.online, batch)
-            for i in (0, 1)
-        }
+        z = {(m, i): online(batch.images[m][i]) for m, online in present(self.online, batch) for i in (0, 1)}
+        return {("q", m, i): self.predictor[m](found) for (m, i), found in z.items()}
 
     def keys(self, batch: Views) -> Embeddings:
         return {("k", m, i): target(batch.images[m][i]) for m, target in present(self.target, batch) for i in (0, 1)}

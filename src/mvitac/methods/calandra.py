@@ -5,8 +5,6 @@ concatenated pooled features, and linear layers 512 - 256 - classes with ReLU be
 https://github.com/facebookresearch/tacto, experiments/grasp_stability). Streams share no weights.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -16,8 +16,6 @@ https://github.com/fredfyyang/Touch-and-Go (train_CMC_touch.py: K 16384, tau .07
 Shapes: N rows of training data, B in a batch, K negatives, D = 128.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar, cast
 
@@ -33,8 +31,7 @@ from mvitac.nn.memory_bank import Bank
 from mvitac.registry import formerly
 from mvitac.system.distributed import World
 
-EPS = 1e-7
-"""Added to both denominators, as in the reference code."""
+EPS = 1e-7  # added to both denominators, as in the reference code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,18 +67,16 @@ class CMCConfig(MethodConfig):
         limit = max(1, int(self.negatives_per_row * num_rows)) if self.negatives_per_row else self.num_negatives
         return min(self.num_negatives, limit)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> CMC:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "CMC":
         self.check_modalities(spec)
         return CMC(self, spec, encoder)
 
 
 def nce(scores: Float[Tensor, "B _"], noise: float, held: Bool[Tensor, "B _"]) -> Float[Tensor, ""]:
-    """This process's contribution to the NCE loss.
+    """This process's contribution to the NCE loss of normalised scores s, whose column 0 is the positive's.
 
-    Args:
-        scores: Normalised scores s; column 0 is the positive's.
-        noise: K / N, the density of the uniform noise times K.
-        held: Which of the scores come from bank rows of this process. The others are ignored.
+    ``noise`` is K / N, the density of the uniform noise times K. Scores that are not ``held`` are ignored: they come
+    from bank rows of other processes.
     """
     positive, negatives = scores[:, 0], scores[:, 1:]
     accepted = torch.log(positive / (positive + noise + EPS))
@@ -144,13 +139,10 @@ class CMC(Contrastive):
         return {"loss": vt + tv, "vt": vt, "tv": tv}
 
     def _contrast(self, query: Tensor, bank: Bank, place: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of one direction, and its normalisation constant Z.
+        """The loss of one direction, and its normalisation constant Z, for embeddings ``query`` [B, D].
 
-        Args:
-            query: [B, D] embeddings.
-            bank: Bank of the other modality.
-            place: [B, K + 1] rows of ``bank``; column 0 is the positive.
-            fixed: Z of earlier batches; 0 in the first batch.
+        ``place`` [B, K + 1] are rows of ``bank``, the other modality's; column 0 is the positive. ``fixed`` is Z of
+        earlier batches, 0 in the first.
         """
         dots, held = bank.dots(query, place)
         logits, world, num = dots / self.config.temperature, bank.world, self.config.negatives(len(self.rows))

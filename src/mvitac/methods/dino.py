@@ -13,8 +13,6 @@ first epoch, gradient clipping (owners: norm 3), a weight decay that rises from 
 methods), and their truncated-normal start of the MLP.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -64,7 +62,7 @@ class DINOConfig(MethodConfig):
             width=("out", "hidden"),
         )
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> DINO:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "DINO":
         return DINO(self, spec, encoder)
 
 
@@ -97,22 +95,17 @@ class DINO(Contrastive):
     def __init__(self, config: DINOConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.student = build_towers(
-            encoder, spec, lambda width: Prototypes(width, config.hidden, config.out, config.prototype_norm)
-        )
+        sizes = config.hidden, config.out, config.prototype_norm
+        self.student = build_towers(encoder, spec, lambda width: Prototypes(width, *sizes))
         self.teacher = nn.ModuleDict({m: Momentum(tower) for m, tower in self.student.items()})
         self.register_buffer("centre", torch.zeros(len(self.student), config.out))
         self.pending: Tensor | None = None
 
     def queries(self, batch: Views) -> Embeddings:
-        return {
-            ("student", m, i): tower(batch.images[m][i]) for m, tower in present(self.student, batch) for i in (0, 1)
-        }
+        return {("student", m, i): t(batch.images[m][i]) for m, t in present(self.student, batch) for i in (0, 1)}
 
     def keys(self, batch: Views) -> Embeddings:
-        return {
-            ("teacher", m, i): tower(batch.images[m][i]) for m, tower in present(self.teacher, batch) for i in (0, 1)
-        }
+        return {("teacher", m, i): t(batch.images[m][i]) for m, t in present(self.teacher, batch) for i in (0, 1)}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         config, losses, means = self.config, {}, []

@@ -22,8 +22,6 @@ in1k_vith14_ep300.yaml). Not implemented: the rising weight decay (here the reci
 Shapes: B images, N patches, K of them context, M target blocks of at most S patches, D features.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -83,7 +81,7 @@ class IJEPAConfig(MethodConfig):
                 raise ValueError(f"{name} {(low, high)}: give two rising numbers above 0, at most {top:g}")
         vit.check_predictor("predictor", self.predictor_width, self.predictor_depth)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> IJEPA:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "IJEPA":
         return IJEPA(self, spec, encoder)
 
     def ema_at(self, progress: float) -> float:
@@ -97,12 +95,11 @@ class Blocks:
     """Context and targets of each image, as patch numbers; unused places are filled with any patch."""
 
     context: Int[Tensor, "B K"]
-    in_context: Bool[Tensor, "B K"]
-    """Which places of ``context`` are used."""
+    in_context: Bool[Tensor, "B K"]  # which places of ``context`` are used
     targets: Int[Tensor, "B M S"]
     in_target: Bool[Tensor, "B M S"]
 
-    def each(self, num: int) -> Blocks:
+    def each(self, num: int) -> "Blocks":
         """Every image ``num`` times in a row."""
         found = (self.context, self.in_context, self.targets, self.in_target)
         return self if num == 1 else Blocks(*(tensor.repeat_interleave(num, 0) for tensor in found))
@@ -179,10 +176,9 @@ class IJEPA(Contrastive):
     def queries(self, batch: Views) -> Embeddings:
         """("predicted", modality) -> [B, M S, D], with the frames of a window one after another."""
         found = {m: self.blocks(batch, m) for m in self.trunks}
-        seen = {
-            m: vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
-            for m, (blocks, _) in found.items()
-        }
+        seen = {}
+        for m, (blocks, _) in found.items():
+            seen[m] = vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
         result: Embeddings = {}
         for modality, (blocks, grid) in found.items():
             other = next((seen[m] for m in seen if m != modality), None)

@@ -18,8 +18,6 @@ trunk's own).
 Shapes: B images, N patches of P values (pixels x channels), K of them visible, D features.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -33,8 +31,7 @@ from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, wi
 from mvitac.nn import vit
 from mvitac.nn.encoders import EncoderConfig
 
-EPS = 1e-6
-"""Added to the variance of a patch, as in the authors' code."""
+EPS = 1e-6  # added to the variance of a patch, as in the authors' code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +58,7 @@ class MAEConfig(MethodConfig):
             raise ValueError(f"mask_ratio {self.mask_ratio}: give a share between 0 and 1")
         vit.check_predictor("decoder", self.decoder_width, self.decoder_depth)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MAE:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MAE":
         return MAE(self, spec, encoder)
 
 
@@ -100,18 +97,16 @@ class MAE(Contrastive):
         for stream, (modality, trunk) in enumerate(self.trunks.items()):
             images = batch.images[modality][0]
             noise = vit.row_uniform(batch.seed, batch.rows, math.prod(vit.grid_of(trunk, images)), stream)
-            visible, hidden[modality] = (
-                at.repeat_interleave(vit.frames_of(trunk), 0) for at in split_patches(noise, self.config.mask_ratio)
-            )
+            parts = split_patches(noise, self.config.mask_ratio)
+            visible, hidden[modality] = (at.repeat_interleave(vit.frames_of(trunk), 0) for at in parts)
             seen[modality] = vit.encode_visible(trunk, images, visible)
         result: Embeddings = {}
         for modality, trunk in self.trunks.items():
             images = batch.images[modality][0]
             other = next((seen[m] for m in seen if m != modality), None)
             decoder = self.decoders[modality]
-            predicted = decoder(seen[modality], hidden[modality][:, None], vit.grid_of(trunk, images), other=other)[
-                :, 0
-            ]
+            size = vit.grid_of(trunk, images)
+            predicted = decoder(seen[modality], hidden[modality][:, None], size, other=other)[:, 0]
             with torch.autocast(images.device.type, enabled=False):
                 values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
                 error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2

@@ -10,8 +10,6 @@ No training code is public, so the exact margin loss could not be verified. The 
 normalised embeddings are our reading. The second modality of MCT was text; here, touch is augmented as an image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -28,8 +26,7 @@ from mvitac.nn.encoders import EncoderConfig
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 
-HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]
-"""Each has a queue."""
+HEADS = [(modality, head) for modality in ("vision", "touch") for head in ("intra", "inter")]  # each has a queue
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +47,7 @@ class MCTConfig(QueueConfig):
         super().__post_init__()
         self.check_fields(positive=("temperature",), weight=("margin", "lambda_inter"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MCT:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MCT":
         self.check_modalities(spec)
         return MCT(self, spec, encoder)
 

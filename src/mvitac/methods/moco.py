@@ -6,8 +6,6 @@ Not implemented: shuffled BatchNorm (section 3.3). Queries and keys of a batch a
 which can reveal the positive.
 """
 
-from __future__ import annotations
-
 from abc import ABC
 from dataclasses import dataclass
 from typing import ClassVar
@@ -64,7 +62,7 @@ class MoCoConfig(QueueConfig):
         super().__post_init__()
         self.check_fields(positive=("temperature",))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MoCo:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MoCo":
         return MoCo(self, spec, encoder)
 
 

@@ -16,8 +16,6 @@ Phi_t (touch, intra), Phi_v (touch, inter). In z_xy, x is the modality of the qu
 Shapes: images [B, C, H, W], features [B, D], embeddings z [B, 128].
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
@@ -119,7 +117,7 @@ class MViTacConfig(MethodConfig):
             mine = replace(mine, lambda_sensor=0.0)
         return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> MViTac:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MViTac":
         possible = possible_losses(spec)
         if not set(self.losses) & set(possible):
             raise ValueError(
@@ -168,9 +166,8 @@ class MViTac(Contrastive):
         super().__init__()
         self.config = config
         # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
-        self.query = nn.ModuleDict(
-            {m: Tower(config, encoder, spec.channels(m), spec.frames(m)) for m in spec.modalities}
-        )
+        towers = {m: Tower(config, encoder, spec.channels(m), spec.frames(m)) for m in spec.modalities}
+        self.query = nn.ModuleDict(towers)
         momentum = self.query if config.keys == "momentum" else {}
         running = config.key_norm == "running"
         self.key = nn.ModuleDict({m: Momentum(tower, running_norm=running) for m, tower in momentum.items()})
@@ -183,9 +180,8 @@ class MViTac(Contrastive):
     def keys(self, batch: Views) -> Embeddings:
         """Eq. 5, 7, 10, 13. End-to-end keys are the queries themselves, so there is nothing to add."""
         views = (1, 0) if self.config.both_ways else (1,)
-        return embed("k", self.key, batch, views, more=True) | {
-            ("both", m): positions for m, positions in batch.both.items()
-        }
+        z = embed("k", self.key, batch, views, more=True)
+        return z | {("both", m): positions for m, positions in batch.both.items()}
 
     def contrast(self, z: Embeddings) -> dict[str, Tensor]:
         k = "q" if self.config.keys == "end-to-end" else "k"

@@ -4,8 +4,6 @@ Each of the 2B views must identify the other view of its image among the 2B - 1 
 compared.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -38,7 +36,7 @@ class SimCLRConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(positive=("temperature",), width=("out", "hidden"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> SimCLR:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "SimCLR":
         return SimCLR(self, spec, encoder)
 
 

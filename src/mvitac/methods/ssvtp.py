@@ -9,8 +9,6 @@ the head (here linear), and whether the two directions are averaged (here) or su
 trains on spatially aligned DIGIT images. That belongs to its data and is not repeated here.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -37,7 +35,7 @@ class SSVTPConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(positive=("temperature",), width=("out",))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> SSVTP:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "SSVTP":
         self.check_modalities(spec)
         return SSVTP(self, spec, encoder)
 

@@ -8,8 +8,6 @@ from labels: its own heads are scored, and its frozen trunks are probed like tho
 From the weights of another run (``Run.init``) the same method is fine-tuning, of all weights or of a part of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Self
@@ -152,11 +150,7 @@ class SupervisedConfig(LabelledConfig):
         return rows[np.isin(pack.column("group")[rows].astype(str), kept if self.hold_out else [*kept, *held])]
 
     def _drawn_groups(self, pack: Pack, rows: np.ndarray) -> tuple[list[str], list[str]]:
-        """Names of the groups to learn from, and of those to choose settings on. A larger share adds to a smaller one.
-
-        Raises:
-            ValueError: If groups are to be held out, and there are too few.
-        """
+        """Names of the groups to learn from, and of those to choose settings on. A larger share adds to a smaller."""
         groups = pack.column("group")[rows].astype(str)
         order = np.random.default_rng(self.draw).permutation(np.unique(groups))
         tasks = self.tasks_of(pack.spec)
@@ -178,7 +172,7 @@ class SupervisedConfig(LabelledConfig):
             )
         return [name for name in drawn if name not in held], held
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "Supervised":
         trunks = {m: build_trunk(encoder, spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
         for m in trunks if self.train == "attentive" else ():
             trunks[m] = AttentivePool(trunks[m])

@@ -10,8 +10,6 @@ Embeddings Z, Z' [B, D] of two views, eq. 1-6:
 The factor 1/2 of the variance term is from the authors' code (https://github.com/facebookresearch/vicreg), not the paper.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -44,7 +42,7 @@ class VICRegConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(weight=("invariance", "variance", "covariance"), width=("hidden",))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> VICReg:
+    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "VICReg":
         return VICReg(self, spec, encoder)
 
 

@@ -1,7 +1,5 @@
 """Trunks (any timm model), their initial weights, and projection heads."""
 
-from __future__ import annotations
-
 import copy
 import difflib
 import math
@@ -26,10 +24,8 @@ from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
-MAP_SIDE = 7
-"""A feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px."""
-_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-"""Names of timm's files on the hub."""
+MAP_SIDE = 7  # a feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px
+_WEIGHTS = ("model.safetensors", "pytorch_model.bin")  # names of timm's files on the hub
 _VITS = ("timm.models.vision_transformer", "timm.models.deit", "timm.models.eva")
 """timm's files of ViTs that take images of any size ..."""
 _ANY_SIZE = {"dynamic_img_size": True, "dynamic_img_pad": True}
@@ -99,11 +95,9 @@ class EncoderConfig:
 def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Module:
     """Create a trunk that maps images [B, ``channels``, H, W] to pooled features [B, D]; ``trunk.num_features`` is D.
 
-    ``EncoderConfig.stem`` says how the first convolution of a pretrained trunk starts if there are not three channels. The
-    channels are those of all ``frames`` of a window together.
-
-    Raises:
-        ValueError: If the requested weights are not available. There is no silent fallback to random weights.
+    ``EncoderConfig.stem`` says how the first convolution of a pretrained trunk starts if there are not three channels.
+    The channels are those of all ``frames`` of a window together. ValueError if the requested weights are not
+    available: there is no silent fallback to random weights.
     """
     if frames == 1 or config.temporal == "stack":
         return use_products(_with_stem(config, channels))
@@ -205,9 +199,8 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
         if not Path(config.weights).is_file():
             raise ValueError(f"weights {config.weights!r}: give imagenet, scratch, or a file that exists")
         try:
-            return timm.create_model(
-                config.trunk, pretrained=True, pretrained_cfg_overlay={"file": config.weights}, **arguments
-            )
+            overlay = {"file": config.weights}
+            return timm.create_model(config.trunk, pretrained=True, pretrained_cfg_overlay=overlay, **arguments)
         except Exception as error:  # torch, safetensors and timm raise different types for an unsuitable file
             raise ValueError(f"{config.weights} does not hold weights for {config.trunk}: {brief(error)}") from None
     return _with_imagenet(config.trunk, arguments)
@@ -235,15 +228,8 @@ def timm_trunk(
 ) -> nn.Module:
     """A copy of an encoder from ``build_trunk`` as timm would have made it, with a ``pretrained_cfg`` of these values.
 
-    Args:
-        encoder: The encoder.
-        name: Name of its timm model.
-        input_size: Channels, height and width of its images.
-        mean: Mean of each channel.
-        std: Standard deviation of each channel.
-
-    Raises:
-        ValueError: If ``encoder`` is not a single timm model.
+    ``input_size`` is channels, height and width; ``mean`` and ``std`` are of each channel. ValueError if it is no
+    single timm model.
     """
     if not hasattr(encoder, "forward_features"):
         raise ValueError(f"this encoder is no single timm model but a {type(encoder).__name__}: use model.encoders")

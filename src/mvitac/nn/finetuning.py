@@ -3,8 +3,6 @@
 Shapes: B images, P places of a feature map, D features, O outputs of a layer and I inputs of each.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterable
 from typing import Literal
@@ -61,14 +59,11 @@ class AttentivePool(nn.Module):
 
 
 def train_part(trunk: nn.Module, part: Part, rank: int) -> None:
-    """Freeze all parameters of ``trunk`` but those of ``part``.
+    """Freeze all parameters of ``trunk`` but those of ``part``; ValueError if it does not name its stages.
 
     all: nothing is frozen. last-stage: the last stage of a timm model (layer4 of a ResNet, the last block of a ViT) and
     what follows it. lora: low-rank updates of every convolution and linear layer, and the affine parameters of
     normalisation layers. attentive: the pooling of an ``AttentivePool``. head: nothing of the trunk.
-
-    Raises:
-        ValueError: If the trunk does not name its stages.
     """
     if part == "all":
         return

@@ -3,8 +3,6 @@
 Shapes: O filters, C channels, h x w pixels of a kernel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -19,8 +17,7 @@ from mvitac.nn.encoders import PerFrame, stem_names
 from mvitac.nn.finetuning import AttentivePool
 from mvitac.nn.weights import read_safetensors, safetensors_digest
 
-MODEL = "model.safetensors"
-"""The file with the weights in the folder of a run or an artifact."""
+MODEL = "model.safetensors"  # the file with the weights in the folder of a run or an artifact
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,30 +43,20 @@ class Init:
 
     @property
     def file(self) -> Path:
-        """The file with the weights.
-
-        Raises:
-            ValueError: If there is none.
-        """
+        """The file with the weights; ValueError if there is none."""
         assert self.path is not None
         if self.path.is_file():
             return self.path
         if not self.path.is_dir():
-            raise ValueError(
-                f"init {self.path} does not exist: give the folder of a run or artifact, or a .safetensors"
-            )
+            raise ValueError(f"init {self.path} does not exist: give the folder of a run or artifact, or .safetensors")
         if not (self.path / MODEL).is_file():
             unfinished = (self.path / "checkpoint.pt").exists()
             why = "its run is not finished, continue it with --resume" if unfinished else "give that of a finished run"
             raise ValueError(f"init {self.path} is a folder without {MODEL}: {why}")
         return self.path / MODEL
 
-    def resolved(self) -> Init:
-        """The same with ``digest``.
-
-        Raises:
-            ValueError: If there are no such weights, or they are others than those of ``digest``.
-        """
+    def resolved(self) -> "Init":
+        """The same with ``digest``; ValueError if there are no such weights, or they have another digest."""
         if not self:
             return self
         found = _digest(self.file, self.file.stat().st_mtime_ns)
@@ -84,17 +71,10 @@ def _digest(file: Path, changed: int) -> str:
 
 
 def load_trunk(trunk: nn.Module, state: dict[str, Tensor]) -> None:
-    """Load the weights of a trunk from ``build_trunk`` or timm into another one.
+    """Load the weights of a trunk from ``build_trunk`` or timm into another one; ValueError if the networks differ.
 
-    The first convolution is adapted to the number of channels. A trunk that sees a window's frames one by one, and one that
-    sees a single image, take each other's weights.
-
-    Args:
-        trunk: The trunk, changed in place.
-        state: State dict of the other one.
-
-    Raises:
-        ValueError: If they are different networks; ``trunk`` is then unchanged.
+    The first convolution is adapted to the number of channels. A trunk that sees a window's frames one by one, and one
+    that sees a single image, take each other's weights.
     """
     inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
     if isinstance(trunk, AttentivePool) or "query" in state:  # a learned pooling starts anew

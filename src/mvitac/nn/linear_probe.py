@@ -3,8 +3,6 @@
 Shapes: B images, D features (a probe on both modalities reads vision, then touch, concatenated), K classes, T targets.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,8 +14,7 @@ from torch import Tensor, nn
 from mvitac.data.spec import Target
 from mvitac.registry import LATER
 
-UNSEEN = -1e4
-"""Logit of a class without training examples: probability 0 in fp32, and still finite in fp16."""
+UNSEEN = -1e4  # logit of a class without training examples: probability 0 in fp32, and still finite in fp16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +22,7 @@ class _Asked:
     """Task and modality of a probe."""
 
     task: str
-    modality: str
-    """touch, vision or both."""
+    modality: str  # touch, vision or both
 
     @property
     def name(self) -> str:
@@ -42,10 +38,8 @@ class ProbeInfo(_Asked):
     """Task, modality and test score of a probe of classes."""
 
     classes: tuple[str, ...]
-    accuracy: float
-    """Accuracy on the test split of the dataset it was trained on."""
-    majority: float
-    """Accuracy on the same rows of always predicting the most frequent class."""
+    accuracy: float  # accuracy on the test split of the dataset it was trained on
+    majority: float  # accuracy on the same rows of always predicting the most frequent class
     num_test: int
     leak: str = field(default="", metadata=LATER)
     """Which test rows the encoders were trained on, or "unknown" (``evaluation.leaks``)."""
@@ -62,10 +56,8 @@ class Error:
     r2: float
     mae: float
     rmse: float
-    edges: tuple[float, ...]
-    """Bounds [R - 1], ascending, between the R ranges of the predicted value."""
-    spread: tuple[float, ...]
-    """Root mean squared error [R] of the test rows whose prediction is in each range."""
+    edges: tuple[float, ...]  # bounds [R - 1], ascending, between the R ranges of the predicted value
+    spread: tuple[float, ...]  # root mean squared error [R] of the test rows whose prediction is in each range
 
     def __post_init__(self) -> None:
         if len(self.spread) != len(self.edges) + 1 or list(self.edges) != sorted(self.edges):
@@ -83,11 +75,9 @@ class ValueInfo(_Asked):
     """Task, modality and test errors of a probe of values."""
 
     targets: tuple[Target, ...]
-    errors: tuple[Error, ...]
-    """One for each target."""
+    errors: tuple[Error, ...]  # one for each target
     num_test: int
-    leak: str = field(default="", metadata=LATER)
-    """As for ``ProbeInfo``."""
+    leak: str = field(default="", metadata=LATER)  # as for ``ProbeInfo``
 
     def __post_init__(self) -> None:
         if not self.targets or len(self.errors) != len(self.targets):
@@ -101,57 +91,54 @@ class ValueInfo(_Asked):
 class LinearProbe(nn.Module):
     """softmax(features W^T + b) for classes; features W^T + b, in the units of the targets, for values.
 
-    Args:
-        question: What the probe predicts.
-        weight: [K, D] or [T, D], fp32.
-        bias: [K] or [T], fp32.
+    ``weight`` is [K, D] or [T, D], ``bias`` [K] or [T], both fp32.
     """
 
     weight: Tensor
     bias: Tensor
 
-    def __init__(self, question: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor) -> None:
+    def __init__(self, info: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor) -> None:
         super().__init__()
-        num = len(question.outputs)
+        num = len(info.outputs)
         if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
             raise ValueError(
-                f"probe {question.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
-                f" do not fit {num} {'classes' if isinstance(question, ProbeInfo) else 'targets'}: expected [{num}, D] and"
+                f"probe {info.name}: weights of shape {tuple(weight.shape)} and bias of shape {tuple(bias.shape)}"
+                f" do not fit {num} {'classes' if isinstance(info, ProbeInfo) else 'targets'}: expected [{num}, D] and"
                 f" [{num}]"
             )
         if weight.dtype != torch.float32 or bias.dtype != torch.float32:
-            raise ValueError(f"probe {question.name}: weights are {weight.dtype}, expected torch.float32")
+            raise ValueError(f"probe {info.name}: weights are {weight.dtype}, expected torch.float32")
         if not (weight.isfinite().all() and bias.isfinite().all()):
-            raise ValueError(f"probe {question.name}: its weights are not all finite")
-        self.question = question
+            raise ValueError(f"probe {info.name}: its weights are not all finite")
+        self.info = info
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)
 
     def forward(self, features: Tensor) -> Tensor:
         """Probabilities [B, K] or values [B, T] of ``features`` [B, D]."""
         found = nn.functional.linear(features, self.weight, self.bias)
-        return torch.softmax(found, dim=1) if isinstance(self.question, ProbeInfo) else found
+        return torch.softmax(found, dim=1) if isinstance(self.info, ProbeInfo) else found
 
 
-def from_logistic(question: ProbeInfo, model: Any, mean: np.ndarray, std: np.ndarray) -> LinearProbe:
+def from_logistic(info: ProbeInfo, model: Any, mean: np.ndarray, std: np.ndarray) -> LinearProbe:
     """Convert a scikit-learn ``LogisticRegression`` fitted on (x - mean) / std; the scaling is folded into the weights."""
     coef, intercept = np.asarray(model.coef_, float), np.asarray(model.intercept_, float)
     if len(coef) == 1:  # with two classes scikit-learn has one logit, that of the second class
         coef, intercept = np.concatenate([0 * coef, coef]), np.concatenate([0 * intercept, intercept])
-    num = len(question.classes)
+    num = len(info.classes)
     weight, bias = np.zeros((num, coef.shape[1])), np.full(num, UNSEEN)
     weight[model.classes_] = coef / std
     bias[model.classes_] = intercept - (coef / std) @ mean
-    return LinearProbe(question, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
+    return LinearProbe(info, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
 
 
-def constant(question: ProbeInfo, label: int, dim: int) -> LinearProbe:
+def constant(info: ProbeInfo, label: int, dim: int) -> LinearProbe:
     """A probe that always predicts class ``label``, for training data with a single class."""
-    bias = torch.full((len(question.classes),), UNSEEN)
+    bias = torch.full((len(info.classes),), UNSEEN)
     bias[label] = 0
-    return LinearProbe(question, torch.zeros(len(question.classes), dim), bias)
+    return LinearProbe(info, torch.zeros(len(info.classes), dim), bias)
 
 
-def from_ridge(question: ValueInfo, weight: np.ndarray, bias: np.ndarray) -> LinearProbe:
+def from_ridge(info: ValueInfo, weight: np.ndarray, bias: np.ndarray) -> LinearProbe:
     """A probe of values with these weights [T, D] and biases [T]."""
-    return LinearProbe(question, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
+    return LinearProbe(info, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())

@@ -1,7 +1,5 @@
 """Contrastive losses. Shapes: B queries, B keys, D dimensions. Row i of the keys is the positive of query i."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float

@@ -3,8 +3,6 @@
 Both are read in ``forward`` and written only in ``after_step``. Shapes: D dimensions, N rows, K places.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -19,10 +17,8 @@ from mvitac.system.distributed import World
 class Queue(nn.Module):
     """The latest K keys, L2-normalised. It starts with random directions, as in MoCo."""
 
-    keys: Tensor
-    """[K, D]."""
-    place: Tensor
-    """[1] int64: where the next key goes."""
+    keys: Tensor  # [K, D]
+    place: Tensor  # [1] int64: where the next key goes
 
     def __init__(self, size: int, width: int) -> None:
         super().__init__()
@@ -68,14 +64,11 @@ class Bank(nn.Module):
         return at if size == 1 else torch.where(at % size == rank, at // size, self.num_own)
 
     def find_drawn(self, at: Int[Tensor, "B K"]) -> Int[Tensor, "B k"]:
-        """Positions in ``values`` of those of the rows ``at`` that this process holds, padded with the spare row.
+        """Positions [B, k] in ``values`` of those of the rows ``at`` that this process holds, padded with the spare row.
 
-        Args:
-            at: K rows for each query, drawn uniformly.
-
-        Returns:
-            [B, k]. On one process k = K. On several, k is a little above K times the share of rows this process holds. A
-            query with more such rows loses the excess; the probability of that is below 1e-32 (Chernoff bound).
+        ``at`` are K rows for each query, drawn uniformly. On one process k = K. On several, k is a little above K times
+        the share of rows this process holds. A query with more such rows loses the excess; the probability of that is
+        below 1e-32 (Chernoff bound).
         """
         place, mean = self.find(at), at.shape[1] * self.num_own / self.num
         width = math.ceil(mean + 12 * mean**0.5 + 50)
@@ -88,15 +81,10 @@ class Bank(nn.Module):
     def dots(
         self, query: Float[Tensor, "B D"], place: Int[Tensor, "B K"]
     ) -> tuple[Float[Tensor, "B K"], Bool[Tensor, "B K"]]:
-        """Inner products of queries with bank rows.
+        """Inner products of queries with bank rows at positions ``place``, from ``find`` or ``find_drawn``.
 
-        Args:
-            query: The queries, the same on all processes.
-            place: Positions in ``values``, from ``find`` or ``find_drawn``.
-
-        Returns:
-            The inner products, and a mask that is False for the spare row, whose products have no meaning. Values computed
-            from the others must be summed over the processes with ``world.sum``.
+        The mask is False for the spare row, whose products have no meaning. Values computed from the others must be
+        summed over the processes with ``world.sum``.
         """
         # Multiply with all rows, then select the drawn ones: the same numbers as gathering B x K rows, in far less memory.
         return (self.world.spread(query) @ self.values.T).gather(1, place), place < self.num_own

@@ -1,7 +1,5 @@
 """The momentum copy of a module (paper eq. 1-3, after MoCo). It copies the whole module, so that no part is forgotten."""
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any
@@ -16,12 +14,10 @@ def momentum_at(progress: float, start: float, end: float | None) -> float:
 
 
 class Momentum(nn.Module):
-    """A frozen copy of a module that follows it: theta_k <- m theta_k + (1 - m) theta.
+    """A frozen copy of the module ``query`` that follows it: theta_k <- m theta_k + (1 - m) theta.
 
-    Args:
-        query: The module to copy.
-        running_norm: BatchNorm of the copy uses moving averages that follow the query's, instead of the statistics of the
-            batch. A key then depends on no other image of its batch (EMAN, Cai et al., CVPR 2021).
+    With ``running_norm``, BatchNorm of the copy uses moving averages that follow the query's, instead of the statistics
+    of the batch. A key then depends on no other image of its batch (EMAN, Cai et al., CVPR 2021).
     """
 
     def __init__(self, query: nn.Module, *, running_norm: bool = False) -> None:
@@ -30,7 +26,7 @@ class Momentum(nn.Module):
         self.running_norm = running_norm
         self._query = (query,)  # in a tuple, or its parameters would be listed here, too
 
-    def train(self, mode: bool = True) -> Momentum:
+    def train(self, mode: bool = True) -> "Momentum":
         return super().train(mode and not self.running_norm)
 
     @torch.no_grad()

@@ -1,7 +1,5 @@
 """Positions of the patches of a ViT as sines and cosines (Chen et al., MoCo v3, arXiv:2104.02057; MAE uses them too)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

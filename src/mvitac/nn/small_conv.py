@@ -7,16 +7,13 @@ slices of the tensors as they lie in memory; nothing is copied. The same sums in
 convolution to rounding (tests/nn/test_small_conv.py).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-MAX_PIXELS = 9
-"""Of the output map, up to which products are faster than the convolution."""
+MAX_PIXELS = 9  # of the output map, up to which products are faster than the convolution
 
 
 class SmallMapConv2d(nn.Conv2d):

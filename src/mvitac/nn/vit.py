@@ -4,8 +4,6 @@ Shapes: B images, F prefix tokens (class, registers), N patches of a grid [rows,
 D features.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -22,8 +20,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, PerFrame, build_trunk
 from mvitac.nn.positions import sin_cos_positions
 
-Senses = Literal["own", "both"]
-"""Whether a predictor sees tokens of its own modality, or of both."""
+Senses = Literal["own", "both"]  # whether a predictor sees tokens of its own modality, or of both
 Shape = tuple[int | None, int | None]
 _GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
 """The constants of SplitMix64 (Steele et al., OOPSLA 2014) as signed numbers."""
@@ -32,13 +29,8 @@ _GOLDEN, _MULTIPLIERS = -0x61C8864680B583EB, (-0x40A7B892E31B1A47, -0x6B2FB644EC
 def row_uniform(seed: Tensor, rows: Int[Tensor, " B"], num: int, stream: int) -> Float[Tensor, "B {num}"]:
     """Uniform numbers in [0, 1) that are a function of (seed, row, stream), on the device of ``rows``.
 
-    They are the same in whatever chunk, process or order a row is read. SplitMix64 hashes the numbers.
-
-    Args:
-        seed: Integer of the step, ``Views.seed``.
-        rows: Number of each row.
-        num: How many to draw for each row.
-        stream: Number of this use. Different uses draw different numbers.
+    They are the same in whatever chunk, process or order a row is read. SplitMix64 hashes the numbers. ``seed`` is
+    ``Views.seed``; each use has a ``stream`` of its own.
     """
     row_key = _hash(_hash(_hash(seed) + stream) + rows)
     key = _hash(row_key[:, None] + torch.arange(num, device=rows.device) * _GOLDEN)
@@ -76,10 +68,8 @@ def _plain(trunk: nn.Module, name: str, method: str) -> VisionTransformer:
 def build_vits(config: EncoderConfig, spec: DataSpec, method: str, senses: Senses) -> nn.ModuleDict:
     """A ViT per modality of ``spec``, or ``PerFrame`` of one, whose features are the mean over its patches.
 
-    The mean because no class token is trained here.
-
-    Raises:
-        ValueError: If the trunk is no plain ViT, or ``senses`` or ``config.temporal`` do not fit the data.
+    The mean because no class token is trained here. ValueError if the trunk is no plain ViT, or ``senses`` or
+    ``config.temporal`` do not fit the data.
     """
     if senses == "both" and len(spec.modalities) < 2:
         raise ValueError(
@@ -137,10 +127,8 @@ class Tokens:
     """Output tokens of a ViT that saw a part of the patches: its prefix tokens, then those patches."""
 
     values: Float[Tensor, "B F+K D"]
-    at: Int[Tensor, "B K"]
-    """The patch of each token after the prefix."""
-    live: Bool[Tensor, "B F+K"] | None = None
-    """Which of them count. None = all."""
+    at: Int[Tensor, "B K"]  # the patch of each token after the prefix
+    live: Bool[Tensor, "B F+K"] | None = None  # which of them count. None = all.
 
 
 def encode_visible(
@@ -220,14 +208,10 @@ class Predictor(nn.Module):
         live: Bool[Tensor, "B M T"] | None = None,
         other: Tokens | None = None,
     ) -> Float[Tensor, "B M T O"]:
-        """Predict each of M sets of hidden patches on its own.
+        """Predict each of M sets of ``hidden`` patches on its own, from the visible tokens ``seen`` and ``other``.
 
-        Args:
-            seen: The visible tokens, seen with every set.
-            hidden: The patches to predict.
-            grid: Rows and columns of the patches.
-            live: Which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the others.
-            other: Visible tokens of the other modality, if there is one.
+        ``live`` says which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the
+        others.
         """
         positions = sin_cos_positions(*grid, self.mask_token.shape[3], hidden.device)
         known, known_live = _placed(self.embed(seen.values), seen.at, positions), seen.live

@@ -3,8 +3,6 @@
 Check that camera and touch belong together, labels are right, colours look natural, and nothing is blank or upside down.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -34,18 +32,10 @@ class Strip:
 def strips(
     pack: Pack, by: str = "", *, split: str = "", num: int = 6, limit: int = 40, seed: int = 0
 ) -> tuple[list[Strip], int]:
-    """Choose random rows of each class or object.
+    """Choose random rows of each value of the task or column ``by`` (default: the first task, else the group).
 
-    Args:
-        pack: The data.
-        by: A task or a column. Default: the first task, else the group.
-        split: Only rows of this split.
-        num: Rows per strip. Rows of different groups (within one group: touches) come first.
-        limit: Largest number of strips.
-        seed: Random seed.
-
-    Returns:
-        The strips, and their number without ``limit``.
+    Of its ``num`` rows, those of different groups (within one group: touches) come first. Returns at most ``limit``
+    strips, and their number without it.
     """
     if split and split not in SPLITS:
         raise unknown("split", split, SPLITS)
@@ -118,10 +108,8 @@ def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128
 
     sections = []
     for number, strip in enumerate(found):
-        cards = [
-            html.figure(html.picture(pair(pack, int(r), side), caption(int(r)), side), caption(int(r)))
-            for r in strip.rows
-        ]
+        said = [(int(row), caption(int(row))) for row in strip.rows]
+        cards = [html.figure(html.picture(pair(pack, row, side), text, side), text) for row, text in said]
         sections.append((f"s{number}", heading(strip, pack), html.grid(cards)))
     left_out = f" {num_all - len(found)} more are not shown." * (num_all > len(found))
     head = f"<h1>{escape(pack.spec.name)}</h1>" + html.paragraph(

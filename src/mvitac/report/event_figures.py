@@ -1,7 +1,5 @@
 """Figures of events: the score of each frame over a recording, with threshold, alarm and onset."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import matplotlib
@@ -15,12 +13,9 @@ from mvitac.report.palette import colour
 
 @matplotlib.rc_context(STYLE)
 def traces(title: str, event: dict[str, Any], hue: str) -> Figure:
-    """Scores over time of some recordings with the event (above) and without it (below).
+    """Scores over time of some recordings with the ``event`` (above, in ``hue``) and without it (below).
 
-    Args:
-        title: Title of the figure.
-        event: What ``evaluation.events.score_event`` returned. Times in ms are drawn in seconds.
-        hue: Colour of the recordings with the event.
+    ``event`` is of ``evaluation.events.score_event``. Times in ms are drawn in seconds.
     """
     figure = Figure(figsize=(WIDTH, 4.4), layout="constrained")
     figure.suptitle(shorten(title, 44), color=colour("ink"), fontsize=10, fontweight="bold", x=0.02, ha="left")

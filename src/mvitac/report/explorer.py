@@ -1,7 +1,5 @@
 """The explorer: a local gradio page about a run's features. scatter.js draws the map, ``ExplorerData`` has the data."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -26,8 +24,7 @@ os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # no telemetry from 
 
 K = 6
 KEYS = "Arrow keys go from point to point, Enter shows its neighbours, + and - zoom, 0 resets."
-KEPT = (60, 600)
-"""Seconds between two deletions of uploaded pictures, and the age of those that are deleted."""
+KEPT = (60, 600)  # seconds between two deletions of uploaded pictures, and the age of those that are deleted
 MAP = (
     f'<div class="map"><canvas tabindex="0" role="application" aria-label="Map of features. {KEYS}"></canvas>'
     '<div class="tip" aria-live="polite"></div></div>'
@@ -69,11 +66,7 @@ def tip(land: ExplorerData, i: int) -> str:
 
 
 def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
-    """Build the page of one run, or of several runs side by side. All must show the same pack.
-
-    Args:
-        lands: Name of each run -> its data.
-    """
+    """Build the page of one run, or of several runs side by side (name -> its data). All must show the same pack."""
     first = next(iter(lands.values()))
     with gr.Blocks(title="mvitac explorer", delete_cache=KEPT) as blocks:
         gr.Markdown(f"### {as_text(' | '.join(lands))} on {as_text(first.pack.spec.name)}")

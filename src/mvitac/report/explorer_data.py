@@ -3,8 +3,6 @@
 Shapes: N rows of the pack, D features.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Sequence
@@ -15,7 +13,7 @@ import torch
 
 from mvitac.data.image_grid import side_by_side
 from mvitac.data.pack import Pack
-from mvitac.deploy.publish import with_readouts
+from mvitac.deploy.publish import with_probes
 from mvitac.deploy.search import check_pack, nearest
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
@@ -23,26 +21,16 @@ from mvitac.nn.linear_probe import ProbeInfo
 from mvitac.registry import unknown
 from mvitac.report.palette import COLOURS, MAP_HUES, ramp
 
-LEVELS = 32
-"""Number of colours between the lowest and the highest value."""
+LEVELS = 32  # number of colours between the lowest and the highest value
 
 
 class ExplorerData:
     """One run: pack rows ``rows`` [N], unit features ``x[modality]`` [N, D], predictions ``guess[task]`` [N]."""
 
     def __init__(self, model: Model, pack: Pack, *, limit: int = 20_000) -> None:
-        """Compute the features; fit probes on ``pack`` if the model has none.
-
-        Args:
-            model: The model.
-            pack: The data to show.
-            limit: Show a random sample of at most this many rows that have all images.
-
-        Raises:
-            ValueError: If the pack's images do not fit the model.
-        """
+        """Compute features of at most ``limit`` random rows that have all images; fit probes if the model has none."""
         names = check_pack(model, pack)
-        self.model, self.pack = with_readouts(model, pack), pack
+        self.model, self.pack = with_probes(model, pack), pack
         whole = np.flatnonzero(np.all([pack.has(m) for m in names], axis=0))
         if not len(whole):
             raise ValueError(f"{pack.path} has no row with {' and '.join(names)}: there is nothing to show")
@@ -59,13 +47,13 @@ class ExplorerData:
                 self.values[f"{target.name} ({target.unit})"] = found
         self.guess: dict[str, np.ndarray] = {}
         for task in tuple(self.classes):
-            readout = self.model.readouts.get(f"{task}.{self.modalities[-1]}")
-            if readout and isinstance(readout.question, ProbeInfo):
-                joined = np.concatenate([raw[m] for m in readout.question.modalities], axis=1)
+            probe = self.model.probes.get(f"{task}.{self.modalities[-1]}")
+            if probe and isinstance(probe.info, ProbeInfo):
+                joined = np.concatenate([raw[m] for m in probe.info.modalities], axis=1)
                 # Match classes by name: the probe may be of other data.
-                known = readout.question.classes
+                known = probe.info.classes
                 names = self.classes[task] = tuple(dict.fromkeys((*self.classes[task], *known)))
-                found = readout(torch.from_numpy(joined)).argmax(1).numpy()
+                found = probe(torch.from_numpy(joined)).argmax(1).numpy()
                 self.guess[task] = np.array([names.index(name) for name in known])[found]
         self._planes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -203,7 +191,7 @@ class ExplorerData:
         given = np.concatenate([image] * num, axis=2)
         pictures: dict[str, Any] = {modality: given}
         said = {}
-        if any(r.question.modality == modality for r in self.model.readouts.values()):
+        if any(r.info.modality == modality for r in self.model.probes.values()):
             found = self.model.predict(**pictures)
             for task, names in self.model.classes.items():
                 said[task] = dict(zip(names, found[task][0].tolist(), strict=True))

@@ -4,8 +4,6 @@ Every colour is one of ``COLOURS``. ``to_svg`` replaces it by the CSS variable o
 and a dark page. No pyplot: no global state, nothing to close.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import re
@@ -32,12 +30,9 @@ from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, c
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
 
-ONE_ANSWER = {"majority": ":", "mean": "--"}
-"""Controls that give one answer for all rows, and their lines."""
-LEAST = -0.5
-"""Where figures cut off R2, which has no lower limit."""
-WIDTH = 3.8
-"""Inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high."""
+ONE_ANSWER = {"majority": ":", "mean": "--"}  # controls that give one answer for all rows, and their lines
+LEAST = -0.5  # where figures cut off R2, which has no lower limit
+WIDTH = 3.8  # inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high.
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # class names may contain a dollar sign
     "font.size": 9,
@@ -80,11 +75,8 @@ def bars(
 ) -> Figure:
     """Horizontal bars in percent with 95 % whiskers. Methods have their modality's colour, controls are grey.
 
-    Args:
-        title: Title of the figure.
-        groups: Group (modality or direction) -> source -> mean, low and high, at most 1. ``low`` None: no whisker.
-        lines: Vertical lines across the bars of all groups, such as majority or chance.
-        what: Label of the axis.
+    ``groups``: modality or direction -> source -> mean, low and high, at most 1; ``low`` None: no whisker. ``lines``
+    are vertical ones across all groups, such as majority or chance. ``what`` labels the axis.
     """
     num_rows = sum(len(group) + 1.25 for group in groups.values())
     figure, axes = new_figure(title, 0.85 + 0.21 * num_rows)

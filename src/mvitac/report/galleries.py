@@ -3,8 +3,6 @@
 Shapes: features [N, D] of the rows shown; L2-normalised embeddings in the space that both modalities share [N, E].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -17,7 +15,7 @@ from torch import Tensor
 
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import features, sample
-from mvitac.evaluation.probe import shared_space
+from mvitac.evaluation.retrieval import shared_space
 from mvitac.report import figures, html
 from mvitac.report.sections import Study
 
@@ -46,13 +44,8 @@ def nearest_groups(
 ) -> list[Query]:
     """Find for each of ``rows`` the ``num`` groups with the nearest mean ``gallery`` embedding, as retrieval is scored.
 
-    Args:
-        query: Embeddings of the query modality [N, E].
-        gallery: Embeddings of the other modality [N, E].
-        groups: Group numbers 0 .. G-1 of the rows [N].
-        labels: Labels [N]; -1 = unlabelled, never "same class".
-        rows: The queries.
-        num: Number of groups to return per query.
+    ``query`` and ``gallery`` [N, E] are embeddings of the two modalities. ``groups`` [N] are numbered from 0. Rows with
+    label -1 are unlabelled and never "same class".
     """
     similarity = query @ diagnostics.group_means(gallery, groups).T  # [N, G]
     ranks = diagnostics.retrieval_ranks(query, gallery, groups)

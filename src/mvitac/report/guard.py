@@ -1,15 +1,12 @@
 """What the explorer's server lets in and what its pages may load."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 import socket
 from typing import Any
 from urllib.parse import urlsplit
 
-MAX_BODY = 20 << 20
-"""Bytes of one request, such as an uploaded image."""
+MAX_BODY = 20 << 20  # bytes of one request, such as an uploaded image
 POLICY = "; ".join(
     (
         "default-src 'self'",
@@ -36,10 +33,6 @@ class Guard:
     """ASGI middleware: refuses other names than this machine's, other origins, and large requests.
 
     A site that lets its name point to 127.0.0.1 (DNS rebinding) sends its own name as Host, so names are checked.
-
-    Args:
-        app: The application behind it.
-        host: Address that the server listens on.
     """
 
     def __init__(self, app: Any, host: str) -> None:

@@ -1,7 +1,5 @@
 """The colours of every figure and page."""
 
-from __future__ import annotations
-
 import numpy as np
 
 COLOURS: dict[str, tuple[str, str]] = {
@@ -26,8 +24,7 @@ COLOURS: dict[str, tuple[str, str]] = {
 }
 """Name -> colour on a light page and on a dark page. Hues after Okabe and Ito, distinct with any colour vision."""
 HUES = ("blue", "vermilion", "green", "amber", "purple", "sky", "olive", "brown")
-MAP_HUES = (*HUES, "ink", "indigo")
-"""Ten colours for the explorer's map: as many as an eye can tell apart."""
+MAP_HUES = (*HUES, "ink", "indigo")  # ten colours for the explorer's map: as many as an eye can tell apart
 MODALITY_HUES = {"touch": "blue", "vision": "vermilion", "both": "green"}
 CONTROL_GREYS = {"imagenet": "grey1", "untrained": "grey2", "pixels": "grey3", "border": "grey4"}
 

@@ -1,7 +1,5 @@
 """The report of finished runs as one HTML page: verdict, tables, curves, pictures, settings, cost. No network."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex
@@ -16,7 +14,8 @@ from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.probe import cross_modal, split_rows
+from mvitac.evaluation.probe import split_rows
+from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.score_text import covered, percent, score_name, with_interval
 from mvitac.evaluation.scores import summarise
 from mvitac.model import load
@@ -39,21 +38,12 @@ def write_report(
     pack: Pack | None = None,
     quiet: bool = False,
 ) -> Path:
-    """Write ``out``/report.html and ``out``/figures/*.png about finished runs on the same data.
+    """Write ``out``/report.html and ``out``/figures/*.png about finished runs on the same data, and return the page.
 
-    Args:
-        paths: Folders of the runs.
-        out: Folder to write to.
-        result: What ``probe_runs`` returned for these runs. Default: the probe.json in the first run's folder if it is
-            complete (``stored_result``), else probe here, with logistic regression, all tasks and all controls.
-        pack: Data to show instead of the runs' own.
-        quiet: Print no progress.
-
-    Returns:
-        Path of the page.
-
-    Raises:
-        ValueError: If a run is not finished, or ``result`` is about other runs or data.
+    ``result`` is what ``probe_runs`` returned for these runs. Default: the probe.json in the first run's folder if it
+    is complete (``stored_result``), else they are probed here, with logistic regression, all tasks and all controls.
+    ``pack`` is shown instead of the runs' own. ValueError if a run is not finished, or ``result`` is about other runs
+    or data.
     """
     paths = [Path(path) for path in paths]
     runs = open_runs(paths)
@@ -261,11 +251,10 @@ def _settings(study: Study) -> str:
         groups.setdefault(group or "run", []).append([name, "  |  ".join(values)])
     order = ["run", *(group for group in groups if group != "run")]
     shown = [page.table([group, ""], groups[group], words=True, label=group) for group in order]
-    records = "".join(
-        page.fold(f"{r.path / 'run.json'} in full", page.code(json.dumps(r.record, indent=1))) for r in study.runs
-    )
+    records = [(f"{r.path / 'run.json'} in full", json.dumps(r.record, indent=1)) for r in study.runs]
+    folded = "".join(page.fold(name, page.code(text)) for name, text in records)
     differ = page.paragraph("Where runs differ, all values are shown.") if len(study.runs) > 1 else ""
-    return f"{differ}{page.grid(shown, 'pillars')}{records}"
+    return f"{differ}{page.grid(shown, 'pillars')}{folded}"
 
 
 def _plain(value: Any) -> str:
@@ -316,11 +305,9 @@ def _cost(study: Study) -> str:
 
 def _again(study: Study) -> str:
     folders = [str(r.path) for r in study.runs]
-    lines = [
-        shlex.join(["mvitac", "pretrain", "--from", f"{folder}/run.json", "--out", f"{folder}-again"])
-        for folder in folders
-    ]
     again = [f"{folder}-again" for folder in folders]
+    pairs = zip(folders, again, strict=True)
+    lines = [shlex.join(["mvitac", "pretrain", "--from", f"{a}/run.json", "--out", b]) for a, b in pairs]
     lines += [shlex.join(["mvitac", "probe", *again]), shlex.join(["mvitac", "report", *again])]
     commits = {str(r.record.get("commit") or "")[:12] for r in study.runs}
     commit = f" at commit {commits.pop()}" if len(commits) == 1 and "" not in commits else ""

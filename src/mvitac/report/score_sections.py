@@ -1,7 +1,5 @@
 """Sections of the report about scores: every probe next to its controls, and predicted values against true ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sections of the report: retrieval, training curves, confusion matrices."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.probe import MIN_GALLERY
+from mvitac.evaluation.retrieval import MIN_GALLERY
 from mvitac.evaluation.score_text import columns_of, sources_of
 from mvitac.evaluation.scores import interval
 from mvitac.model import Model
@@ -22,8 +20,7 @@ from mvitac.report.palette import HUES, MODALITY_HUES
 from mvitac.run import Run
 from mvitac.system.files import write_atomic
 
-WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}
-"""The input of a probe, in words."""
+WORDS = {"touch": "touch", "vision": "vision", "both": "touch + vision"}  # the input of a probe, in words
 
 
 @dataclass(frozen=True)
@@ -137,11 +134,8 @@ def _loss_parts(study: Study, source: str, series: Sequence[tuple[Finished, list
     names = [name for name in series[0][1][0] if name not in _NOT_LOSS] if series else []
     if len(names) < 2:
         return []
-    lines = [
-        Line(name, *_column(entries, name), HUES[i % len(HUES)])
-        for i, name in enumerate(names)
-        for _, entries in series
-    ]
+    hues = {name: HUES[i % len(HUES)] for i, name in enumerate(names)}
+    lines = [Line(name, *_column(entries, name), hue) for name, hue in hues.items() for _, entries in series]
     batch, caption, chance = series[0][0].run.batch_size, "", {}
     if set(names) <= {"vv", "tt", "vt", "tv"}:  # InfoNCE has a known chance level
         chance = {f"guessing (ln {batch})": math.log(batch)}
@@ -181,10 +175,7 @@ def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
     def each(name: str) -> dict[str, tuple[str, str]]:
         return {f"{m}/{name}": (m, hue) for m, hue in MODALITY_HUES.items()}  # a curve that no log has is left out
 
-    across = {
-        f"{d} R@5": (d.replace("->", " → "), hue)
-        for d, hue in {"vision->touch": "green", "touch->vision": "purple"}.items()
-    }
+    across = {"vision->touch R@5": ("vision → touch", "green"), "touch->vision R@5": ("touch → vision", "purple")}
     probe = "Accuracy, or R2 of values; fitted on training rows, scored on held-out rows, never test."
     knn = "20 nearest training rows vote; held-out rows, never test."
     return [
@@ -255,8 +246,5 @@ def headline(study: Study, task: str) -> tuple[str, dict[str, Any], dict[str, di
     have = [m for m in columns_of(found) if source in found[m]]
     modality = "both" if "both" in have else max(have, key=lambda m: found[m][source]["mean"])
     beside = {**found.get("none", {}), **found[modality]}
-    return (
-        modality,
-        found[modality][source],
-        {s: beside[s] for s in sources_of(found) if s in beside and s not in study.sources},
-    )
+    controls = {s: beside[s] for s in sources_of(found) if s in beside and s not in study.sources}
+    return modality, found[modality][source], controls

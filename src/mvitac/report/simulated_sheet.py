@@ -1,7 +1,5 @@
 """Contact sheets of the simulators: everything they make, to check by eye."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Probe results as tables for a terminal 80 columns wide, and the rows that every table of results shares."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,8 +24,7 @@ from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 VALUE_PROBE_NAMES = {"linear": "ridge regression"}
-RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")
-"""Columns of a retrieval table, in percent."""
+RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")  # columns of a retrieval table, in percent
 EVENT = ("", "features", "detected %", "false alarms %", "alarm before onset", "AUROC")
 """Columns of a table of an event: shares of the recordings with and without it, and the median time."""
 
@@ -54,10 +51,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
         about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
         title = f"{result['data']}: {name} ({about})"
-        table = Table(title=title, title_justify="left", title_style="bold")
-        table.add_column(f"{score} %")
-        for modality in modalities:
-            table.add_column(modality, justify="right", no_wrap=True)
+        table = _table(title, f"{score} %", *modalities)
         for source in sources_of(task):
             # LEAK on a line of its own, else the table is too wide.
             table.add_row(source, *(cell_text(task, source, m).replace(" LEAK", "\nLEAK") for m in modalities))
@@ -65,12 +59,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         if score == "R2":
             console.print(_targets(name, task))
         if events := event_rows(task):
-            table = Table(title=event_title(name, task), title_justify="left", title_style="bold")
-            for column in EVENT:
-                table.add_column(column, justify="right" if column in EVENT[2:] else "left")
-            for row in events:
-                table.add_row(*row)
-            console.print(table)
+            console.print(_filled(event_title(name, task), EVENT, events))
     console.print(f"95 % intervals: {covered(result['group_by'], trained)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
@@ -80,11 +69,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
 
 def _targets(name: str, task: dict[str, Any]) -> Table:
     """R2 in percent and mean absolute error of each target."""
-    modalities = columns_of(task)
-    table = Table(title=f"{name}: R2 % and mean absolute error", title_justify="left", title_style="bold")
-    table.add_column("")
-    for modality in modalities:
-        table.add_column(modality, justify="right", no_wrap=True)
+    table = _table(f"{name}: R2 % and mean absolute error", "", *columns_of(task))
     rows = target_rows(task)
     above = "" if len({target for target, _, _ in rows}) > 1 else rows[0][0]  # the only target needs no row of its own
     for target, source, cells in rows:
@@ -131,14 +116,8 @@ def print_retrieval(result: dict[str, Any], console: Console) -> None:
     if not result["retrieval"]:
         return
     unseen = unseen_groups(result["group_by"], result["retrieval"])
-    table = Table(title=f"retrieval over {unseen}", title_justify="left", title_style="bold")
-    table.add_column("")
-    table.add_column("query -> found")
-    for column in RETRIEVAL:
-        table.add_column(f"{column} %", justify="right")
-    for row in retrieval_rows(result["retrieval"]):
-        table.add_row(*row)
-    console.print(table)
+    columns = ("", "query -> found", *(f"{column} %" for column in RETRIEVAL))
+    console.print(_filled(f"retrieval over {unseen}", columns, retrieval_rows(result["retrieval"])))
 
 
 def print_sensors(result: dict[str, Any], console: Console) -> None:
@@ -147,9 +126,7 @@ def print_sensors(result: dict[str, Any], console: Console) -> None:
         console.print(line, markup=False, highlight=False)
     if not result.get("sensors"):
         return
-    table = Table(title="touch sensors", title_justify="left", title_style="bold")
-    for column in ("", "", "%", "chance %"):
-        table.add_column(column)
+    table = Table("", "", "%", "chance %", title="touch sensors", title_justify="left", title_style="bold")
     for source, name in dict.fromkeys((r["source"], r["name"]) for r in result["sensors"]):
         found = [r for r in result["sensors"] if (r["source"], r["name"]) == (source, name)]
         shown = [percent(sum(r[key] for r in found) / len(found)) for key in ("score", "chance")]
@@ -223,6 +200,16 @@ def _table(title: str, first: str, *columns: str) -> Table:
     table = Table(first, title=title, title_justify="left", title_style="bold")
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
+    return table
+
+
+def _filled(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A table whose columns from the third on are numbers."""
+    table = Table(*columns[:2], title=title, title_justify="left", title_style="bold")
+    for column in columns[2:]:
+        table.add_column(column, justify="right")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 

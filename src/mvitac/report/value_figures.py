@@ -1,7 +1,5 @@
 """Figures of predicted values: predicted against true, the error by range of the true value, and values over time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -17,13 +15,9 @@ from mvitac.report.palette import CONTROL_GREYS, MODALITY_HUES, colour
 
 @matplotlib.rc_context(STYLE)
 def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str) -> Figure:
-    """Predicted against true values, with the line on which predictions are exact.
+    """Predicted against true values (``points`` [N, 2]: true, predicted), with the line on which predictions are exact.
 
-    Args:
-        title: Title of the figure.
-        points: Pairs of true and predicted value, [N, 2]. Predictions far outside the true range are drawn at the edge.
-        unit: Unit of both.
-        hue: Colour of the points.
+    Predictions far outside the true range are drawn at the edge.
     """
     figure, axes = new_figure(title, 3.5)
     true, guess = np.array(points, float).T
@@ -48,14 +42,9 @@ def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str
 
 @matplotlib.rc_context(STYLE)
 def error_ranges(title: str, ranges: Mapping[str, Sequence[Mapping[str, Any]]], unit: str, hue: str) -> Figure:
-    """Mean absolute error by range of the true value.
+    """Mean absolute error by range of the true value (``value_scores.error_by_range``), for each source.
 
-    Args:
-        title: Title of the figure.
-        ranges: Source -> its ranges (``value_scores.error_by_range``). The first is drawn in ``hue``, the others are
-            controls.
-        unit: Unit of values and errors.
-        hue: Colour of the first source.
+    The first source is drawn in ``hue``, the others are controls. ``unit`` is that of values and errors.
     """
     figure, axes = new_figure(title, 3.5)
     handles = {}
@@ -84,11 +73,8 @@ def error_ranges(title: str, ranges: Mapping[str, Sequence[Mapping[str, Any]]], 
 def over_time(predictions: Iterable[Mapping[str, Any]]) -> Figure:
     """Predicted values against time, one panel per value, with a band of the usual error. A line is one touch.
 
-    Args:
-        predictions: Lines of `mvitac live --predictions`: "time" in s, "touch", and by task the values with unit and spread.
-
-    Raises:
-        ValueError: If they have no values.
+    ``predictions`` are lines of `mvitac live --predictions`: "time" in s, "touch", and by task the values with unit and
+    spread. ValueError if they have no values.
     """
     panels: dict[tuple[str, str], dict[int, list[tuple[float, float, float]]]] = {}
     for line in predictions:

@@ -8,8 +8,6 @@ each grasp and independent of the outcome.
 Shapes: P rays (pixels times samples). Colours are linear RGB in [0, 1] until the last step. Units: metres, radians.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco
@@ -17,8 +15,7 @@ import numpy as np
 
 from mvitac.sim import objects
 
-SAMPLES = 2
-"""Rays per pixel along each axis."""
+SAMPLES = 2  # rays per pixel along each axis
 
 TABLES = ("plain", "checker", "planks", "marble", "dots")
 
@@ -30,31 +27,23 @@ VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 class View:
     """The random properties of one picture that are independent of the outcome."""
 
-    position: np.ndarray
-    """Camera position [3]."""
-    target: np.ndarray
-    """Point [3] in the centre of the picture."""
+    position: np.ndarray  # camera position [3]
+    target: np.ndarray  # point [3] in the centre of the picture
     roll: float
-    half_fov: float
-    """Tangent of half the field of view."""
-    lamp: np.ndarray
-    """Lamp position [3]."""
+    half_fov: float  # tangent of half the field of view
+    lamp: np.ndarray  # lamp position [3]
     lamp_color: np.ndarray
     ambient: float
     exposure: float
     table: str
-    table_colors: np.ndarray
-    """[2, 3]."""
+    table_colors: np.ndarray  # [2, 3]
     table_turn: float
     table_scale: float
-    wall_colors: np.ndarray
-    """[3, 3]: bottom, top, and a soft stain."""
-    wall_stain: np.ndarray
-    """Direction [3] of the stain."""
+    wall_colors: np.ndarray  # [3, 3]: bottom, top, and a soft stain
+    wall_stain: np.ndarray  # direction [3] of the stain
     gripper_color: np.ndarray
     gel_color: np.ndarray
-    clutter_poses: np.ndarray
-    """[clutter, 7]: position and quaternion; absent objects are far below the table."""
+    clutter_poses: np.ndarray  # [clutter, 7]: position and quaternion; absent objects are far below the table
     clutter_colors: np.ndarray
     noise: float
 

@@ -1,7 +1,5 @@
 """What physics knows of a press, as numbers to predict: depth, position and size of the contact."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -14,14 +12,10 @@ KNOWN = ("depth_mm", "contact_x_mm", "contact_y_mm", "patch_mm2")
 def contact(
     relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float
 ) -> dict[str, float]:
-    """Measure the contact that ``gel.press`` renders, before the membrane smooths it.
+    """Measure the contact that ``gel.press`` renders with these arguments, before the membrane smooths it.
 
-    Args:
-        relief_mm: Object height [H, W]; the other arguments are those of ``gel.press``.
-
-    Returns:
-        "depth_mm", the deepest indentation of the gel; "contact_x_mm" and "contact_y_mm", the centre of pressure, right
-        and down from the middle of the picture (NaN without contact); "patch_mm2", the area under pressure.
+    Returns "depth_mm", the deepest indentation of the gel; "contact_x_mm" and "contact_y_mm", the centre of pressure,
+    right and down from the middle of the picture (NaN without contact); "patch_mm2", the area under pressure.
     """
     p = pressure(
         relief_mm, force_n=force_n, stiffness=stiffness, pixel_mm=pixel_mm, dome_radius_mm=dome_radius_mm

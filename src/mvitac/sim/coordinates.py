@@ -1,7 +1,5 @@
 """Coordinates of the pictures of materials, and how they change between two moments of one press."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,21 +49,15 @@ class Motion:
     Object, lamp, clutter and sensor stay. The sizes were set by eye, for frames of a video some tenths of a second apart.
     """
 
-    turn: float
-    """Rotation of the camera in radians."""
-    shift: NDArray[np.float64]
-    """Shift of the camera picture (x, y) in parts of its width."""
-    zoom: float
-    """Factor of the camera's field of view."""
-    slip: NDArray[np.float64]
-    """Movement of the object over the gel (x, y) in mm."""
-    force: float
-    """Factor of the force, at least 1."""
-    noise: np.random.Generator
-    """Source of the pixel noise of both pictures."""
+    turn: float  # rotation of the camera in radians
+    shift: NDArray[np.float64]  # shift of the camera picture (x, y) in parts of its width
+    zoom: float  # factor of the camera's field of view
+    slip: NDArray[np.float64]  # movement of the object over the gel (x, y) in mm
+    force: float  # factor of the force, at least 1
+    noise: np.random.Generator  # source of the pixel noise of both pictures
 
     @classmethod
-    def draw(cls, *numbers: int) -> Motion:
+    def draw(cls, *numbers: int) -> "Motion":
         """Draw a motion that depends only on ``numbers``."""
         rng = np.random.default_rng(numbers)
         return cls(

@@ -26,8 +26,7 @@ __all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "background", "p
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
 Pair = tuple[float, float]
 
-GEL_STIFFNESS = 0.06
-"""Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm."""
+GEL_STIFFNESS = 0.06  # Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm
 
 MEMBRANE_MM = (0.12, 0.35, 0.9)
 """Radii over which the membrane bridges gaps (set by eye, from the halo around real imprints)."""
@@ -85,30 +84,19 @@ def press(
     dome_radius_mm: float | None = 25.0,
     gel_stiffness: float = GEL_STIFFNESS,
 ) -> F:
-    """Press an object into the gel.
+    """Press an object into the gel: the imprint [H, W] in mm.
 
     A soft object deforms, too, so its contact is wider, shallower and flatter at the same force.
 
     Args:
         relief_mm: Object height [H, W]; higher = nearer to the gel, -inf = no object.
-        force_n: Contact force in N.
         stiffness: Winkler modulus of the object in N/mm^3 (foam 0.01, wood above 10; 1e3 is rigid).
-        pixel_mm: Size of a pixel in mm.
-        dome_radius_mm: Radius of the gel's dome; None = flat. Real gels are domed; a flat pad on a flat face gives a nearly
-            blank picture.
+        dome_radius_mm: Radius of the gel's dome; None = flat. Real gels are domed; a flat pad on a flat face gives a
+            nearly blank picture.
         gel_stiffness: Winkler modulus of the gel in N/mm^3.
-
-    Returns:
-        The imprint [H, W] in mm.
     """
-    p = pressure(
-        relief_mm,
-        force_n=force_n,
-        stiffness=stiffness,
-        pixel_mm=pixel_mm,
-        dome_radius_mm=dome_radius_mm,
-        gel_stiffness=gel_stiffness,
-    )
+    gel: Any = {"dome_radius_mm": dome_radius_mm, "gel_stiffness": gel_stiffness}
+    p = pressure(relief_mm, force_n=force_n, stiffness=stiffness, pixel_mm=pixel_mm, **gel)
     return relax(p / np.float32(gel_stiffness), pixel_mm=pixel_mm)
 
 
@@ -131,21 +119,15 @@ def render(
     unit: int | None = None,
     gain: float = 1.0,
 ) -> NDArray[np.uint8]:
-    """Render an imprint as a sensor sees it.
+    """Render an imprint [H, W] in mm as a sensor sees it: uint8 [h, w, 3].
 
     Args:
-        imprint_mm: Imprint [H, W] in mm.
-        sensor: The sensor model.
         rng: Random generator of camera noise, and of the unit if `unit` is None.
-        pixel_mm: Size of a pixel in mm.
         shear_mm: Displacement (x, y) of the dots inside the contact.
         size: Output size (h, w), or one number for both; default: (H, W).
-        unit: Number of a physical copy of the sensor with its own dots, dirt, scratches and tint. Give it to render several
-            pictures with the same copy.
+        unit: Number of a physical copy of the sensor with its own dots, dirt, scratches and tint. Give it to render
+            several pictures with the same copy.
         gain: Factor of the colour response to slope (LED current, paint).
-
-    Returns:
-        The picture, uint8 [h, w, 3].
     """
     if imprint_mm.ndim != 2:
         raise ValueError(f"imprint_mm must be [H, W], got shape {imprint_mm.shape}: pass the result of press()")

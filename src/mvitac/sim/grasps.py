@@ -19,8 +19,6 @@ VERSION.
 Every item is a function of (seed, object, grasp).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -37,26 +35,21 @@ __all__ = ["NUM_GRASPS", "NUM_OBJECTS", "PHASES", "VERSION", "grasp", "object_na
 
 VERSION = 2
 NUM_OBJECTS = 106
-NUM_GRASPS = 50
-"""Grasps per object as in the original; larger indices are allowed."""
+NUM_GRASPS = 50  # grasps per object as in the original; larger indices are allowed
 
-FIELD_MM = 22.0
-"""Width of a gel's field of view."""
+FIELD_MM = 22.0  # width of a gel's field of view
 
-GRID = 144
-"""Smallest number of samples across a gel, because the relief is finer than the pixels of a small picture."""
+GRID = 144  # smallest number of samples across a gel, because the relief is finer than the pixels of a small picture
 
 SHEAR_MM_PER_N = 0.35
 SHEAR_LIMIT_MM = 1.2
 
-FAR = 0.25
-"""Fraction of grips that miss the centre of mass."""
+FAR = 0.25  # fraction of grips that miss the centre of mass
 
 EXPECTED_FRICTION = 0.5
 """The hand knows the weight of an object, not its friction; it presses as hard as this friction needs."""
 
-BEHIND_M = 3.0
-"""Rays start this far behind the pad, so that they are parallel to within 0.2 degrees."""
+BEHIND_M = 3.0  # rays start this far behind the pad, so that they are parallel to within 0.2 degrees
 
 # One random stream per purpose, so that sensor and picture size do not affect physics and camera.
 _PLAN, _VIEW, _TOUCH = 0x67A50, 0x67A51, 0x67A52
@@ -92,24 +85,21 @@ def grasp(
     phases: tuple[str, ...] = PHASES,
     measured: bool = False,
 ) -> list[dict[str, Any]]:
-    """Simulate one grasp.
+    """Simulate grasp number ``index`` of object number ``obj``.
 
     Args:
-        seed: Data seed.
-        obj: Number of the object.
-        index: Number of the grasp.
-        size: Side of the pictures in pixels.
         held_out_sensor: Use the sensor that is not used otherwise.
         phases: Phases to render; fewer are faster.
         measured: Also return what physics knows of the contact of each gel: ``contact.KNOWN`` and the shear force in N,
             right and down in the gel's picture, with names such as ``depth_left_mm`` and ``shear_x_right_n``.
 
     Returns:
-        A dict per phase with ``vision``, ``touch_left``, ``touch_right`` (uint8 [size, size, 3]), ``phase``, ``success``
-        (0 or 1, equal in all phases), the names ``object`` and ``sensor``, and numbers: the inputs (``mass_kg``,
-        ``friction``, ``force_n`` the set grip force, ``offset_mm`` from the centre of mass along the object, ``height_mm``
-        of the grip above it, ``yaw_deg``, ``peaks``, ``amplitude_mm``, ``softness``), the result (``lift_mm``,
-        ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in mm, a control).
+        A dict per phase with ``vision``, ``touch_left``, ``touch_right`` (uint8 [size, size, 3]), ``phase``,
+        ``success`` (0 or 1, equal in all phases), the names ``object`` and ``sensor``, and numbers: the inputs
+        (``mass_kg``, ``friction``, ``force_n`` the set grip force, ``offset_mm`` from the centre of mass along the
+        object, ``height_mm`` of the grip above it, ``yaw_deg``, ``peaks``, ``amplitude_mm``, ``softness``), the result
+        (``lift_mm``, ``unstable``) and the contact (``normal_*_n``, and ``contact_*``, the mean imprint of that gel in
+        mm, a control).
     """
     if not 0 <= obj < NUM_OBJECTS:
         raise ValueError(f"obj must be in 0..{NUM_OBJECTS - 1}, got {obj}")

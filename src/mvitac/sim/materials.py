@@ -25,17 +25,13 @@ from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS, Sensor
 
-VERSION = 1
-"""Stored in the pack. Increase it with every change of a pixel."""
+VERSION = 1  # stored in the pack. Increase it with every change of a pixel.
 
-SOFT_BELOW = 0.12
-"""Stiffness in N/mm^3 below which an instance is labelled soft."""
+SOFT_BELOW = 0.12  # stiffness in N/mm^3 below which an instance is labelled soft
 
 _TAG = 0x3A7
-_TOUCH_MM = 12.8
-"""Width of the gel's field of view."""
-_CAMERA_MM = 90.0
-"""Width of the camera's field of view at zoom 1."""
+_TOUCH_MM = 12.8  # width of the gel's field of view
+_CAMERA_MM = 90.0  # width of the camera's field of view at zoom 1
 MIN_SIZE, MAX_SIZE = 16, 512
 
 
@@ -46,14 +42,12 @@ class Material:
     name: str
     sight: str
     feel: str
-    colour: tuple[float, float, float]
-    """Mean reflectance; instances vary widely around it."""
+    colour: tuple[float, float, float]  # mean reflectance; instances vary widely around it
     wavelength_mm: tuple[float, float] = (0.9, 2.4)
     anisotropy: tuple[float, float] = (1.0, 1.3)
     irregularity: tuple[float, float] = (0.1, 0.6)
     gloss: tuple[float, float] = (0.0, 0.3)
-    soft: float = 0.5
-    """Fraction of soft instances (thin sheets on foam, panels on rubber, ...)."""
+    soft: float = 0.5  # fraction of soft instances (thin sheets on foam, panels on rubber, ...)
     rough: float = 0.5
 
 
@@ -106,8 +100,7 @@ class Instance:
     amplitude_mm: float
     gloss: float
     colour: NDArray[np.float32]
-    ink: NDArray[np.float32]
-    """Second colour, which follows the relief with either sign."""
+    ink: NDArray[np.float32]  # second colour, which follows the relief with either sign
     contrast: float
 
     @property
@@ -132,11 +125,8 @@ def draw_instance(seed: int, category: int, instance: int) -> Instance:
     decades = rng.uniform(0.1, 0.6) if soft else -rng.uniform(0.1, 1.6)
     asperity = rng.uniform(0.3, 0.85) * (1 if rough else -1)
     wavelength = np.exp(rng.uniform(*np.log(m.wavelength_mm)))
-    shared = {
-        "anisotropy": rng.uniform(*m.anisotropy),
-        "irregularity": rng.uniform(*m.irregularity),
-        "asperity": asperity,
-    }
+    shared = {"anisotropy": rng.uniform(*m.anisotropy), "irregularity": rng.uniform(*m.irregularity)}
+    shared["asperity"] = asperity
     ratio = rng.uniform(6.0, 9.0)
     tables = draw_tables(rng)
     mean = np.asarray(m.colour, np.float32)
@@ -167,18 +157,16 @@ def touch(
     sensors: Sequence[Sensor] = (),
     through: int = 0,
 ) -> dict[str, Any]:
-    """Simulate one pair.
+    """Simulate one pair, given the numbers of the data set, class, instance and touch.
 
     Args:
-        seed, category, instance, touch: Numbers of the data set, class, instance and touch.
-        size: Side of the pictures in pixels.
         held_out_sensor: Use the sensor that is not used otherwise; everything else is the same.
         background: Also return "background", the same copy of the sensor before contact.
         moment: 0, or the number of a later moment of the same press (`motion.Motion`).
         measured: Also return depth, position and size of the contact (`contact.KNOWN`).
         sensors: Sensors to choose from. Default: the known ones, or the held-out one.
-        through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs from
-            those of smaller numbers; the camera takes another picture.
+        through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs
+            from those of smaller numbers; the camera takes another picture.
 
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
@@ -353,9 +341,5 @@ def _feel(
     made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
     if background:  # rendered last, so that other pictures do not change
         made["background"] = draw(np.zeros_like(imprint))
-    return {
-        **made,
-        "sensor": sensor.name,
-        "force_n": force,
-        **(contact(relief, force_n=force, **physics) if measured else {}),
-    }
+    made |= {"sensor": sensor.name, "force_n": force}
+    return made | (contact(relief, force_n=force, **physics) if measured else {})

@@ -7,8 +7,6 @@ Frames: the gripper closes along x, an object's long side is along y, z is up an
 Shapes: N points. Units: metres, kilograms and newtons, except names that end in ``_mm``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,23 +16,17 @@ from mvitac.sim.skin import Finish, draw_finish
 OBJECT_TAG = 0x0B1EC7
 """First word of the seed sequence of object properties. Grasps use other tags, because trailing zeros are ignored."""
 
-PAD_HALF_M = 0.0115
-"""Half the side of a gel pad."""
+PAD_HALF_M = 0.0115  # half the side of a gel pad
 
-DOME_RADIUS_MM = 20.0
-"""Radius of curvature of the gels, in the physics and in the optics."""
+DOME_RADIUS_MM = 20.0  # radius of curvature of the gels, in the physics and in the optics
 
-PAD_DEPTH_M = PAD_HALF_M**2 / (DOME_RADIUS_MM / 1000)
-"""Half depth of the ellipsoid with this radius at its apex."""
+PAD_DEPTH_M = PAD_HALF_M**2 / (DOME_RADIUS_MM / 1000)  # half depth of the ellipsoid with this radius at its apex
 
-FINGER_M = (0.006, 0.009, 0.036)
-"""Half sizes of a finger's bar: thickness, width, height."""
+FINGER_M = (0.006, 0.009, 0.036)  # half sizes of a finger's bar: thickness, width, height
 
-OPEN_M = 0.047
-"""Distance of an open pad's apex from the hand's axis."""
+OPEN_M = 0.047  # distance of an open pad's apex from the hand's axis
 
-MASS_KG = 0.25, 0.7
-"""Smallest and largest mass of an object."""
+MASS_KG = 0.25, 0.7  # smallest and largest mass of an object
 
 CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045"), ("capsule", ".015 .05"))
 """MuJoCo types and sizes of the clutter."""
@@ -44,15 +36,11 @@ CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045")
 class Part:
     """One primitive of an object, in the object's frame."""
 
-    shape: str
-    """MuJoCo geom type: box, cylinder, capsule, ellipsoid or sphere."""
-    size: tuple[float, ...]
-    """MuJoCo half sizes in metres."""
+    shape: str  # MuJoCo geom type: box, cylinder, capsule, ellipsoid or sphere
+    size: tuple[float, ...]  # MuJoCo half sizes in metres
     center: tuple[float, float, float]
-    lying: bool = False
-    """Whether the geom's axis is y instead of z."""
-    density: float = 1.0
-    """Multiple of the object's density; above 1.2 the part is drawn as metal."""
+    lying: bool = False  # whether the geom's axis is y instead of z
+    density: float = 1.0  # multiple of the object's density; above 1.2 the part is drawn as metal
 
     def half(self) -> np.ndarray:
         """Return the half extents [3] of the axis-aligned box around the part."""
@@ -100,10 +88,8 @@ class Thing:
     kind: str
     parts: tuple[Part, ...]
     finish: Finish
-    density: float
-    """Kilograms per cubic metre (objects are mostly hollow)."""
-    softness: float
-    """0 = hard, 1 = foam-like: determines stiffness and the time constant of the contact."""
+    density: float  # kilograms per cubic metre (objects are mostly hollow)
+    softness: float  # 0 = hard, 1 = foam-like: determines stiffness and the time constant of the contact
 
     @property
     def mass(self) -> float:
@@ -229,8 +215,7 @@ _DRAW = {
     "dumbbell": _dumbbell,
 }
 """Shape kind -> function that draws its parts, which stand on z = 0."""
-KINDS = tuple(_DRAW)
-"""Shape kinds. Objects cycle through them, so that every split by object has all kinds."""
+KINDS = tuple(_DRAW)  # shape kinds. Objects cycle through them, so that every split by object has all kinds.
 
 
 def make_thing(seed: int, index: int) -> Thing:

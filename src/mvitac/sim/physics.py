@@ -5,8 +5,6 @@
 Frames and units as in :mod:`mvitac.sim.objects`: metres, kilograms, newtons, radians, seconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -17,18 +15,14 @@ from mvitac.sim import gel, objects
 
 PHASES = ("before", "during", "after")
 STEP_S = 0.002
-CHUNK = 5
-"""Time steps between changes of the set points."""
+CHUNK = 5  # time steps between changes of the set points
 
 SETTLE_S, CLOSE_S, LIFT_S, HOLD_S = 0.10, 0.30, 0.36, 0.24
-CLOSE_SPEED = 0.14
-"""Metres per second of each finger."""
+CLOSE_SPEED = 0.14  # metres per second of each finger
 
-HELD_PART = 0.7
-"""An object is lifted if its centre of mass has risen by this fraction of the hand's path."""
+HELD_PART = 0.7  # an object is lifted if its centre of mass has risen by this fraction of the hand's path
 
-RUNAWAY = 30.0
-"""A velocity (m/s or rad/s) that occurs only if the solver diverges."""
+RUNAWAY = 30.0  # a velocity (m/s or rad/s) that occurs only if the solver diverges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +45,7 @@ class Touch:
     """Contact forces on one gel."""
 
     normal_n: float
-    shear_n: tuple[float, float]
-    """Tangential force along x (right) and y (down) of the gel's picture."""
+    shear_n: tuple[float, float]  # tangential force along x (right) and y (down) of the gel's picture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +56,7 @@ class Moment:
     data: mujoco.MjData
     left: Touch
     right: Touch
-    success: int
-    """Valid at 'after'."""
+    success: int  # valid at 'after'
     rise_m: float
     unstable: int
 

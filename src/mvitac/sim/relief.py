@@ -216,14 +216,11 @@ class Relief:
 
     kind: str
     wavelength_mm: float
-    anisotropy: float = 1.0
-    """Stretch factor along the grain."""
-    irregularity: float = 0.2
-    """0: as regular as possible; 1: bent, uneven and covered with debris."""
+    anisotropy: float = 1.0  # stretch factor along the grain
+    irregularity: float = 0.2  # 0: as regular as possible; 1: bent, uneven and covered with debris
     asperity: float = 0.0
     """-1: plateaus with pits and grooves; +1: separate peaks. Skewness R_sk of surface metrology (ISO 21920-2)."""
-    tables: F
-    """Random numbers [4, 64, 64] of this instance."""
+    tables: F  # random numbers [4, 64, 64] of this instance
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

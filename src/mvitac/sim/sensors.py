@@ -16,36 +16,24 @@ class Sensor:
     """Appearance of one type of tactile sensor. Colours are 8-bit levels; u, v are -1 to 1 over the picture."""
 
     name: str
-    base: RGB
-    """Level far from the glow, per channel."""
+    base: RGB  # level far from the glow, per channel
     glow: tuple[tuple[float, float, float, float, float], ...]
     """Per channel (height in levels, centre u, centre v, width u, width v) of the soft bright spot of its LEDs."""
-    tilt: tuple[Pair, Pair, Pair]
-    """Linear change of level along (u, v), per channel."""
+    tilt: tuple[Pair, Pair, Pair]  # linear change of level along (u, v), per channel
     response: tuple[Pair, Pair, Pair]
     """Change of level per unit slope along (x, y), per channel: the direction of its LED."""
-    saturation: float = 75.0
-    """Change of level at which the response saturates."""
-    shadow: float = 0.35
-    """Fraction of light that a ridge takes from the surface behind it, seen from the LED."""
-    marker_pitch_mm: float = 0.0
-    """Distance between printed dots; 0 = no dots."""
+    saturation: float = 75.0  # change of level at which the response saturates
+    shadow: float = 0.35  # fraction of light that a ridge takes from the surface behind it, seen from the LED
+    marker_pitch_mm: float = 0.0  # distance between printed dots; 0 = no dots
     marker_radius_mm: float = 0.0
-    marker_jitter: float = 0.0
-    """Standard deviation of a dot's position, as a fraction of the pitch."""
-    marker_wear: float = 0.0
-    """0: round, complete dots; 1: irregular, half worn off."""
+    marker_jitter: float = 0.0  # standard deviation of a dot's position, as a fraction of the pitch
+    marker_wear: float = 0.0  # 0: round, complete dots; 1: irregular, half worn off
     marker_angle_deg: float = 0.0
-    dirt: float = 6.0
-    """Expected number of specks on the gel."""
-    scratches: float = 1.0
-    """Expected number of scratches in the paint."""
-    edge: float = 0.0
-    """Visibility of the lens edge: a dark rim with a thin bright line inside."""
-    noise: float = 1.5
-    """Standard deviation of the camera noise in levels."""
-    held_out: bool = False
-    """Not used for training data; it tests transfer to a new sensor."""
+    dirt: float = 6.0  # expected number of specks on the gel
+    scratches: float = 1.0  # expected number of scratches in the paint
+    edge: float = 0.0  # visibility of the lens edge: a dark rim with a thin bright line inside
+    noise: float = 1.5  # standard deviation of the camera noise in levels
+    held_out: bool = False  # not used for training data; it tests transfer to a new sensor
 
 
 SENSORS: dict[str, Sensor] = {
@@ -129,8 +117,7 @@ SENSORS: dict[str, Sensor] = {
     )
 }
 
-MARGIN = 0.25
-"""How far a random sensor may lie outside the four known ones: this part of their range, on either side."""
+MARGIN = 0.25  # how far a random sensor may lie outside the four known ones: this part of their range, on either side
 _TAG = 0x5E5
 
 

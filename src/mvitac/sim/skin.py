@@ -7,32 +7,25 @@ imprint distinguishes them.
 Shapes: N points, in millimetres in the object's frame (`objects.py`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
 PATTERNS = ("ribs", "knurl", "grain", "bumps")
 
-PEAKS = 0.76
-"""Fraction of patches with peaks."""
+PEAKS = 0.76  # fraction of patches with peaks
 
-GRIPS, SLIDES = 0.85, 0.3
-"""Friction coefficients against the gel for peaks and for pits."""
+GRIPS, SLIDES = 0.85, 0.3  # friction coefficients against the gel for peaks and for pits
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pattern:
     """A procedural texture in the object's frame, with few high and many low points."""
 
-    kind: str
-    """One of ``PATTERNS``."""
+    kind: str  # one of ``PATTERNS``
     wavelength_mm: float
-    waves: np.ndarray
-    """Unit directions [7, 3] of the pattern's waves."""
-    phases: np.ndarray
-    """Their phases [7] in radians."""
+    waves: np.ndarray  # unit directions [7, 3] of the pattern's waves
+    phases: np.ndarray  # their phases [7] in radians
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the pattern in [-1, 1] at points [N, 3] of the object's frame."""
@@ -53,12 +46,9 @@ class Finish:
     """Appearance of an object in the camera; it is independent of friction."""
 
     printed: Pattern
-    color: np.ndarray
-    """Linear RGB [3] of the body."""
-    accent: np.ndarray
-    """Linear RGB [3] of the print."""
-    gloss: float
-    """Strength of the highlight, 0..1."""
+    color: np.ndarray  # linear RGB [3] of the body
+    accent: np.ndarray  # linear RGB [3] of the print
+    gloss: float  # strength of the highlight, 0..1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,12 +56,9 @@ class Patch:
     """The skin under one grip. Its relief is visible to the gels, but too fine for the camera."""
 
     pattern: Pattern
-    peaks: bool
-    """Whether the pattern is raised, which grips, or sunk, which slides."""
-    amplitude_mm: float
-    """Half the height between lowest and highest points."""
-    friction: float
-    """Sliding friction coefficient against the gel."""
+    peaks: bool  # whether the pattern is raised, which grips, or sunk, which slides
+    amplitude_mm: float  # half the height between lowest and highest points
+    friction: float  # sliding friction coefficient against the gel
 
     def relief_mm(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the relief in mm at points [N, 3] of the object's frame."""

@@ -1,7 +1,5 @@
 """rich's console, which prints text as ``terminal.plain`` does."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

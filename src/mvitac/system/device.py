@@ -1,13 +1,10 @@
 """Which device a run computes on and in which precision, and their names for the record."""
 
-from __future__ import annotations
-
 import time
 
 import torch
 
-SIDE = 256
-"""Of the matrices in ``slowdown``: a product takes 10 ms where bf16 is 30 times as slow as fp32."""
+SIDE = 256  # of the matrices in ``slowdown``: a product takes 10 ms where bf16 is 30 times as slow as fp32
 
 
 def pick_device(name: str) -> torch.device:

@@ -10,8 +10,6 @@ If a memory bank is sharded, process r has rows r, r + size, ... (`shard`). Inpu
 operators f and g of Shoeybi et al., arXiv:1909.08053).
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from typing import Any

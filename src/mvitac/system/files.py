@@ -1,7 +1,5 @@
 """Atomic writes, reads with clear errors, digests of files."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hashlib
@@ -52,8 +50,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, sync: bool 
         raise
 
 
-_HERE = f"{zlib.crc32(platform.node().encode()):08x}"
-"""This machine, in the names of temporary files."""
+_HERE = f"{zlib.crc32(platform.node().encode()):08x}"  # this machine, in the names of temporary files
 _TEMPORARY = re.compile(r"\.(?P<name>.+?)\.((?P<machine>[0-9a-f]{8})-)?(?P<process>\d+)-\d+\.tmp")
 
 

@@ -1,7 +1,5 @@
 """File locks: one process per pack or run, and new folders. A lock is released even if its process is killed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
@@ -15,8 +13,7 @@ from filelock import FileLock, Timeout
 from mvitac.system.console import Console
 from mvitac.system.files import check_place, naming
 
-_held: ContextVar[frozenset[Path]] = ContextVar("_held", default=frozenset())
-"""Paths whose locks this thread holds."""
+_held: ContextVar[frozenset[Path]] = ContextVar("_held", default=frozenset())  # paths whose locks this thread holds
 
 
 class Busy(ValueError):
@@ -25,15 +22,10 @@ class Busy(ValueError):
 
 @contextmanager
 def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Iterator[None]:
-    """Hold the file lock ``<place>.lock``. A thread may hold the same lock twice.
+    """Hold the file lock ``<place>.lock`` of a pack or run. A thread may hold the same lock twice.
 
-    Locks work between machines if their shared file system supports them; otherwise nothing is locked.
-
-    Args:
-        place: Path of the pack or run.
-        busy: Message if another process holds the lock.
-        wait: Wait for the other process, after printing ``busy``; otherwise raise ``Busy``.
-        quiet: Do not print ``busy``.
+    Locks work between machines if their shared file system supports them; otherwise nothing is locked. If another
+    process holds it, ``wait`` for it after printing ``busy`` (unless ``quiet``), or raise ``Busy`` with that message.
     """
     place = place.absolute()
     if place in _held.get():
@@ -65,9 +57,7 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
 def new_folder(out: Path) -> Iterator[Path]:
     """Yield the new folder ``<out>.partial``. It is renamed to ``out`` at the end, or deleted after an error.
 
-    Raises:
-        Busy: If another process writes ``out``.
-        ValueError: If ``out`` exists or cannot be written.
+    Raises Busy if another process writes ``out``, ValueError if it exists or cannot be written.
     """
     check_place(out)
     busy = f"{out} is being written by another process: wait until it ends, or choose another place"

@@ -4,8 +4,6 @@ By default, glibc maps and unmaps each array over 128 KiB separately, and the ke
 allocates the same large arrays repeatedly spends a third of its time there (docs/speed.md).
 """
 
-from __future__ import annotations
-
 import ctypes
 import sys
 

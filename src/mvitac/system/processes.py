@@ -3,8 +3,6 @@
 Child processes end when the command's process ends, so a killed command can be started again immediately.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
@@ -99,16 +97,11 @@ def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> lis
 
 
 def in_branches(branches: Sequence[Callable[[], dict[Hashable, Tensor]]]) -> dict[Hashable, Tensor]:
-    """Run networks that are trained together in parallel threads, forward and backward.
+    """Run networks that are trained together in parallel threads, forward and backward; their tensors in one dict.
 
     Each gets its share of torch's threads. Two networks with one thread each use two cores better than one network with
     two threads, which wait for each other after every layer. In fp32 the results equal those of one thread bit for bit.
-
-    Args:
-        branches: Functions that share no parameters and draw no random numbers.
-
-    Returns:
-        The tensors of all branches in one dict.
+    The ``branches`` share no parameters and draw no random numbers.
     """
     one = torch.compiler.is_compiling() or len(branches) < 2 or torch.distributed.is_initialized()
     threads = 1 if one else torch.get_num_threads()  # torch.compile cannot ask for it

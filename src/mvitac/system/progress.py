@@ -6,8 +6,6 @@ file gets plain lines: the work, the time left after the first measured steps, a
 time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,11 +16,9 @@ from rich.text import Text
 
 from mvitac.system.console import Console
 
-WIDE = 120
-"""Terminal width from which all losses and a long bar are shown."""
-FIRST, OFTEN, SELDOM = 5.0, 10.0, 300.0
-"""Seconds before the first plain line, and the minimum and maximum between two."""
-_shown: list[Bars] = []
+WIDE = 120  # terminal width from which all losses and a long bar are shown
+FIRST, OFTEN, SELDOM = 5.0, 10.0, 300.0  # seconds before the first plain line, and the minimum and maximum between two
+_shown: "list[Bars]" = []
 
 
 class Bars(Progress):
@@ -151,16 +147,9 @@ def shown(console: Console | None = None, *, quiet: bool = False, **options: Any
 def work(
     what: str, total: int | None = None, unit: str = "", *, announce: bool = True
 ) -> Iterator[Callable[..., None]]:
-    """Show one piece of work.
+    """Show one piece of work of ``total`` units; yields a function to call with the number of finished ones.
 
-    Args:
-        what: Its name.
-        total: Number of units, if known.
-        unit: Name of the unit, e.g. "rows".
-        announce: Print a line at the start in a pipe or a file.
-
-    Yields:
-        A function to call with the number of finished units.
+    ``announce``: print a line at the start in a pipe or a file.
     """
     if not _shown:
         yield lambda num=1: None

@@ -1,7 +1,5 @@
 """Provenance of results: library versions, machine and git commit."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.metadata
 import os

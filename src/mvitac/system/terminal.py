@@ -1,7 +1,5 @@
 """Text for a terminal. Labels and file names may be a stranger's: their control characters are printed as "?"."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import sys

@@ -8,8 +8,6 @@ torch.save writes a zip archive. Its comment, at the end of the file, holds the 
 checkpoint before is kept as checkpoint.previous.pt until the run is finished, and used if this one is damaged.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io
@@ -27,10 +25,8 @@ from mvitac.system.files import brief, write_atomic
 
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 _MARK = b"mvitac sha256 "
-_SEAL = len(_MARK) + 64
-"""Bytes of the comment."""
-_END = b"PK\5\6"
-"""First bytes of the last record of a zip archive, which has 22 bytes without its comment."""
+_SEAL = len(_MARK) + 64  # bytes of the comment
+_END = b"PK\5\6"  # first bytes of the last record of a zip archive, which has 22 bytes without its comment
 
 
 class Damaged(ValueError):

@@ -1,7 +1,5 @@
 """Heads that start as linear probes of the trunks they belong to: LP-FT (Kumar et al., arXiv:2202.10054)."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import nn

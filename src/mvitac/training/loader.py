@@ -3,8 +3,6 @@
 Shapes: images are uint8 [N, H, W, C] in the pack and are returned as [B, C, H, W] (channels-last).
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Iterator
@@ -18,8 +16,7 @@ from mvitac.data.pack import Images, Pack
 from mvitac.methods.base import Views
 
 T = TypeVar("T")
-SHARE = 0.4
-"""Share of the free GPU memory that a copy of the pack may take."""
+SHARE = 0.4  # share of the free GPU memory that a copy of the pack may take
 
 
 class Feed:

@@ -1,7 +1,5 @@
 """Logging of a run: log.jsonl, the progress bar, and optional loggers (TensorBoard, Weights & Biases, Trackio)."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import time
@@ -15,22 +13,14 @@ from mvitac.run import Run
 from mvitac.system.files import naming, parse_json, write_atomic
 from mvitac.system.progress import WIDE, shown
 
-Logger = Callable[[int, dict[str, float]], None]
-"""Called with a step and the values logged at it."""
-EARLY = 3
-"""Step of the first log line, so that the speed is known soon."""
+Logger = Callable[[int, dict[str, float]], None]  # called with a step and the values logged at it
+EARLY = 3  # step of the first log line, so that the speed is known soon
 
 
 class Log:
     """Writes log.jsonl, the progress bar and the loggers.
 
-    Args:
-        out: Folder of the run. Lines of its log.jsonl after step ``start`` are removed.
-        start: Number of steps that are already done.
-        num_steps: Number of steps of the run.
-        batch_size: Pairs per step.
-        quiet: Show no progress bar.
-        loggers: Functions that receive all values.
+    Lines after step ``start`` (the number of steps that are already done) are removed from the log.jsonl in ``out``.
     """
 
     def __init__(
@@ -54,7 +44,7 @@ class Log:
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
         self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, batch_size, quiet, ExitStack()
 
-    def __enter__(self) -> Log:
+    def __enter__(self) -> "Log":
         self.bars = self.stack.enter_context(shown(quiet=self.quiet))
         if self.bars:
             rate = {"unit": "steps", "rate": "pairs", "scale": self.batch_size}
@@ -138,20 +128,12 @@ def in_a_bar(line: dict[str, Any], num_steps: int, batch_size: int) -> dict[str,
 
 
 LOGGERS = ("tensorboard", "wandb", "trackio")
-Started = tuple[Logger, Callable[[], object]]
-"""A logger and the function that closes it."""
+Started = tuple[Logger, Callable[[], object]]  # a logger and the function that closes it
 
 
 @contextmanager
 def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger, ...]]:
-    """Open the logger ``name`` for the run in ``out``.
-
-    Yields:
-        The loggers for ``train``: one, or none if ``name`` is None.
-
-    Raises:
-        ValueError: If there is no such logger, or its library is not installed.
-    """
+    """Open the logger ``name`` for the run in ``out``; yields the loggers for ``train``: one, or none without a name."""
     if name is None:
         yield ()
         return

@@ -4,8 +4,6 @@ All randomness is a function of (seed, step). A run that is killed at any time a
 that was not interrupted (on the same machine, with the same number of threads).
 """
 
-from __future__ import annotations
-
 import math
 import signal
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Rows of each step, in an order that is a function of (seed, epoch)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import Literal
@@ -28,12 +26,6 @@ class Batches:
     """Pack rows of each step.
 
     The order of an epoch depends on (seed, epoch) and, for a pack in shards, on the number of processes.
-
-    Args:
-        run: Gives seed, batch size and sampler.
-        pack: The pack.
-        rows: Pack rows to train on.
-        world: The processes that train together. Default: this one only.
     """
 
     def __init__(self, run: Run, pack: Pack, rows: np.ndarray, world: World | None = None) -> None:
@@ -75,15 +67,9 @@ class PartOrder:
     """Rows of each epoch of a mix whose parts are drawn by weight.
 
     An epoch draws as many rows as it has room for. Each draw is of a random part, by weight: a row, or a whole batch if
-    batches are of one part. It takes the next rows of that part's endless sequence: pass after pass over its rows, each pass
-    in another order. All of it is a function of (seed, epoch); the number of earlier draws is counted from the first epoch.
-
-    Args:
-        run: Gives seed, batch size and sampler.
-        pack: The mix.
-        rows: Its rows to train on.
-        per_epoch: Number of steps in an epoch.
-        order: ``epoch_order`` or ``spread_order``, for a pass over a part.
+    batches are of one part. It takes the next rows of that part's endless sequence: pass after pass over its rows, each
+    pass in another ``order``. All of it is a function of (seed, epoch); the number of earlier draws is counted from the
+    first epoch.
     """
 
     def __init__(self, run: Run, pack: MixedPack, rows: np.ndarray, per_epoch: int, order: Order) -> None:
@@ -91,12 +77,9 @@ class PartOrder:
         self.rows = [rows[pack.part_of[rows] == number] for number in range(len(pack.parts))]
         self.touch_groups = [pack.touch_groups[own] if run.sampler != "shuffle" else None for own in self.rows]
         self.shares = pack.shares(rows)
-        self.length = run.batch_size if pack.one_part else 1
-        """Rows of one draw."""
-        self.num = per_epoch * run.batch_size // self.length
-        """Draws of an epoch."""
-        self.before = [np.zeros(len(self.rows), np.int64)]
-        """Draws of each part before each epoch."""
+        self.length = run.batch_size if pack.one_part else 1  # rows of one draw
+        self.num = per_epoch * run.batch_size // self.length  # draws of an epoch
+        self.before = [np.zeros(len(self.rows), np.int64)]  # draws of each part before each epoch
 
     def epoch(self, number: int) -> np.ndarray:
         """Rows [per_epoch, batch_size] of epoch ``number``."""
@@ -124,9 +107,8 @@ class PartOrder:
 def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
     """Check that ``run`` can train on ``rows`` of ``pack``, if it is a mix.
 
-    Raises:
-        ValueError: If a part has no rows, or fewer than its weight asks for in a batch, or the rows of a batch have other
-            modalities and are embedded in several places.
+    ValueError if a part has no rows, or fewer than its weight asks for in a batch, or the rows of a batch have other
+    modalities and are embedded in several places.
     """
     if not isinstance(pack, MixedPack):
         return
@@ -224,22 +206,11 @@ def shard_order(
     seed: int,
     order: Order = epoch_order,
 ) -> np.ndarray:
-    """A random order of rows 0..N-1 in which each process needs few shards at a time.
+    """A random order [num_lanes, num / num_lanes] of rows 0..N-1 in which each process needs few shards at a time.
 
-    The shards are put in random order and cut into one lane per process. Within a lane, rows are shuffled by
-    ``order``, ``window`` shards at a time. Only a shard that is cut is read by two processes.
-
-    Args:
-        shards: [N], the shard of each row.
-        groups: [N], the touch group of each row, or None.
-        window: Number of shards to shuffle together.
-        num_lanes: Number of processes.
-        num: Number of rows to use.
-        seed: Random seed.
-        order: ``epoch_order`` or ``spread_order``.
-
-    Returns:
-        [num_lanes, num / num_lanes] row numbers, each at most once.
+    The shards are put in random order and cut into one lane per process. Within a lane, rows are shuffled by ``order``,
+    ``window`` shards at a time. Only a shard that is cut is read by two processes. ``shards`` and ``groups`` [N] are
+    the shard and the touch group of each row.
     """
     place = np.random.default_rng(seed).permutation(shards.max() + 1)[shards]
     lanes = np.argsort(place, kind="stable")[:num].reshape(num_lanes, -1)

@@ -1,7 +1,5 @@
 """Set-up of pre-training: everything that happens before the first step, and every check that can be made there."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,31 +40,22 @@ from mvitac.transforms.gel_flip import GelMirror
 class Setup:
     """What the training loop works with."""
 
-    asked: Run
-    """The run as it was given."""
-    run: Run
-    """The same with ``precision`` resolved for this machine."""
+    asked: Run  # the run as it was given
+    run: Run  # the same with ``precision`` resolved for this machine
     pack: Pack
-    rows: np.ndarray
-    """Pack rows to train on."""
+    rows: np.ndarray  # pack rows to train on
     mirror: GelMirror | None
     device: torch.device
     world: World
     method: Method
     step: Step
-    start: int
-    """Number of steps that are already done."""
+    start: int  # number of steps that are already done
     num_steps: int
-    kept: dict[str, Any]
-    """State of validation (``Validation``)."""
+    kept: dict[str, Any]  # state of validation (``Validation``)
 
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
-    """Open the data, build the method and its optimiser, restore a checkpoint, and write run.json.
-
-    Returns:
-        The set-up, or None if the run in ``out`` is already finished.
-    """
+    """Open the data, build the method, restore a checkpoint, and write run.json; None if the run is finished."""
     asked = replace(asked, init=asked.init.resolved())
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
@@ -131,11 +120,7 @@ def check_still_there(out: Path) -> None:
 
 
 def _is_finished(out: Path, world: World) -> bool:
-    """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint.
-
-    Raises:
-        ValueError: If there is no checkpoint either.
-    """
+    """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint."""
     if not (out / "model.safetensors").exists():
         return False
     try:
@@ -165,11 +150,7 @@ def check_divisible(run: Run, world: World) -> None:
 def check_same(run: Run, pack: Pack, out: Path) -> str:
     """Check that the run in folder ``out`` is ``run`` on ``pack``. Precision auto matches any precision.
 
-    Returns:
-        The precision in which the run in ``out`` was started.
-
-    Raises:
-        ValueError: If it is a different run.
+    Returns the precision in which the run in ``out`` was started; ValueError if it is a different run.
     """
     old, record = load_run(out)
     begun = precision_of(old, record)

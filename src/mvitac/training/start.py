@@ -1,7 +1,5 @@
 """Start weights from another model (``Run.init``): read them, load what fits, and say what that model learned from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +10,14 @@ from torch import Tensor
 from mvitac.data.pack import Pack
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, read_sources, unknown_source
 from mvitac.methods.base import Method
-from mvitac.model import FORMAT, load
+from mvitac.model import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
-from mvitac.nn.weights import read_safetensors
+from mvitac.nn.weights import FORMAT, read_safetensors
 from mvitac.run import read_record
 
 State = dict[str, Tensor]
-ANY = "any"
-"""Key of a trunk's weights in a file that does not say which modality they are for."""
+ANY = "any"  # key of a trunk's weights in a file that does not say which modality they are for
 
 
 @dataclass(frozen=True)
@@ -28,26 +25,14 @@ class Start:
     """What a run starts from."""
 
     init: Init
-    trunks: dict[str, State]
-    """Modality, or ``ANY``, -> state dict."""
-    heads: dict[str, State]
-    """Modality -> state dict of the head into the shared space."""
-    trunk: str
-    """timm name of the trunks; "" if it is not known."""
-    sources: list[Source]
-    """What its weights were trained on."""
+    trunks: dict[str, State]  # modality, or ``ANY``, -> state dict
+    heads: dict[str, State]  # modality -> state dict of the head into the shared space
+    trunk: str  # timm name of the trunks; "" if it is not known
+    sources: list[Source]  # what its weights were trained on
 
 
 def read_start(init: Init, pack: Pack) -> Start | None:
-    """Read the weights of ``init``; None if it names none.
-
-    Args:
-        init: What to take.
-        pack: The data of the new run.
-
-    Raises:
-        ValueError: If there are no such weights, or they are damaged.
-    """
+    """Read the weights of ``init``, for a run on ``pack``; None if it names none."""
     if not init:
         return None
     header, tensors = read_safetensors(init.file)
@@ -79,11 +64,8 @@ def _learned(file: Path, pack: Pack) -> list[Source]:
 def load_start(start: Start, method: Method) -> dict[str, Any]:
     """Load start weights into a new method, by modality, and into its momentum copies.
 
-    Returns:
-        What was taken, for the record: name, digest, modality -> parts, and names of what the weights were trained on.
-
-    Raises:
-        ValueError: If nothing fits, or a modality that was asked for does not.
+    Returns what was taken, for the record: name, digest, modality -> parts, and names of what the weights were trained
+    on. ValueError if nothing fits, or a modality that was asked for does not.
     """
     init, taken, reasons = start.init, {}, {}
     trunks, heads = method.encoders(), method.projectors()

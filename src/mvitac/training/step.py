@@ -8,8 +8,6 @@ up to rounding (tests/training/test_step.py). BatchNorm normalises each chunk by
 its running statistics are updated once per chunk.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -26,17 +24,7 @@ Chunk = Callable[[], Views]
 
 
 class Step:
-    """Takes one optimiser step when called.
-
-    Args:
-        run: Settings of the optimiser, precision, chunks, recomputation and compilation.
-        method: The method to train, on ``device``.
-        device: Device of the method.
-        world: The processes that train together. Default: this one only.
-
-    Raises:
-        ValueError: If the method or the trunk does not support these settings.
-    """
+    """Takes one optimiser step when called. ValueError if the method or the trunk does not support these settings."""
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world = method, device, world or World()
@@ -55,16 +43,10 @@ class Step:
         self.forward = torch.compile(method, fullgraph=True) if run.compile else method
 
     def __call__(self, chunks: Sequence[Chunk], *, lr: float, seed: int, progress: float) -> dict[str, Tensor]:
-        """Take one step.
+        """Take one step with the ``chunks`` of the batch that this process embeds; returns the detached losses.
 
-        Args:
-            chunks: The chunks of the batch that this process embeds.
-            lr: Learning rate.
-            seed: Random seed of dropout and of random draws in losses.
-            progress: Share of the run that is done after this step, from 0 to 1.
-
-        Returns:
-            The losses, detached, on the device.
+        ``seed`` is that of dropout and of random draws in losses; ``progress`` is the share of the run done after this
+        step.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group.get("lr_scale", 1.0)
@@ -158,10 +140,8 @@ def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
         parameters = _by_layer(config, method, parameters)
     elif config.weight_decay and not config.decay_norms:
         vectors = [p for p in parameters if p.ndim <= 1]  # biases and BatchNorm
-        parameters = [
-            {"params": [p for p in parameters if p.ndim > 1]},
-            {"params": vectors, "weight_decay": 0.0},
-        ]
+        matrices = [p for p in parameters if p.ndim > 1]
+        parameters = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
     if config.name == "sgd":
         momentum, decay = config.betas[0], config.weight_decay
         return torch.optim.SGD(parameters, config.lr, momentum=momentum, weight_decay=decay, fused=fused)

@@ -4,8 +4,6 @@ A linear probe, kNN accuracy, retrieval and signs of collapse. The start (step 0
 those with the highest mean of the linear probe over tasks and modalities: accuracy of classes, R2 of values (below 0: 0).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +31,7 @@ ratio: accuracy of a class (errors: wrong rows; guess: all rows), R2 of a value 
 class Validation:
     """Evaluates a method while it trains, compares it with its start, and keeps the best weights.
 
-    Args:
-        out: Folder of the run.
-        run: Its settings.
-        method: The method that trains.
-        pack: The data.
-        log: Where values are logged.
-        kept: State of the last checkpoint, which a resumed run continues with; empty at the start.
+    ``kept`` is the state of the last checkpoint, which a resumed run continues with; empty at the start.
     """
 
     def __init__(self, out: Path, run: Run, method: Method, pack: Pack, log: Log, kept: dict[str, Any]) -> None:
@@ -74,10 +66,8 @@ def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
     """Scores on held-out groups (split val, never test). Only rows with both modalities are used.
 
     Without rows of val that are not trained on, the scores are computed on training rows, and there are no probes.
-
-    Returns:
-        name -> value, e.g. "touch/linear category", "touch/knn category", "vision/rankme", "vision->touch R@5". Of a mix,
-        the scores of each part, named "<part> <name>".
+    Returns name -> value, e.g. "touch/linear category", "touch/knn category", "vision/rankme", "vision->touch R@5". Of
+    a mix, the scores of each part, named "<part> <name>".
     """
     return validate(model, pack, run)[0]
 
@@ -136,9 +126,8 @@ def _knn(
         labelled, scored = known >= 0, asked >= 0
         if labelled.any() and scored.any():
             for m in z:
-                values[f"{m}/knn {task.name}"] = diagnostics.knn_accuracy(
-                    bank[m][labelled], known[labelled], z[m][scored], asked[scored]
-                )
+                sides = bank[m][labelled], known[labelled], z[m][scored], asked[scored]
+                values[f"{m}/knn {task.name}"] = diagnostics.knn_accuracy(*sides)
     return values
 
 

@@ -1,7 +1,5 @@
 """The random views of each step, which are a function of (seed, step)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -62,11 +60,7 @@ def load_chunks(
 
 
 def gel_mirror(run: Run, pack: Pack, device: torch.device) -> GelMirror | None:
-    """The object that flips touch images with their colours, or None if the run flips pixels only.
-
-    Raises:
-        ValueError: If the colours of the pack's sensors cannot be learned.
-    """
+    """The object that flips touch images with their colours, or None if the run flips pixels only."""
     return GelMirror(pack, device) if run.augment.gel_flip == "colour" else None
 
 
@@ -113,10 +107,8 @@ def make_views(
                 seen = mirror.random(seen, source, run.augment.touch, generator)
             view = random_view(seen, config, run.augment.size, generator, dtype)
             images[modality].append(view)
-    labels = {
-        t.name: torch.from_numpy(pack.labels(t.name, *run.method.label_splits)[rows]).to(device)
-        for t in pack.spec.tasks
-    }
+    splits = run.method.label_splits
+    labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(device) for t in pack.spec.tasks}
     values = {task: value.to(device) for task, value in values_of(run, pack, rows).items()}
     at, seed = torch.from_numpy(rows).to(device), torch.tensor(generator.initial_seed()).to(device)
     return Views(images=images, labels=labels, rows=at, values=values, both=both, seed=seed)

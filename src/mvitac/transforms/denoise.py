@@ -3,8 +3,6 @@
 Shapes: N images of H x W pixels and C channels, levels 0 to 255.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import convolve, gaussian_filter
 

@@ -9,8 +9,6 @@ its height is skewed, with the same sign on all gels that press the same kind of
 Shapes: N images of H x W pixels, levels 0 to 255.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +17,7 @@ from scipy.stats import skew
 
 from mvitac.transforms.gel_flip import slope_colours
 
-MIN_IMAGES, NUM_IMAGES = 32, 400
-"""Least number of images of a sensor, and the number that is used."""
+MIN_IMAGES, NUM_IMAGES = 32, 400  # least number of images of a sensor, and the number that is used
 SMOOTH, SURE = 36, 3.0
 """Curvature is that of slopes blurred by this fraction of the side: of 0, 1, 2 and 3 pixels of 72, 2 told the sign of the
 four known simulated sensors best (t 5.1 to 5.9 with 100 images, 2.1 to 2.9 without blur). Below ``SURE`` it is refused."""
@@ -30,22 +27,15 @@ four known simulated sensors best (t 5.1 to 5.9 with 100 images, 2.1 to 2.9 with
 class GelColours:
     """How one sensor shows slopes."""
 
-    level: np.ndarray
-    """[3], mean colour."""
-    rest: np.ndarray
-    """[H, W, 3], mean image minus ``level``."""
+    level: np.ndarray  # [3], mean colour
+    rest: np.ndarray  # [H, W, 3], mean image minus ``level``
     colours: np.ndarray
     """[3, 2], change of level per slope along x and y, in units of the root mean square of the slopes."""
-    mixtures: np.ndarray
-    """[3, 2], where ``d @ mixtures`` are the slopes of a change of level ``d``."""
+    mixtures: np.ndarray  # [3, 2], where ``d @ mixtures`` are the slopes of a change of level ``d``
 
 
 def learn_colours(images: np.ndarray) -> GelColours:
-    """Learn the colours of slope of one sensor from images [N, H, W, 3] of different presses.
-
-    Raises:
-        ValueError: If there are too few images, their colours do not follow slopes, or the sign remains unclear.
-    """
+    """Learn the colours of slope of one sensor from images [N, H, W, 3] of different presses, or raise ValueError."""
     if len(images) < MIN_IMAGES:
         raise ValueError(f"{len(images)} images: learning the colours of a gel needs {MIN_IMAGES} of different presses")
     mean = images.mean(0, dtype=np.float64)

@@ -13,8 +13,6 @@ sum to zero, so the mean colour comes from lamps and tint, which differ between 
 image contains the average contact. This does no harm if the average contact is symmetric.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -27,27 +25,18 @@ from mvitac.transforms.random_views import ViewAugment
 
 MIN_ROWS, NUM_ROWS = 32, 256
 """Minimum number of training rows of a sensor, and the number of rows that are used, evenly spaced."""
-SIDE = 64
-"""Approximate side in pixels at which colours are learned. Finer detail is noise and JPEG artefacts."""
-REST = 16
-"""Side in pixels of I0. It resolves lamps and tint, but not the dots, which move with the contact."""
+SIDE = 64  # approximate side in pixels at which colours are learned. Finer detail is noise and JPEG artefacts.
+REST = 16  # side in pixels of I0. It resolves lamps and tint, but not the dots, which move with the contact.
 MAX_CURL, MAX_STRETCH = 0.2, 30.0
 """Above these limits the result is not a pair of slopes. Curl is .03 to .11 for gels, simulated and real, and .25 to .5
 for gray images."""
 
 
 def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Learn the colours of slope from images of one sensor.
+    """Learn the colours of slope from images of one sensor, minus their mean; ValueError if no mixtures are slopes.
 
-    Args:
-        images: Images minus their mean image.
-
-    Returns:
-        ``colours`` [3, 2], rx and ry as columns, up to a common factor; ``mixtures`` [3, 2], where ``d @ mixtures`` are gx
-        and gy of a colour ``d``, up to the inverse factor; and ``curl``, 0 for perfect slopes and .5 for noise.
-
-    Raises:
-        ValueError: If no two mixtures of colours are slopes of one height.
+    Returns ``colours`` [3, 2], rx and ry as columns, up to a common factor; ``mixtures`` [3, 2], where ``d @ mixtures``
+    are gx and gy of a colour ``d``, up to the inverse factor; and ``curl``, 0 for perfect slopes and .5 for noise.
     """
     down = ((images[:, 2:, 1:-1] - images[:, :-2, 1:-1]) / 2).reshape(-1, 3)
     right = ((images[:, 1:-1, 2:] - images[:, 1:-1, :-2]) / 2).reshape(-1, 3)
@@ -69,16 +58,10 @@ def mirror_colours(colours: np.ndarray, mixtures: np.ndarray) -> np.ndarray:
 
 
 class GelMirror:
-    """Flips touch images of a pack. Colours are learned once, from each sensor's training rows.
+    """Flips touch images of a pack on ``device``. Colours are learned once, from each sensor's training rows.
 
-    Each gel of a stacked image is mirrored separately.
-
-    Args:
-        pack: The pack of the images.
-        device: Device of the images to flip.
-
-    Raises:
-        ValueError: If a sensor has too few rows, or its colours do not follow slopes.
+    Each gel of a stacked image is mirrored separately. ValueError if a sensor has too few rows, or its colours do not
+    follow slopes.
     """
 
     def __init__(self, pack: Pack, device: torch.device) -> None:

@@ -7,8 +7,6 @@ which LLVM vectorises. Pixels are handled as four bytes, the last of them unused
 
 # pyright: reportCallIssue=false
 # (numba passes the first parameter of an intrinsic, not the caller)
-from __future__ import annotations
-
 from contextlib import suppress
 from typing import Any
 
@@ -281,15 +279,9 @@ def views(
 ) -> None:
     """Compute random views. Releases the GIL, so that several threads can fill parts of one ``out``.
 
-    Args:
-        images: uint8 [B, H, W, C], contiguous as all arguments.
-        boxes: As ``random_views.Drawn``, like ``flip`` and ``grayscale``.
-        flip: [B].
-        grayscale: [B].
-        out: [B, S, S, C], filled with the views: float32, or the bits of bfloat16 as uint16.
-        luma: float32 [3], like ``factors`` and ``offsets``.
-        factors: Factors of the normalisation.
-        offsets: Offsets of the normalisation.
+    All arrays are contiguous. ``images`` are uint8 [B, H, W, C]; ``boxes``, ``flip`` and ``grayscale`` [B] as in
+    ``random_views.Drawn``; ``out`` [B, S, S, C] is float32, or the bits of bfloat16 as uint16; ``luma``, and
+    ``factors`` and ``offsets`` of the normalisation, are float32 [3].
     """
     assert max(images.shape[1:3]) <= MAX_SHRINK * out.shape[1]
     num, height, width, channels = images.shape

@@ -4,8 +4,6 @@ An image is first resized to ``stored``, the side of the training pack's images,
 sees. Shapes: B images, C channels, H x W pixels, S the side that the encoder sees.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -24,8 +22,7 @@ from mvitac.transforms.random_views import normalise, plain_view
 
 ImageInput = str | Path | np.ndarray | Tensor | Image.Image | Sequence[Any]
 """One image or several, as ``Model.embed`` accepts them."""
-TOLERANCE = 1e-3
-"""By which floats may lie outside [0, 1], as rounding and resizing leave them."""
+TOLERANCE = 1e-3  # by which floats may lie outside [0, 1], as rounding and resizing leave them
 
 
 @dataclass(frozen=True)
@@ -37,14 +34,11 @@ class Preprocess:
 
     modality: str
     channels: int
-    stored: int
-    """Side in pixels of the images in the training pack."""
+    stored: int  # side in pixels of the images in the training pack
     size: int | None = None
     """Side of normalised images for the trunk. None: uint8 at ``stored`` pixels, for ``Model.forward``."""
-    background: np.ndarray | None = None
-    """The touch sensor without contact, uint8 [H, W, C], to subtract."""
-    frames: int = 1
-    """Frames of a window; ``channels`` are those of all of them, the newest first."""
+    background: np.ndarray | None = None  # the touch sensor without contact, uint8 [H, W, C], to subtract
+    frames: int = 1  # frames of a window; ``channels`` are those of all of them, the newest first
 
     def __call__(self, image: ImageInput) -> Tensor:
         """One image (a path, PIL image, array or tensor) to uint8 [C, stored, stored], or fp32 [C, size, size].
@@ -129,11 +123,7 @@ def _is_frame(value: Any) -> bool:
 
 
 def to_array(image: Any, channels: int, what: str) -> np.ndarray:
-    """One image of any kind as uint8 [H, W, channels].
-
-    Raises:
-        ValueError: If it is no such image. ``what`` names it in the message.
-    """
+    """One image of any kind as uint8 [H, W, channels]; if it is none, ValueError with its name, ``what``."""
     first = isinstance(image, Tensor)  # channels are first in tensors and last in arrays, where both would fit
     if isinstance(image, (str, os.PathLike)):
         image = decode(Path(image))

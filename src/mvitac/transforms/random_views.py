@@ -6,8 +6,6 @@
 Shapes: B images of C channels and H x W pixels, stacked from N = C / 3 sensors; views of S x S pixels.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -93,14 +91,10 @@ class Augment:
 class Drawn:
     """Parameters of one view of B images."""
 
-    boxes: Tensor
-    """[B, 4] int64: top, left, height, width of the crop."""
-    flip: Tensor
-    """[B] bool."""
-    grayscale: Tensor
-    """[B] bool."""
-    gains: Tensor
-    """[B, 5] float: brightness, contrast, and gains of R, G, B."""
+    boxes: Tensor  # [B, 4] int64: top, left, height, width of the crop
+    flip: Tensor  # [B] bool
+    grayscale: Tensor  # [B] bool
+    gains: Tensor  # [B, 5] float: brightness, contrast, and gains of R, G, B
 
 
 def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -> Drawn:

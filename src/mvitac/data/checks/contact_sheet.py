@@ -1,7 +1,5 @@
 """The doctor's contact sheet: the suspicious rows of each finding, or a sample of the data if there are none."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,8 +8,7 @@ from mvitac.data.checks.finding import Finding
 from mvitac.data.image_grid import Block, Tile, contents, pair
 from mvitac.data.pack import Pack
 
-SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24
-"""Pixels; rows shown of a finding; rows shown if nothing is suspicious."""
+SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24  # pixels; rows shown of a finding; rows shown if nothing is suspicious
 
 
 def blocks_of(pack: Pack, findings: Sequence[Finding]) -> list[Block]:

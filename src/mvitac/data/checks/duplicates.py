@@ -1,7 +1,5 @@
 """Duplicates across splits: identical pixels, and near-duplicates by correlation of residual thumbnails."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
@@ -10,14 +8,10 @@ from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.checks.table_checks import sides_of
 from mvitac.data.pack import Pack
 
-NEAR = 0.975
-"""Upper limit of the correlation threshold for near-duplicates."""
-NEAR_AT_LEAST = 0.85
-"""Lower limit of the threshold, for datasets whose groups differ a lot."""
-FAINT = 2.0
-"""Standard deviation in grey levels below which a residual is noise and is not compared."""
-BLUR = 5
-"""Width of the blur that is subtracted, in thumbnail pixels."""
+NEAR = 0.975  # upper limit of the correlation threshold for near-duplicates
+NEAR_AT_LEAST = 0.85  # lower limit of the threshold, for datasets whose groups differ a lot
+FAINT = 2.0  # standard deviation in grey levels below which a residual is noise and is not compared
+BLUR = 5  # width of the blur that is subtracted, in thumbnail pixels
 MAX_ASKED, MAX_SEARCHED = 2000, 40_000
 
 
@@ -37,14 +31,14 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             rows += across.tolist()
     if notes:
         return Finding(
-            item="identical images across splits",
-            verdict="broken",
-            evidence="; ".join(notes),
-            advice="remove the copies, or put them in one group so that they stay in one split",
+            "identical images across splits",
+            "broken",
+            "; ".join(notes),
+            "remove the copies, or put them in one group so that they stay in one split",
             rows=tuple(rows),
         )
     evidence = "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")
-    return Finding(item="identical images across splits", verdict="ok", evidence=evidence)
+    return Finding("identical images across splits", "ok", evidence)
 
 
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -80,10 +74,10 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
         rows += pairs.ravel().tolist()
     return Finding(
-        item="near-copies across splits",
-        verdict="look" if suspicious else "ok" if compared else "not checkable",
-        evidence="; ".join(notes),
-        advice=suspicious * "look at the sheet (pairs side by side); if they are one contact or one scene, group them",
+        "near-copies across splits",
+        "look" if suspicious else "ok" if compared else "not checkable",
+        "; ".join(notes),
+        suspicious * "look at the sheet (pairs side by side); if they are one contact or one scene, group them",
         rows=tuple(rows) if suspicious else (),
     )
 
@@ -91,10 +85,9 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
 def _near_pairs(
     unit: np.ndarray, asked: np.ndarray, bank: np.ndarray, groups: np.ndarray, exact: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return near-duplicates of ``asked`` in ``bank``, and how common they are between groups of ``bank``.
+    """Pairs of rows [n, 2] that are near-duplicates, one of ``asked`` and one of ``bank``, the most similar first.
 
-    Returns:
-        Pairs of rows [n, 2], the most similar first (exact copies are left out), and a fraction.
+    Exact copies are left out. Also returns how common near-duplicates are between groups of ``bank``.
     """
     best, value = _nearest(unit, asked, bank)
     _, natural = _nearest(unit, _some(bank, 500), bank, apart=groups)

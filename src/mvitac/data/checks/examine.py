@@ -1,7 +1,5 @@
 """Runs all checks on a pack, or on a source that is packed as thumbnails first."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -64,13 +62,10 @@ class ThumbnailSource(Source):
 def examine(
     pack: Pack, counts: list[Count] | None = None, *, part: bool = False, window: Window = SINGLE
 ) -> list[Finding]:
-    """Run every check on ``pack``.
+    """Run every check on ``pack``; ``counts`` are published ones.
 
-    Args:
-        pack: The pack.
-        counts: Published counts, from the source.
-        part: Whether the pack is a part of the source. Classes missing here may be in the rest, so they are not "broken".
-        window: Frames that a row will show; checked if it is more than one.
+    Of a ``part`` of a source, missing classes may be in the rest, so they are not "broken". A ``window`` of several
+    frames is checked, too.
     """
     looks = look_at(pack)
     labels = [table_checks.missing_labels(pack), *table_checks.class_balance(pack), *value_checks.values(pack)]
@@ -106,16 +101,14 @@ def examine_pack(path: str | Path, window: Window = SINGLE) -> tuple[list[Findin
     except ValueError as error:
         if not (Path(path) / "pack.json").is_file():
             raise
-        found = Finding(
-            item="pack", verdict="broken", evidence=str(error), advice="make it again; training refuses it, too"
-        )
+        found = Finding("pack", "broken", str(error), "make it again; training refuses it, too")
         return [found], [Block(f"broken: pack. {error}")]
     return examine_open(pack, window)
 
 
 def examine_open(pack: Pack, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
     """As ``examine_pack``, for a pack that is open."""
-    whole = Finding(item="pack", verdict="ok", evidence=f"{pack.num} rows, every digest matches")
+    whole = Finding("pack", "ok", f"{pack.num} rows, every digest matches")
     findings = [whole, *examine(pack, window=window)]
     return findings, blocks_of(pack, findings)
 
@@ -129,28 +122,17 @@ def examine_source(
     quiet: bool = False,
     window: Window = SINGLE,
 ) -> tuple[list[Finding], list[Block]]:
-    """Check ``source``, which is read into a temporary pack of ``size`` px.
+    """Findings about ``source``, which is read into a temporary pack of ``size`` px, and the contact sheet's blocks.
 
-    Damaged items are a finding; it is an error only if nothing can be read.
-
-    Args:
-        source: The dataset.
-        num: Number of items to read, evenly spaced; 0 = all.
-        size: Side of the thumbnails in pixels.
-        workers: Number of processes; 0 = one per core.
-        quiet: Show no progress.
-        window: Frames that a row will show.
-
-    Returns:
-        The findings, and the blocks of the contact sheet.
+    ``num`` items are read, evenly spaced; 0 = all. Damaged items are a finding; it is an error only if nothing can be
+    read.
     """
     thumbnails = ThumbnailSource(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
         options: dict[str, Any] = {"size": size, "workers": workers, "quiet": quiet}
         pack = build(thumbnails, Path(folder) / "pack", max_damaged=1.0, **options)
-        findings = examine(
-            pack, thumbnails.expected(), part=len(thumbnails.items()) < len(source.items()), window=window
-        )
+        partly = len(thumbnails.items()) < len(source.items())
+        findings = examine(pack, thumbnails.expected(), part=partly, window=window)
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
-        findings.insert(0, Finding(item="source", verdict="ok", evidence=f"{pack.spec.name}: {read}"))
+        findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
         return findings, blocks_of(pack, findings)

@@ -1,7 +1,5 @@
 """The result of one check."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -10,18 +8,15 @@ Verdict = Literal["ok", "look", "broken", "not checkable"]
 MAX_ROWS = 64
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """The result of one check."""
 
     item: str
     verdict: Verdict
-    evidence: str
-    """What was measured, in one line."""
-    advice: str = ""
-    """What to do; "" if nothing is wrong."""
-    rows: tuple[int, ...] = ()
-    """Suspicious rows for the contact sheet, at most ``MAX_ROWS``."""
+    evidence: str  # what was measured, in one line
+    advice: str = ""  # what to do; "" if nothing is wrong
+    rows: tuple[int, ...] = ()  # suspicious rows for the contact sheet, at most ``MAX_ROWS``
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rows", tuple(int(row) for row in self.rows[:MAX_ROWS]))

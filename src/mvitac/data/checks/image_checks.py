@@ -1,7 +1,5 @@
 """Checks of the images, by thumbnails [N, S, S, 3] of ``ImageStats``. They compare rows of one dataset with each other."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -10,11 +8,9 @@ from mvitac.data.checks.finding import Finding, share, some
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
 
-ORDER_COLUMNS = ("seq", "frame", "step", "time")
-"""Columns that give the order of the rows of a group."""
+ORDER_COLUMNS = ("seq", "frame", "step", "time")  # columns that give the order of the rows of a group
 MAX_LAG = 5
-BLOCK = 48
-"""Frames per measurement of the offset in a long sequence."""
+BLOCK = 48  # frames per measurement of the offset in a long sequence
 
 
 def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -22,14 +18,14 @@ def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     found = {name: np.flatnonzero(one.has & ~one.seen) for name, one in looks.items()}
     rows = np.unique(np.concatenate(list(found.values())))
     if not len(rows):
-        return Finding(item="constant frames", verdict="ok", evidence=f"none among {pack.num} rows")
+        return Finding("constant frames", "ok", f"none among {pack.num} rows")
     what = "; ".join(f"{name}: {share(len(r), pack.num)}" for name, r in found.items() if len(r))
     first = pack.column("id")[rows[0]]
     return Finding(
-        item="constant frames",
-        verdict="broken" if len(rows) > 0.05 * pack.num else "look",
-        evidence=f"{what}, first {first}",
-        advice="look whether the sensor or the decoder failed, and leave these rows out",
+        "constant frames",
+        "broken" if len(rows) > 0.05 * pack.num else "look",
+        f"{what}, first {first}",
+        "look whether the sensor or the decoder failed, and leave these rows out",
         rows=tuple(rows),
     )
 
@@ -48,12 +44,8 @@ def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             notes.append(f"{name}: all without colour")
     verdict = "look" if rows else "ok"
     evidence = "; ".join(notes) or "all in colour"
-    advice = (
-        "different cameras or converters: convert all in the same way, or mark them as different sensors"
-        if rows
-        else ""
-    )
-    return Finding(item="grayscale among colour", verdict=verdict, evidence=evidence, advice=advice, rows=tuple(rows))
+    advice = "different cameras or converters: convert all alike, or mark them as different sensors" if rows else ""
+    return Finding("grayscale among colour", verdict, evidence, advice, rows=tuple(rows))
 
 
 def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -77,12 +69,10 @@ def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             note = f"{share(len(mine), len(usable))} have red and blue mirrored{_where(pack, mine)}"
         notes.append(f"{name}: {note}")
     return Finding(
-        item="red and blue swapped",
-        verdict="look" if rows else "ok" if compared else "not checkable",
-        evidence="; ".join(notes),
-        advice="look at the sheet; if they are BGR (OpenCV's order), reverse their channels when reading"
-        if rows
-        else "",
+        "red and blue swapped",
+        "look" if rows else "ok" if compared else "not checkable",
+        "; ".join(notes),
+        "look at the sheet; if they are BGR (OpenCV's order), reverse their channels when reading" if rows else "",
         rows=tuple(rows),
     )
 
@@ -126,11 +116,11 @@ def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find rows whose vision resembles the others' touch and whose touch resembles the others' vision."""
     item = "vision and touch swapped"
     if len(pack.spec.modalities) < 2:
-        return Finding(item=item, verdict="not checkable", evidence="one modality only")
+        return Finding(item, "not checkable", "one modality only")
     pair = [next(one for one in looks.values() if one.modality == m) for m in ("vision", "touch")]
     seen = np.flatnonzero(pair[0].seen & pair[1].seen)
     if len(seen) < 16:
-        return Finding(item=item, verdict="not checkable", evidence="fewer than 16 usable pairs")
+        return Finding(item, "not checkable", "fewer than 16 usable pairs")
     x = [np.concatenate([_coarse(one.thumbs[seen]), one.std[seen, None]], axis=1) for one in pair]
     # A diagonal Gaussian per modality, by median and MAD, which a minority of swapped rows does not change.
     middle = [np.median(values, axis=0) for values in x]
@@ -140,19 +130,19 @@ def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     right = float(np.concatenate([as_touch < 0, as_vision < 0]).mean())
     if right < 0.75:
         evidence = f"cameras and gels look too similar here ({100 * right:.0f} % of the images can be told apart)"
-        return Finding(item=item, verdict="not checkable", evidence=evidence)
+        return Finding(item, "not checkable", evidence)
     bad = seen[(as_touch > 0) & (as_vision > 0)]
     # Both images of a row resemble the other modality: always if swapped, sometimes by chance.
     chance = float((as_touch > 0).mean() * (as_vision > 0).mean() * len(seen))
     if len(bad) <= 2 * chance + 3 * chance**0.5:
         told = f"{len(bad)} of {len(seen)} pairs, {chance:.1f} by chance" if len(bad) else f"none of {len(seen)} pairs"
         evidence = f"{told} ({100 * right:.0f} % of images can be told apart; a swap of all cannot)"
-        return Finding(item=item, verdict="ok", evidence=evidence)
+        return Finding(item, "ok", evidence)
     return Finding(
-        item=item,
-        verdict="look",
-        evidence=f"{share(len(bad), len(seen))} look swapped, first {pack.column('id')[bad[0]]}{_where(pack, bad)}",
-        advice="look at the sheet (vision left, touch right); exchange the two paths or keys of these rows",
+        item,
+        "look",
+        f"{share(len(bad), len(seen))} look swapped, first {pack.column('id')[bad[0]]}{_where(pack, bad)}",
+        "look at the sheet (vision left, touch right); exchange the two paths or keys of these rows",
         rows=tuple(bad),
     )
 
@@ -173,34 +163,34 @@ def _coarse(thumbs: np.ndarray) -> np.ndarray:
 def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find a lag between motion in vision and in touch, by cross-correlation within ordered groups."""
     item = "time offset between streams"
-    cannot = partial(Finding, item=item, verdict="not checkable")
+    cannot = partial(Finding, item, "not checkable")
     column = next((name for name in ORDER_COLUMNS if name in pack.table.column_names), None)
     if len(pack.spec.modalities) < 2 or column is None:
         missing = f"no column {', '.join(ORDER_COLUMNS)} gives the order of rows"
-        return cannot(evidence="one modality only" if column else missing)
+        return cannot("one modality only" if column else missing)
     try:
         when = pack.column(column).astype(float)
     except ValueError:
-        return cannot(evidence=f"column {column} holds no numbers")
+        return cannot(f"column {column} holds no numbers")
     curves = motion_correlations(pack, looks, when)
     if len(curves) < 3:
-        return cannot(evidence=f"{len(curves)} ordered sequences of {2 * MAX_LAG + 2} rows or more, 3 are needed")
+        return cannot(f"{len(curves)} ordered sequences of {2 * MAX_LAG + 2} rows or more, 3 are needed")
     mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
     lag = int(mean.argmax()) - MAX_LAG
     best = lag + MAX_LAG
     if mean[best] < 0.15 or mean[best] < 3 * error[best]:
-        return cannot(evidence=f"motion in vision and touch is unrelated (at best r = {mean[best]:.2f} at lag {lag})")
+        return cannot(f"motion in vision and touch is unrelated (at best r = {mean[best]:.2f} at lag {lag})")
     gain = curves[:, best] - curves[:, MAX_LAG]
     certain = lag != 0 and gain.mean() > 3 * gain.std(ddof=1) / len(gain) ** 0.5 and gain.mean() > 0.05
     evidence = f"r = {mean[MAX_LAG]:.2f} at lag 0, best {mean[best]:.2f} at lag {lag} over {len(curves)} sequences"
     if not certain:
-        return Finding(item=item, verdict="ok", evidence=evidence)
+        return Finding(item, "ok", evidence)
     later = "touch" if lag > 0 else "vision"
     return Finding(
-        item=item,
-        verdict="look",
-        evidence=f"{evidence}: {later} comes {abs(lag)} row{'s' * (abs(lag) > 1)} late",
-        advice="pair by timestamps if there are any, or shift one stream; motion that precedes contact can also do this",
+        item,
+        "look",
+        f"{evidence}: {later} comes {abs(lag)} row{'s' * (abs(lag) > 1)} late",
+        "pair by timestamps if there are any, or shift one stream; motion that precedes contact can also do this",
     )
 
 

@@ -1,7 +1,5 @@
 """Statistics of a pack's images, computed in one pass for all checks. N rows, S = thumbnail side, F = fine side."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 
@@ -10,8 +8,7 @@ import numpy as np
 from mvitac.data.pack import Images, Pack
 
 SIDE, FINE = 16, 32
-CONSTANT = 1.0
-"""Standard deviation in grey levels below which an image is constant."""
+CONSTANT = 1.0  # standard deviation in grey levels below which an image is constant
 NUM_AT_ONCE = 128
 
 
@@ -19,19 +16,13 @@ NUM_AT_ONCE = 128
 class ImageStats:
     """Statistics of the images of one sensor."""
 
-    name: str
-    """vision, touch, or touch 1 and touch 2 if stacked."""
+    name: str  # vision, touch, or touch 1 and touch 2 if stacked
     modality: str
-    thumbs: np.ndarray
-    """uint8 [N, S, S, 3], area means."""
-    fine: np.ndarray
-    """uint8 [N, F, F], area means of the channels' mean."""
-    std: np.ndarray
-    """float32 [N], the largest of the three channels' standard deviations."""
-    exact: np.ndarray
-    """bytes [N], digest of the pixels."""
-    has: np.ndarray
-    """bool [N], whether the row has this image. If not, the other values are meaningless."""
+    thumbs: np.ndarray  # uint8 [N, S, S, 3], area means
+    fine: np.ndarray  # uint8 [N, F, F], area means of the channels' mean
+    std: np.ndarray  # float32 [N], the largest of the three channels' standard deviations
+    exact: np.ndarray  # bytes [N], digest of the pixels
+    has: np.ndarray  # bool [N], whether the row has this image. If not, the other values are meaningless.
 
     @property
     def light(self) -> np.ndarray:

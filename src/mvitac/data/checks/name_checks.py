@@ -1,7 +1,5 @@
 """Checks of names: groups and classes that are probably one, typed in two ways."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import defaultdict
@@ -33,10 +31,10 @@ def similar_names(pack: Pack) -> Finding:
         if alike := _alike(task.classes):
             notes.append(f"classes of {task.name}: {_shown(alike)}")
     return Finding(
-        item="names that differ in spelling only",
-        verdict="look" if notes else "ok",
-        evidence="; ".join(dict.fromkeys(notes)) or "no two groups or classes differ only in case, blanks or zeros",
-        advice="if they mean the same, write them alike and pack again" if notes else "",
+        "names that differ in spelling only",
+        "look" if notes else "ok",
+        "; ".join(dict.fromkeys(notes)) or "no two groups or classes differ only in case, blanks or zeros",
+        "if they mean the same, write them alike and pack again" if notes else "",
         rows=tuple(dict.fromkeys(rows)),
     )
 

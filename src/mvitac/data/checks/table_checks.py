@@ -1,7 +1,5 @@
 """Checks of the table: damaged items, labels, classes, leaks between splits, sensors, numbers, published counts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,21 +11,20 @@ from mvitac.data.source import Count
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
 """Columns whose values should not be in more than one split either, if the dataset has them."""
-MIX = ("sensor", "vision_size", "touch_size")
-"""Columns that describe how an image was taken."""
+MIX = ("sensor", "vision_size", "touch_size")  # columns that describe how an image was taken
 
 
 def unreadable(pack: Pack) -> Finding:
     """List items that packing could not read."""
     damaged = pack.meta.get("damaged", [])
     if not damaged:
-        return Finding(item="unreadable items", verdict="ok", evidence=f"none; {pack.num} rows were read")
+        return Finding("unreadable items", "ok", f"none; {pack.num} rows were read")
     name, why = damaged[0]
     return Finding(
-        item="unreadable items",
-        verdict="broken" if len(damaged) > 0.01 * pack.num else "look",
-        evidence=f"{len(damaged)}; {pack.num} rows were read; first {name}: {why}",
-        advice="repair them or download them again; the pack does not contain them",
+        "unreadable items",
+        "broken" if len(damaged) > 0.01 * pack.num else "look",
+        f"{len(damaged)}; {pack.num} rows were read; first {name}: {why}",
+        "repair them or download them again; the pack does not contain them",
     )
 
 
@@ -44,10 +41,10 @@ def missing_images(pack: Pack) -> Finding:
                 verdict = "look"
                 notes.append(f"no row of {split} has {modality}")
     return Finding(
-        item="missing images",
-        verdict=verdict,
-        evidence="; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
-        advice="assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else "",
+        "missing images",
+        verdict,
+        "; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
+        "assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else "",
     )
 
 
@@ -56,7 +53,7 @@ def missing_labels(pack: Pack) -> Finding:
     item, notes, rows = "missing labels", [], []
     verdict: Verdict = "ok"
     if not pack.spec.tasks:
-        return Finding(item=item, verdict="ok", evidence="no tasks: nothing to label")
+        return Finding(item, "ok", "no tasks: nothing to label")
     for task in pack.spec.tasks:
         labels = pack.column(f"label_{task.name}")
         for split in ("train", "val", "test"):
@@ -72,13 +69,8 @@ def missing_labels(pack: Pack) -> Finding:
                 )
                 rows += empty.tolist()
     advice = "fill them in, or move the rows to split unlabelled; fine if they are meant for pre-training only"
-    return Finding(
-        item=item,
-        verdict=verdict,
-        evidence="; ".join(notes) or "none in train, val and test",
-        advice=advice if notes else "",
-        rows=tuple(rows),
-    )
+    evidence = "; ".join(notes) or "none in train, val and test"
+    return Finding(item, verdict, evidence, advice if notes else "", tuple(rows))
 
 
 def class_balance(pack: Pack) -> list[Finding]:
@@ -92,7 +84,7 @@ def class_balance(pack: Pack) -> list[Finding]:
             counts[side] = np.bincount(found[found >= 0], minlength=len(task.classes))
         item = f"classes of {task.name}"
         if not counts["train"].sum() or not counts["test"].sum():
-            findings.append(Finding(item=item, verdict="not checkable", evidence="no labels in train or test"))
+            findings.append(Finding(item, "not checkable", "no labels in train or test"))
             continue
         majority = counts["test"][counts["train"].argmax()] / counts["test"].sum()
         unseen = [c for i, c in enumerate(task.classes) if counts["test"][i] and not counts["train"][i]]
@@ -107,12 +99,10 @@ def class_balance(pack: Pack) -> list[Finding]:
         if majority > 0.9 or (majority > 0.75 and len(task.classes) > 2):
             verdict, advice = "look", "report balanced accuracy as well"
         if unseen:
-            verdict, advice = (
-                "broken",
-                "these cannot be learned: assign the groups to splits again, or drop the classes",
-            )
+            verdict = "broken"
+            advice = "these cannot be learned: assign the groups to splits again, or drop the classes"
             evidence += f"; tested but never seen in training: {some(unseen)}"
-        findings.append(Finding(item=item, verdict=verdict, evidence=evidence, advice=advice))
+        findings.append(Finding(item, verdict, evidence, advice))
     return findings
 
 
@@ -152,9 +142,8 @@ def leaks(pack: Pack) -> list[Finding]:
                 kind = f" ({pack.spec.group_by})" if name == "group" else ""
                 test = on.get("test", set())
                 of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""
-                notes.append(
-                    f"{name}{kind}: {len(both)} of {len(set(values))} in more than one split, e.g. {both[0]!r}{of}"
-                )
+                num = f"{len(both)} of {len(set(values))}"
+                notes.append(f"{name}{kind}: {num} in more than one split, e.g. {both[0]!r}{of}")
                 for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
@@ -163,16 +152,16 @@ def leaks(pack: Pack) -> list[Finding]:
             continue
         findings.append(
             Finding(
-                item="groups across splits" if split == "split" else f"groups across column {split}",
-                verdict=verdict,
-                evidence="; ".join(notes) or f"none of {', '.join(names)} is in more than one split",
-                advice=bool(notes) * "split by the largest of these keys, or report what test shares with train",
+                "groups across splits" if split == "split" else f"groups across column {split}",
+                verdict,
+                "; ".join(notes) or f"none of {', '.join(names)} is in more than one split",
+                bool(notes) * "split by the largest of these keys, or report what test shares with train",
                 rows=tuple(rows),
             )
         )
     if sound:
         evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
-        findings.append(Finding(item="groups across split columns", verdict="ok", evidence=evidence))
+        findings.append(Finding("groups across split columns", "ok", evidence))
     return findings
 
 
@@ -200,12 +189,12 @@ def mixture(pack: Pack) -> Finding:
             notes += told
     if not columns:
         return Finding(
-            item="sensors and resolutions",
-            verdict="not checkable",
-            evidence="no column sensor, and a pack holds one size: check the source with --data instead",
+            "sensors and resolutions",
+            "not checkable",
+            "no column sensor, and a pack holds one size: check the source with --data instead",
         )
     advice = "probe each kind separately, or use the same kinds in train and test" if verdict != "ok" else ""
-    return Finding(item="sensors and resolutions", verdict=verdict, evidence="; ".join(notes), advice=advice)
+    return Finding("sensors and resolutions", verdict, "; ".join(notes), advice)
 
 
 def _predicted_tasks(pack: Pack, column: str, values: np.ndarray) -> list[str]:
@@ -248,19 +237,16 @@ def numbers(pack: Pack) -> Finding:
         good = values[~bad]
         if len(good) >= 8:
             low, middle, high = np.percentile(good, [5, 50, 95])
-            far = (
-                np.flatnonzero(np.abs(np.where(bad, middle, values) - middle) > 100 * (high - low))
-                if high > low
-                else []
-            )
+            values_far = np.abs(np.where(bad, middle, values) - middle) > 100 * (high - low)
+            far = np.flatnonzero(values_far) if high > low else []
             if len(far):
                 notes.append(f"{name} is {values[far[0]]:g} in row {far[0]}, others {low:g} to {high:g}")
                 rows += list(far)
     return Finding(
-        item="numbers",
-        verdict="look" if notes else "ok",
-        evidence="; ".join(notes) or f"{seen} columns, all finite and in range",
-        advice="repair the cells, or leave the rows out" if notes else "",
+        "numbers",
+        "look" if notes else "ok",
+        "; ".join(notes) or f"{seen} columns, all finite and in range",
+        "repair the cells, or leave the rows out" if notes else "",
         rows=tuple(rows),
     )
 
@@ -293,20 +279,15 @@ def give_aways(pack: Pack) -> Finding:
                     f"{name} predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
                 )
     advice = "report them with every score as a control (--data.controls name=column)" if notes else ""
-    return Finding(
-        item="columns that give a label away",
-        verdict="look" if notes else "ok",
-        evidence="; ".join(notes) or "no column of numbers does",
-        advice=advice,
-    )
+    evidence = "; ".join(notes) or "no column of numbers does"
+    return Finding("columns that give a label away", "look" if notes else "ok", evidence, advice)
 
 
 def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
     """Return whether the values are few and each has one label only: the label itself, or another name for it."""
     names, numbers = np.unique(values, return_inverse=True)
-    return len(names) <= 2 * len(np.unique(labels)) and all(
-        len(set(labels[numbers == i])) == 1 for i in range(len(names))
-    )
+    one_class = (len(set(labels[numbers == i])) == 1 for i in range(len(names)))
+    return len(names) <= 2 * len(np.unique(labels)) and all(one_class)
 
 
 def numeric_columns(pack: Pack) -> Iterator[tuple[str, np.ndarray]]:
@@ -330,9 +311,7 @@ def _parsed(values: np.ndarray) -> np.ndarray | None:
     known = 0
     for i, cell in enumerate(values):
         try:
-            out[i] = float(
-                "" if "_" in str(cell) else cell
-            )  # 20220319_002026 is a name, although Python reads it as a number
+            out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name
             known += 1
         except (TypeError, ValueError):
             continue
@@ -347,10 +326,10 @@ def published(counts: list[Count]) -> list[Finding]:
         detail = f"; {count.detail}" if count.detail else ""
         findings.append(
             Finding(
-                item=f"published: {count.what}",
-                verdict="ok" if same else "look",
-                evidence=f"{count.found} found, {count.published} published{detail}",
-                advice="" if same else "fine for a part of the data; mention it with every result",
+                f"published: {count.what}",
+                "ok" if same else "look",
+                f"{count.found} found, {count.published} published{detail}",
+                "" if same else "fine for a part of the data; mention it with every result",
             )
         )
     return findings

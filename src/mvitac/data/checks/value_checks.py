@@ -1,7 +1,5 @@
 """Checks of tasks with values (units, outliers, glitches, stuck sensors, test outside train), and of windows of frames."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -15,8 +13,7 @@ UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", 
 """Units whose name at the end of a column's name, as in depth_mm, is taken for the unit of the column."""
 SPIKE_FRAMES, OUTLYING_FRAMES = 3, 15
 """Longest glitch, a value that leaves and comes back: within the usual range, and beyond it."""
-STUCK_FRAMES = 10
-"""Shortest constant stretch that is reported."""
+STUCK_FRAMES = 10  # shortest constant stretch that is reported
 
 
 def values(pack: Pack) -> list[Finding]:
@@ -35,9 +32,7 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, rec
     measured = {side: rows[np.isfinite(found[rows])] for side, rows in sides.items()}
     if lacking := [side for side, rows in measured.items() if not len(rows)]:
         evidence = f"no row of {' and '.join(lacking)} has a value"
-        return Finding(
-            item=item, verdict="broken", evidence=evidence, advice="measure some, or assign the splits again"
-        )
+        return Finding(item, "broken", evidence, "measure some or assign the splits again")
     rows = np.sort(np.concatenate(list(measured.values())))
     known = found[rows]
     low, middle, high = np.percentile(known, [0, 50, 100])
@@ -54,17 +49,16 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, rec
     wrong = {advice: note for advice, note in checks.items() if note[0]}
     verdict: Verdict = "look" if wrong else "ok"
     return Finding(
-        item=item,
-        verdict=verdict,
-        evidence="; ".join([*evidence, *(text for text, _ in wrong.values())]),
-        advice="; ".join(wrong),
+        item,
+        verdict,
+        "; ".join([*evidence, *(text for text, _ in wrong.values())]),
+        "; ".join(wrong),
         rows=tuple(row for _, suspicious in wrong.values() for row in suspicious),
     )
 
 
 _SIDES = {"train": ("train", "val"), "test": ("test",)}
-Note = tuple[str, list[int]]
-"""What is wrong ("" = nothing), and the rows to look at."""
+Note = tuple[str, list[int]]  # what is wrong ("" = nothing), and the rows to look at
 
 
 def _recordings(pack: Pack, window: Window) -> list[np.ndarray]:
@@ -73,10 +67,8 @@ def _recordings(pack: Pack, window: Window) -> list[np.ndarray]:
         _, place = places(pack, window)
     except ValueError:
         return []
-    return [
-        rows[np.argsort(place[rows], kind="stable")]
-        for rows in map(pack.rows_of, range(int(pack.touch_groups.max()) + 1))
-    ]
+    touches = map(pack.rows_of, range(int(pack.touch_groups.max()) + 1))
+    return [rows[np.argsort(place[rows], kind="stable")] for rows in touches]
 
 
 def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
@@ -179,12 +171,12 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     """Return whether the recordings of ``pack`` have the frames that ``window`` asks for: gaps, rates and length."""
     item = f"windows of {window.frames} frames, stride {window.stride:g}"
     if part:
-        return Finding(item=item, verdict="not checkable", evidence="a part of the items has gaps: examine all of them")
+        return Finding(item, "not checkable", "a part of the items has gaps: examine all of them")
     try:
         name, place = places(pack, window)
         _, whole = frames_of(pack, window)
     except ValueError as error:
-        return Finding(item=item, verdict="broken", evidence=str(error), advice="training refuses these windows, too")
+        return Finding(item, "broken", str(error), "training refuses these windows, too")
     steps = [np.diff(place[rows]) for rows in _recordings(pack, window) if len(rows) > 2]
     rates = np.array([np.median(step) for step in steps])
     gaps = sum(int((step > 2.5 * rate).sum()) for step, rate in zip(steps, rates, strict=True))
@@ -193,9 +185,8 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     if gaps:
         with_gaps = sum((step > 2.5 * rate).any() for step, rate in zip(steps, rates, strict=True))
         longest = max(step.max() / rate for step, rate in zip(steps, rates, strict=True))
-        evidence.append(
-            f"{gaps} gaps in {share(int(with_gaps), len(steps))} touches, the longest of {longest:.3g} frames"
-        )
+        touches = f"{share(int(with_gaps), len(steps))} touches"
+        evidence.append(f"{gaps} gaps in {touches}, the longest of {longest:.3g} frames")
         advice.append("a window across a gap shows an older frame than asked: split the touches there")
     if len(rates) and rates.max() > 1.25 * rates.min():
         evidence.append(f"frames are {rates.min():.3g} apart in some touches and {rates.max():.3g} in others")
@@ -203,6 +194,5 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     if too_short := set(pack.touch_groups.tolist()) - set(pack.touch_groups[whole].tolist()):
         evidence.append(f"{share(len(too_short), int(pack.touch_groups.max()) + 1)} touches are shorter than a window")
         advice.append("their first frame repeats in every row: give fewer frames or a smaller stride")
-    return Finding(
-        item=item, verdict="look" if advice else "ok", evidence="; ".join(evidence), advice="; ".join(advice)
-    )
+    verdict: Verdict = "look" if advice else "ok"
+    return Finding(item, verdict, "; ".join(evidence), "; ".join(advice))

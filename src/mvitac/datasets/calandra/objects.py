@@ -3,8 +3,6 @@
 Sources: github.com/robertocalandra/the-feeling-of-success (repairs, shuffle); github.com/ligerfotis/mvitac (the lists).
 """
 
-from __future__ import annotations
-
 import random
 from collections import Counter
 from collections.abc import Sequence

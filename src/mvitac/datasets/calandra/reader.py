@@ -15,8 +15,6 @@ Sources: the owners' scripts (github.com/robertocalandra/the-feeling-of-success)
 split by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for their 32 and 8 objects.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -42,8 +40,7 @@ from mvitac.datasets.calandra.objects import (
 from mvitac.registry import to_json, unknown
 from mvitac.system.files import brief, digest
 
-VERSION = 1
-"""Version of this reader. Increase it when the same shards would give another pack."""
+VERSION = 1  # version of this reader. Increase it when the same shards would give another pack.
 Phase = Literal["before", "during", "after"]
 NUM_SHARDS, NUM_PER_SHARD, NUM_GRASPS = 38, 250, 9296
 SHARD = re.compile(r"calandra_corl2017_(\d{3})\.h5")
@@ -191,9 +188,8 @@ class Calandra(Source):
         where = f"{grasp.shard:03d}-{grasp.index:03d}"
         with h5py.File(grasp.file) as file:
             for phase in (phase for phase in PHASES if phase in self.config.phases):
-                left, right, vision = (
-                    _image(file, f"{name}_{phase}", grasp) for name in ("gelsightA", "gelsightB", "kinectA_rgb")
-                )
+                names = (f"{name}_{phase}" for name in ("gelsightA", "gelsightB", "kinectA_rgb"))
+                left, right, vision = (_image(file, name, grasp) for name in names)
                 if left.shape != right.shape:
                     raise ValueError(
                         f"{grasp.file.name} i{grasp.index}: gelsightA_{phase} is {left.shape}, gelsightB_{phase} is"

@@ -11,8 +11,6 @@ A sample is a pair: both cameras at the time of a table row. From a video, the f
 used, so cameras may have different rates. If it is farther away than ``tolerance``, the image is missing.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -31,8 +29,7 @@ from mvitac.registry import unknown
 from mvitac.system.files import brief, digest, read_json
 
 VERSION = "v3.0"
-FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)
-"""Usual names of tactile cameras."""
+FELT = re.compile(r"touch|tactile|gelsight|digit(?!al)|gel\b|finger", re.IGNORECASE)  # usual names of tactile cameras
 RENAMED = {"episode_index": "episode", "frame_index": "frame", "index": "id"}
 """Columns of the format -> names in a pack."""
 SCALARS = {"float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool", "string"}
@@ -194,11 +191,8 @@ def _frames(
         for name in ("timestamp", "episode_index", "frame_index", *images):
             if name not in opened.schema_arrow.names:
                 raise ValueError(f"{file} has no column {name!r}: fetch it again")
-        names = [
-            name
-            for name in opened.schema_arrow.names
-            if name in scalars or name in vectors or name in RENAMED or name == "timestamp"
-        ]
+        wanted = {*scalars, *vectors, *RENAMED, "timestamp"}
+        names = [name for name in opened.schema_arrow.names if name in wanted]
         for group in range(opened.num_row_groups):
             for place, values in enumerate(opened.read_row_group(group, columns=names).to_pylist()):
                 if values["frame_index"] % every:

@@ -3,8 +3,6 @@
 Images are embedded as PNG, without loss. An episode is a touch group; timestamps are nominal (``fps``).
 """
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterator
@@ -21,15 +19,12 @@ from mvitac.datasets.lerobot.reader import RENAMED, VERSION
 from mvitac.system.files import write_json
 from mvitac.system.locks import new_folder
 
-ROWS_PER_GROUP = 100
-"""Rows per parquet row group, which is the smallest unit of reading."""
-FILE_BYTES = 100 << 20
-"""Size after which the next data file begins, as in lerobot."""
+ROWS_PER_GROUP = 100  # rows per parquet row group, which is the smallest unit of reading
+FILE_BYTES = 100 << 20  # size after which the next data file begins, as in lerobot
 FILES_PER_CHUNK = 1000
 TAKEN = {"timestamp", "task_index", "task", *RENAMED, *RENAMED.values()}
 """Column names reserved by the format or by our reader; a pack column of such a name is renamed."""
-NUM_FOR_STATS = 256
-"""Number of images used for mean and standard deviation."""
+NUM_FOR_STATS = 256  # number of images used for mean and standard deviation
 ONE_FILE = "chunk-000/file-000.parquet"
 
 
@@ -42,9 +37,8 @@ def check_fps(fps: float) -> None:
 def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
     """Write the rows of ``pack`` that have every modality to the new folder ``out``, and return their number.
 
-    Raises:
-        Busy: If another process writes ``out``.
-        ValueError: If ``out`` exists or cannot be written, or no row has every modality.
+    Raises Busy if another process writes ``out``; ValueError if it exists, cannot be written, or no row has every
+    modality.
     """
     check_fps(fps)
     rows = pack.rows("train", "val", "test", "unlabelled", having=pack.spec.modalities)
@@ -137,14 +131,8 @@ def _write_data(
 ) -> list[tuple[int, int]]:
     """Write the data files; return (chunk, file) of each episode, which is in a single file."""
     picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    kinds = {
-        "int64": pa.int64(),
-        "float32": pa.float32(),
-        "float64": pa.float64(),
-        "bool": pa.bool_(),
-        "string": pa.string(),
-        "image": picture,
-    }
+    kinds = {"int64": pa.int64(), "float32": pa.float32(), "float64": pa.float64(), "bool": pa.bool_()}
+    kinds |= {"string": pa.string(), "image": picture}
     schema = pa.schema([(name, kinds[feature["dtype"]]) for name, feature in features.items()])
     homes: list[tuple[int, int]] = []
     writer: pq.ParquetWriter | None = None

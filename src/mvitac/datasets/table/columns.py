@@ -1,7 +1,5 @@
 """Converts a manifest's text cells to a pack's columns: labels, controls, groups, splits and ids."""
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -23,12 +21,10 @@ class Selection:
     """The rows of a manifest that become samples; all lists have one entry per row."""
 
     manifest: Manifest
-    numbers: list[int]
-    """Row numbers in the manifest, counted from 1."""
+    numbers: list[int]  # row numbers in the manifest, counted from 1
     rows: list[dict[str, str]]
     refs: Refs
-    backgrounds: list[Background]
-    """One per touch column; empty for raw images."""
+    backgrounds: list[Background]  # one per touch column; empty for raw images
 
     @property
     def where(self) -> str:
@@ -73,9 +69,7 @@ def read_task(selected: Selection, column: str, counts: Sequence[bool]) -> tuple
     labelled = sum(bool(cell) for cell in cells)
     if len(names) < 2:
         what = f"only the class {min(names)!r}" if names else "no labels"
-        raise ValueError(
-            f"{selected.where}: column {column!r} has {what} in {len(cells)} rows: a task needs two classes"
-        )
+        raise ValueError(f"{selected.where}: column {column!r} has {what} in {len(cells)} rows: a task needs two")
     if len(names) == labelled >= 10:
         raise ValueError(
             f"{selected.where}: column {column!r} has another value in each of its {labelled} rows (e.g."
@@ -96,11 +90,7 @@ def element_of(name: str) -> tuple[str, int]:
 
 
 def with_elements(manifest: Manifest, names: Iterable[str]) -> Manifest:
-    """Return ``manifest`` with a column for each of ``names`` that is an element of a vector, e.g. state[2], from 0.
-
-    Raises:
-        ValueError: If no cell of the vector is that long.
-    """
+    """Return ``manifest`` with a column for each of ``names`` that is an element of a vector, e.g. state[2], from 0."""
     made: dict[str, list[str]] = {}
     for name in names:
         vector, number = element_of(name)
@@ -153,9 +143,7 @@ def read_values(
                 columns[target.name][i] = value
     for name, found in columns.items():
         if len({value for value in found if value == value}) < 2:  # NaN differs from itself
-            raise ValueError(
-                f"{selected.where}: column {name!r} has fewer than two different values: nothing to predict"
-            )
+            raise ValueError(f"{selected.where}: column {name!r} has fewer than two values: nothing to predict")
     known = [
         [0 if any(not math.isnan(columns[t.name][i]) for t in task.targets) else -1 for i in range(len(counts))]
         for task in tasks
@@ -206,9 +194,8 @@ def split_rows(
 ) -> list[str]:
     """Return the split of each row: read from ``column``, or assigned by group, and checked.
 
-    Args:
-        shares: Fractions of the groups in test and in val, for ``BY_GROUP``.
-        allow_leak: Accept a group, touch group or image in more than one split.
+    ``shares``: fractions of the groups in test and in val, for ``BY_GROUP``. ``allow_leak`` accepts a group, touch
+    group or image in more than one split.
     """
     where = selected.where
     if column == BY_GROUP:

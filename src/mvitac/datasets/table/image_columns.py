@@ -3,8 +3,6 @@
 Row numbers count from 1, row indices from 0.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,10 +11,8 @@ from mvitac.data.source import Stamp, stamp_of
 from mvitac.datasets.table.image_refs import ImageRef
 from mvitac.datasets.table.manifest import Condition, Manifest
 
-NUM_NO_CONTACT = 16
-"""Number of no-contact frames that are averaged to a sensor's background."""
-Refs = dict[str, list[ImageRef | None]]
-"""Image column -> one reference per row; None where the row has no image."""
+NUM_NO_CONTACT = 16  # number of no-contact frames that are averaged to a sensor's background
+Refs = dict[str, list[ImageRef | None]]  # image column -> one reference per row; None where the row has no image
 Background = dict[int, tuple[ImageRef, ...]]
 """Row number -> the no-contact images whose mean is subtracted from the row's touch image."""
 
@@ -138,8 +134,7 @@ def check_files(
 ) -> tuple[list[int], dict[str, Stamp]]:
     """Check that every image file exists and is not empty.
 
-    Returns:
-        The file size of each image of each row (for the fingerprint), and the stamp of each file by its path.
+    Returns the file size of each image of each row (for the fingerprint), and the stamp of each file by its path.
     """
     stamps: dict[str, Stamp] = {}
     missing: list[str] = []

@@ -3,8 +3,6 @@
 References with the same container (a video, a row group) are read together in one pass.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 from abc import ABC, abstractmethod
@@ -25,8 +23,7 @@ from mvitac.system.files import brief
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 
 
-Damage = dict["ImageRef", str]
-"""Reference of a damaged image -> what is wrong with it."""
+Damage = dict["ImageRef", str]  # reference of a damaged image -> what is wrong with it
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +42,11 @@ class ImageRef(ABC):
 
     @staticmethod
     @abstractmethod
-    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
-        """Yield each reference with its image as RGB.
+    def read(refs: "Sequence[ImageRef]", lost: Damage) -> "Iterator[tuple[ImageRef, Image.Image]]":
+        """Yield each reference with its image as RGB; damaged images go to ``lost`` instead.
 
-        Args:
-            refs: References in ascending order, all of one class and with one container.
-            lost: Receives the damaged images, which are not yielded.
-
-        Raises:
-            ValueError, OSError: If the container cannot be opened.
+        ``refs`` are in ascending order, all of one class and with one container. ValueError or OSError if that cannot
+        be opened.
         """
 
 

@@ -3,8 +3,6 @@
 Cells are text, whatever the file format. Rows are counted from 1, without the header.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import operator
@@ -29,8 +27,7 @@ from mvitac.registry import unknown
 from mvitac.system.files import brief, digest, digest_file, parse_json
 
 MANIFESTS = (".csv", ".parquet", ".jsonl")
-NAN = ("nan", "NaN", "NAN")
-"""How programs write a missing number. "Nan" is a name."""
+NAN = ("nan", "NaN", "NAN")  # how programs write a missing number. "Nan" is a name.
 COMPARE: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 
 
@@ -53,7 +50,7 @@ class Manifest:
     @classmethod
     def of(
         cls, root: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]] | None = None
-    ) -> Manifest:
+    ) -> "Manifest":
         """Return the table of ``rows`` that a reader made from the files below ``root``."""
         columns = tuple(dict.fromkeys(name for row in rows for name in row))
         return cls(root, root, columns, rows, digest(rows), found or {})
@@ -62,7 +59,7 @@ class Manifest:
         if column not in self.columns and column not in self.found:
             raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
 
-    def normalised(self, paths: Collection[str | None]) -> Manifest:
+    def normalised(self, paths: Collection[str | None]) -> "Manifest":
         """Return this table with the cells in one form (``normal``), except in the columns of ``paths``.
 
         Else two ways to type a name would be two classes, or one object in train and in test.
@@ -223,9 +220,8 @@ def _check_header(file: Path, columns: Sequence[str]) -> None:
 def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bool = False) -> Manifest:
     """Return the manifest of a tree of class folders (the layouts are in ``mvitac.datasets.folder``).
 
-    Args:
-        pictures: Modality of the images if the tree has no folders for modalities.
-        allow_missing: Leave a cell empty where an image has no counterpart.
+    ``pictures`` is the modality of the images if no folders name it; ``allow_missing`` leaves a cell without image
+    empty.
     """
     rows: list[dict[str, str]] = []
     for split in _split_folders(root) or [""]:
@@ -234,9 +230,7 @@ def list_class_folders(root: Path, *, pictures: str = "touch", allow_missing: bo
     for number, row in enumerate(rows, 1):
         if len(row) < len(columns) and not allow_missing:
             lacking = next(name for name in columns if name not in row)
-            raise ValueError(
-                f"{root} has {lacking} images in some splits only (row {number} has none): add or remove them"
-            )
+            raise ValueError(f"{root} has {lacking} images in some splits only (row {number} has none): add or remove")
     rows = [{name: row.get(name, "") for name in columns} for row in rows]
     if not rows:
         raise ValueError(f"{root} holds no images ({', '.join(IMAGES)}): put them in <class> folders")
@@ -274,9 +268,7 @@ def _split_rows(root: Path, split: str, pictures: str, allow_missing: bool) -> l
         label, *below = key.split("/")
         if not below:
             raise ValueError(f"{first} is not in a class folder: put it in one, named by its class")
-        row = {
-            name: images[key].relative_to(root).as_posix() if key in images else "" for name, images in found.items()
-        }
+        row = {n: images[key].relative_to(root).as_posix() if key in images else "" for n, images in found.items()}
         group = key.rpartition("/")[0] if len(below) > 1 else f"{split}/{key}"
         rows.append({**row, "label": label, "group": group, **({"split": split} if split else {})})
     return rows
@@ -302,7 +294,7 @@ class Condition:
     value: str
 
     @classmethod
-    def parse(cls, text: str) -> Condition:
+    def parse(cls, text: str) -> "Condition":
         match = re.fullmatch(r"\s*([^<>=!]+?)\s*(<=|>=|!=|=)\s*([^<>=!]*?)\s*", text)
         if match is None:
             raise ValueError(f"condition {text!r}: write column=value, column!=value, column<=number or column>=number")

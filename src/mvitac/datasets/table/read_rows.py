@@ -1,7 +1,5 @@
 """Reads the images of a table's rows, those of one video (or row group, ...) together."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

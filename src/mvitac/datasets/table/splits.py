@@ -1,7 +1,5 @@
 """Train/val/test splits: assign whole groups to splits, or validate a given split column."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -20,20 +18,11 @@ BY_GROUP = "by-group"
 def assign_splits(
     groups: Sequence[str], targets: Sequence[Sequence[int]], test_share: float, val_share: float, seed: int
 ) -> list[str]:
-    """Assign whole groups to train, val and test, stratified by the classes of the first label.
+    """Split of each row: whole ``groups`` go to train, val and test, stratified by the classes of the first label.
 
     The first group of each class goes to train and each further group to the split with the largest deficit, so a class
-    with one group is never tested. Groups without any label are "unlabelled" if other groups are labelled.
-
-    Args:
-        groups: Group of each row.
-        targets: For each task, the class number of each row (-1 = unlabelled).
-        test_share: Fraction of groups in test.
-        val_share: Fraction of groups in val.
-        seed: Random seed.
-
-    Returns:
-        The split of each row.
+    with one group is never tested. Groups without any label are "unlabelled" if other groups are labelled. ``targets``:
+    class number of each row for each task (-1 = unlabelled); the shares are fractions of the groups.
     """
     votes: dict[str, Counter[int]] = {group: Counter() for group in groups}
     known: set[str] = set()
@@ -61,30 +50,20 @@ def assign_splits(
 def group_by_video(
     root: Path, numbers: Sequence[int], refs: Iterable[Sequence[ImageRef | None]]
 ) -> tuple[str, list[str]]:
-    """Group rows that no column groups: by video, with videos that occur in the same row as one group.
+    """What a group is ("video" or "row") and the group of each row, for rows that no column groups.
 
-    A row of image files is its own group.
-
-    Args:
-        root: Folder that names of videos are relative to.
-        numbers: Row numbers.
-        refs: For each image column, one reference per row.
-
-    Returns:
-        What a group is ("video" or "row"), and the group of each row.
+    Videos that occur in the same row are one group. A row of image files is its own group. ``refs`` has one reference
+    per row for each image column.
     """
     columns = list(refs)
-    videos = [
-        [os.path.relpath(ref.path, root) for column in columns if isinstance(ref := column[i], Frame)]
-        for i in range(len(numbers))
-    ]
+    rows = [[column[i] for column in columns] for i in range(len(numbers))]
+    videos = [[os.path.relpath(ref.path, root) for ref in row if isinstance(ref, Frame)] for row in rows]
     parent: dict[str, str] = {}  # union-find
     for shown in videos:
         for video in shown[1:]:
             parent[_root(parent, video)] = _root(parent, shown[0])
-    groups = [
-        _root(parent, shown[0]) if shown else f"{number:06d}" for number, shown in zip(numbers, videos, strict=True)
-    ]
+    shown_in = zip(numbers, videos, strict=True)
+    groups = [_root(parent, shown[0]) if shown else f"{number:06d}" for number, shown in shown_in]
     return "video" if any(videos) else "row", groups
 
 
@@ -140,11 +119,8 @@ def check_sides(
     for task, target in zip(tasks, targets, strict=True):
         for side in ("train", "test"):
             if not any(label >= 0 and s == side for label, s in zip(target, splits, strict=True)):
-                hint = (
-                    "give more groups, or another --data.test-share"
-                    if split == BY_GROUP
-                    else "a probe needs train and test"
-                )
+                more = "give more groups, or another --data.test-share"
+                hint = more if split == BY_GROUP else "a probe needs train and test"
                 raise ValueError(f"{where}: {what} gives label {task.name!r} no labelled rows in {side}: {hint}")
 
 
@@ -174,8 +150,7 @@ def add_folds(rows: Sequence[dict[str, str]], strata: Sequence[str], num: int, v
             row[column] = split
 
 
-SCALE = 1_000_000
-"""Fractions are integers in millionths, so that the result is the same on every machine."""
+SCALE = 1_000_000  # fractions are integers in millionths, so that the result is the same on every machine
 
 
 def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.ndarray:
@@ -183,15 +158,8 @@ def stratify(counts: np.ndarray, shares: tuple[float, ...], seed: int) -> np.nda
 
     Starts from a random assignment and moves one group, or exchanges two, as long as that lowers the sum of squared
     differences from ``shares``. Rows and groups count equally: the number of rows limits the precision of a score, the
-    number of groups its confidence interval. A class with a single group does not count.
-
-    Args:
-        counts: [G, C], number of rows of each group in each class.
-        shares: Fraction of each split.
-        seed: Random seed of the initial assignment.
-
-    Returns:
-        [G] int64, the index in ``shares`` of each group's split.
+    number of groups its confidence interval. A class with a single group does not count. ``counts`` [G, C] is the
+    number of rows of each group in each class. Returns int64 [G], the index in ``shares`` of each group's split.
     """
     num = len(counts)
     if not num:

@@ -3,8 +3,6 @@
 The table is checked completely before the first image is decoded.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
@@ -43,12 +41,10 @@ from mvitac.datasets.table.splits import BY_GROUP, group_by_video
 from mvitac.registry import LATER, to_json
 from mvitac.system.files import digest
 
-VERSION = 3
-"""Version of this reader. Increase it when the same table would give another pack."""
+VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
 CONTROL_NAMES = ("majority", "pixels", "border", "untrained", "imagenet")
 """Controls that every probe computes by itself."""
-MAX_TOGETHER = 1024
-"""Rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``."""
+MAX_TOGETHER = 1024  # rows of one video that are read in one pass, if their images fit into ``MAX_TOGETHER_BYTES``
 MAX_TOGETHER_BYTES = 600 << 20
 """Memory per worker for these images at the stored size: 1024 rows of two gels and a camera at 256 px."""
 
@@ -224,10 +220,8 @@ class Rows(Source):
 
         row_bytes = 3 * config.size**2 * sum(bool(column) for column in (self._vision, *self._touch))
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
-        self._stamps = [
-            one_stamp((*stamps[ref.path], *ref.within()) for i in item for ref in self._rows[i].refs())
-            for item in self._items
-        ]
+        used = [[ref for i in item for ref in self._rows[i].refs()] for item in self._items]
+        self._stamps = [one_stamp((*stamps[ref.path], *ref.within()) for ref in refs) for refs in used]
         tasks_with_classes = tuple(task for task, _ in read)
         self._spec = self._describe(tasks_with_classes, tuple(value_tasks), grouping.group_by, controls)
 
@@ -285,9 +279,8 @@ class Rows(Source):
             group_by, groups = group_by_video(selected.manifest.root, selected.numbers, selected.refs.values())
         touch_group = self._config.touch_group
         touch_groups = selected.filled(touch_group, "touch_group") if touch_group else groups
-        return Grouping(
-            groups=groups, group_by=group_by, touch_groups=touch_groups, touch_group_by=touch_group or group_by
-        )
+        shared = touch_group or group_by
+        return Grouping(groups=groups, group_by=group_by, touch_groups=touch_groups, touch_group_by=shared)
 
     def _make_rows(
         self, selected: Selection, own: dict[str, Sequence[Any]], extra: dict[str, list[float]]

@@ -1,7 +1,5 @@
 """Frame counts and times of a video, read without decoding it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

@@ -5,8 +5,6 @@ train_rough.txt  test_rough.txt   1 rough, 0 smooth
 label.txt                         every labelled frame, if the other lists are missing
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -32,8 +30,7 @@ CLASSES = (
     ),
     *("rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others"),
 )
-SOFT = (7, 8, 9, 11, 13)
-"""Categories that the owners call soft; the others are hard."""
+SOFT = (7, 8, 9, 11, 13)  # categories that the owners call soft; the others are hard
 LISTS_AT = "https://github.com/fredfyyang/Touch-and-Go, folder 'Visuo-tactile contrastive learning/dataset'"
 LIST_FILES = ("train.txt", "test.txt", "train_rough.txt", "test_rough.txt", "label.txt")
 NUM_ROWS = {"train.txt": 91_982, "test.txt": 29_879, "train_rough.txt": 35_119, "test_rough.txt": 8_085}
@@ -49,13 +46,11 @@ class Frame:
     number: int
     category: int = -1
     rough: int = -1
-    listed: str = ""
-    """train or test: the category list that it is in."""
+    listed: str = ""  # train or test: the category list that it is in
     listed_rough: str = ""
     split: str = "unlabelled"
     split_rough: str = "unlabelled"
-    touch: int = 0
-    """Number of the first frame of its run."""
+    touch: int = 0  # number of the first frame of its run
 
 
 def read_list(file: Path, num_classes: int) -> list[tuple[str, int, int]]:
@@ -89,9 +84,7 @@ def read_lists(folder: Path) -> list[Frame]:
     elif not present and (folder / "label.txt").is_file():
         _add_list(known, folder / "label.txt", "label", False)
     else:
-        raise ValueError(
-            f"{folder} has no train.txt and test.txt: they are in {LISTS_AT}; give their folder as --data.lists"
-        )
+        raise ValueError(f"{folder} has no train.txt and test.txt: give their folder as --data.lists ({LISTS_AT})")
     labelled = [frame for frame in known.values() if frame.category >= 0 or frame.rough >= 0]
     return sorted(labelled, key=lambda frame: (frame.recording, frame.number))
 

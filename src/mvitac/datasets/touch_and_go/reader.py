@@ -10,8 +10,6 @@ are in the owners' repository (see ``lists.py``). One pack has all three tasks; 
 label -1.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,10 +44,8 @@ from mvitac.datasets.touch_and_go.recordings import (
 from mvitac.registry import to_json
 from mvitac.system.files import digest, digest_file
 
-VERSION = 1
-"""Version of this reader. Increase it when the same files would give another pack."""
-CHUNK = 256
-"""Frames of one recording that a worker holds at a time (100 MB of pairs at 256 px)."""
+VERSION = 1  # version of this reader. Increase it when the same files would give another pack.
+CHUNK = 256  # frames of one recording that a worker holds at a time (100 MB of pairs at 256 px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,9 +116,7 @@ class TouchAndGo(Source):
         self._config, self._lists = config, _lists_folder(config)
         listed = read_lists(self._lists)
         if config.split == "official" and listed[0].listed == "label":
-            raise ValueError(
-                f"{self._lists} has no train.txt and test.txt, which the official split needs: see {LISTS_AT}"
-            )
+            raise ValueError(f"{self._lists} has no train.txt and test.txt, for the official split: see {LISTS_AT}")
         self._num_listed = len(listed)
         self._num_names = len({frame.recording for frame in listed})
         recordings, missing = _find_recordings(config, sorted({frame.recording for frame in listed}))
@@ -135,10 +129,8 @@ class TouchAndGo(Source):
             assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
         self._recordings = {recording.name: recording for recording in recordings}
         self._chunks = _chunks([*listed, *_unlabelled(listed, recordings, config)])
-        self._stamps = [
-            one_stamp(self._recordings[chunk[0].recording].stamps([frame.number for frame in chunk]))
-            for chunk in self._chunks
-        ]
+        frames = [(chunk[0].recording, [frame.number for frame in chunk]) for chunk in self._chunks]
+        self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
         notes = leaks(listed) if config.split == "official" else []
         if missing:
             notes.append(missing_report(missing, self._num_names))

@@ -3,8 +3,6 @@
 Each modality of a recording is an mp4 file or a folder of JPEGs named by frame number (the layout is in ``reader.py``).
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import re
@@ -102,15 +100,12 @@ def missing_report(missing: dict[str, str], num: int) -> str:
     by_reason: dict[str, list[str]] = defaultdict(list)
     for name, why in missing.items():
         by_reason[why].append(name)
-    parts = [
-        f"{why} ({len(names)}): {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}"
-        for why, names in sorted(by_reason.items())
-    ]
+    each = [(f"{why} ({len(names)})", ", ".join(names[:8]), len(names) > 8) for why, names in sorted(by_reason.items())]
+    parts = [f"{what}: {first}{', ...' * more}" for what, first, more in each]
     return f"{len(missing)} of {num} listed recordings cannot be packed: {'; '.join(parts)}"
 
 
-Shape = tuple[int, int]
-"""Height and width."""
+Shape = tuple[int, int]  # height and width
 
 
 def read_frames(

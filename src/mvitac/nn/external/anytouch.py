@@ -5,8 +5,6 @@ weights were at hand; no owner's code is used. AnyTouch's convolution in three d
 its channels are frames and its depth is colour. The 2-D ``embeddings.patch_embedding`` of that file is not used.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from typing import ClassVar

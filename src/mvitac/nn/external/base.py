@@ -8,8 +8,6 @@ An adapter is one file: a subclass of ``Adapter`` whose fields are its options. 
 weights were at hand when the adapters were written: they are tested on small weights with the owners' names and shapes.
 """
 
-from __future__ import annotations
-
 import copy
 import typing
 from abc import ABC, abstractmethod
@@ -36,19 +34,13 @@ STATISTICS = {"imagenet": IMAGENET, "clip": CLIP, "none": PLAIN}
 class Loaded:
     """What an adapter opened."""
 
-    network: nn.Module
-    """As ``ExternalEncoder`` takes it."""
+    network: nn.Module  # as ``ExternalEncoder`` takes it
     preprocessing: Preprocessing
-    title: str
-    """Its name in tables."""
-    files: tuple[Path, ...] = ()
-    """Files with its weights."""
-    licence: str = UNKNOWN
-    """Licence of the weights."""
-    source: str = UNKNOWN
-    """Where they are from."""
-    trained_on: str = UNKNOWN
-    """The data it was trained on; ``NOTHING`` for random weights."""
+    title: str  # its name in tables
+    files: tuple[Path, ...] = ()  # files with its weights
+    licence: str = UNKNOWN  # licence of the weights
+    source: str = UNKNOWN  # where they are from
+    trained_on: str = UNKNOWN  # the data it was trained on; ``NOTHING`` for random weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,9 +94,8 @@ class Adapter(Registered, ABC):
 
     def changed(self, made: Preprocessing) -> Preprocessing:
         """``made`` with the values that options give."""
-        changes: dict[str, Any] = {
-            n: getattr(self, n) for n in ("frames", "stride", "offset") if getattr(self, n) is not None
-        }
+        options = ("frames", "stride", "offset")
+        changes: dict[str, Any] = {n: getattr(self, n) for n in options if getattr(self, n) is not None}
         for name, at in (("mean", 0), ("std", 1)):
             if text := getattr(self, name):
                 changes[name] = STATISTICS[text][at] if text in STATISTICS else _numbers(text, name, float, "/")
@@ -141,7 +132,7 @@ class OpenEncoder:
     loaded: Loaded
     encoder: ExternalEncoder
 
-    def untrained(self) -> OpenEncoder | None:
+    def untrained(self) -> "OpenEncoder | None":
         """The same network with random weights; None if it has no weights here, or random ones already."""
         network = self.loaded.network
         if self.loaded.trained_on == NOTHING or not any(p.is_floating_point() for p in network.parameters()):
@@ -177,11 +168,7 @@ def seeded(build: Callable[[], nn.Module], seed: int) -> nn.Module:
 
 
 def open_encoder(text: str) -> OpenEncoder:
-    """Open the encoder that ``text`` names (module docstring).
-
-    Raises:
-        ValueError: If there is no such encoder, an option is unknown, or the network does not take such images.
-    """
+    """Open the encoder that ``text`` names (module docstring); ValueError if that is not possible."""
     adapter = parse(text)
     loaded = adapter.load()
     given = {name: getattr(adapter, name) for name in ("licence", "trained_on") if getattr(loaded, name) == UNKNOWN}

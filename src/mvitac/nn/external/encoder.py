@@ -3,8 +3,6 @@
 Shapes: B images, S sensors, F frames, D features, P places.
 """
 
-from __future__ import annotations
-
 import copy
 import hashlib
 from dataclasses import dataclass
@@ -23,8 +21,7 @@ class Layout:
 
     sensors: int = 1
     frames: int = 1
-    gain: float = 0.0
-    """2 for difference images, (image - background) / 2 + 128; 0 for plain ones."""
+    gain: float = 0.0  # 2 for difference images, (image - background) / 2 + 128; 0 for plain ones
 
 
 class Plain(nn.Module):
@@ -48,11 +45,9 @@ class Plain(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         found = self.forward_features(images)
-        return (
-            found.mean((2, 3))
-            if found.ndim == 4
-            else found[:, min(self.num_prefix_tokens, found.shape[1] - 1) :].mean(1)
-        )
+        if found.ndim == 4:
+            return found.mean((2, 3))
+        return found[:, min(self.num_prefix_tokens, found.shape[1] - 1) :].mean(1)
 
 
 class ExternalEncoder(nn.Module):
@@ -88,7 +83,7 @@ class ExternalEncoder(nn.Module):
             raise ValueError(f"the network returned {list(found.shape)} for two images: expected features [2, D]")
         self.num_features = self.width = found.shape[1]
 
-    def bound(self, layout: Layout) -> ExternalEncoder:
+    def bound(self, layout: Layout) -> "ExternalEncoder":
         """The same encoder, with the same weights, for images of ``layout``."""
         made = copy.copy(self)
         made.layout, made.num_features = layout, self.width * layout.sensors

@@ -3,8 +3,6 @@
 Shapes: N images, F frames (newest first), H x W pixels.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -18,8 +16,7 @@ Three = tuple[float, float, float]
 PLAIN: tuple[Three, Three] = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 IMAGENET: tuple[Three, Three] = (IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
 CLIP: tuple[Three, Three] = (OPENAI_CLIP_MEAN, OPENAI_CLIP_STD)
-NO_CONTACT = 128 / 255
-"""The value of no contact in difference images, (image - background) / 2 + 128."""
+NO_CONTACT = 128 / 255  # the value of no contact in difference images, (image - background) / 2 + 128
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +62,7 @@ class Preprocessing:
         if self.offset is not None and not 0 <= self.offset <= 1:
             raise ValueError(f"offset {self.offset}: give 0 to 1; 0.5 keeps no contact grey")
 
-    def resized_to(self, size: tuple[int, int]) -> Preprocessing:
+    def resized_to(self, size: tuple[int, int]) -> "Preprocessing":
         """The same for another input size; the margin of a centre crop grows with it."""
         shorter = None if self.shorter is None else round(self.shorter * min(size) / min(self.size))
         return replace(self, size=size, shorter=shorter)
@@ -75,11 +72,10 @@ class Preprocessing:
         return self._laid_out(torch.zeros(1, self.frames, 3, 1, 1)).shape[1:-2] + self.size
 
     def __call__(self, images: Tensor, gain: float = 0.0) -> Tensor:
-        """Prepare images [N, F, 3, H, W], uint8 or float in [0, 1], of at least one frame.
+        """Prepare images [N, F, 3, H, W], uint8 or float in [0, 1], newest first.
 
-        Args:
-            images: Frames, newest first. Missing older ones are the oldest there is; further ones are left out.
-            gain: For difference images the factor that undoes their scale; 0 for plain images.
+        Missing older frames are the oldest there is; further ones are left out. For difference images ``gain`` undoes
+        their scale; it is 0 for plain images.
         """
         last = 0 if self.still else images.shape[1] - 1
         images = images[:, [min(f, last) for f in range(self.frames)]]

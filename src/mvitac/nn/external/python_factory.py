@@ -10,8 +10,6 @@ The module maps normalised images to features [B, D], tokens [B, P, D] or maps [
 "licence", "source", "trained_on" and "prefix" (tokens in front that are no places).
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable

@@ -6,8 +6,6 @@ code. No owner's code is used. MViTac's notebooks number the stages of torchvisi
 or without a name in front; with strict=False they would load nothing.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import ClassVar
@@ -31,9 +29,8 @@ class Notebooks(Adapter):
         tensors = read_tensors(self.path())
         if not any(name == "0.weight" for name in tensors):
             tensors = {re.sub(r"^[a-z]\w*\.", "", name): value for name, value in tensors.items()}
-        return _loaded(
-            self, under(tensors, "", NUMBERS), 256, "MViTac notebooks", "https://github.com/ligerfotis/mvitac"
-        )
+        made = under(tensors, "", NUMBERS)
+        return _loaded(self, made, 256, "MViTac notebooks", "https://github.com/ligerfotis/mvitac")
 
 
 @dataclass(frozen=True, kw_only=True)

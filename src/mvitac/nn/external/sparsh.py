@@ -5,8 +5,6 @@ huggingface.co/facebook/sparsh-*. No owner's weights were at hand; no owner's co
 The configs of I-JEPA and V-JEPA set no register, but the files have one: the file decides.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 

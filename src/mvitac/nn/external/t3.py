@@ -4,8 +4,6 @@ Names, shapes and preprocessing were read from alanzjl/t3 @341177f and huggingfa
 No owner's weights were at hand; no owner's code is used.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import ClassVar

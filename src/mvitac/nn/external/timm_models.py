@@ -3,8 +3,6 @@
 Preprocessing is that of the model's ``pretrained_cfg`` (huggingface/pytorch-image-models @aa4b585).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,9 +29,8 @@ class Timm(Adapter):
 
     def load(self) -> Loaded:
         if self.place.endswith(".openai") and "quickgelu" not in self.place:
-            raise ValueError(
-                f"{self.place}: OpenAI's weights need QuickGELU: {self.place.replace('_clip_', '_clip_quickgelu_')}"
-            )
+            quick = self.place.replace("_clip_", "_clip_quickgelu_")
+            raise ValueError(f"{self.place}: OpenAI's weights need QuickGELU: {quick}")
         known = {"pretrained": IMAGENET, "random": SCRATCH}
         try:
             network = seeded(partial(self._built, known.get(self.weights, self.weights)), self.seed)

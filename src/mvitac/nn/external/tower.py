@@ -3,8 +3,6 @@
 Widths and depths are taken from the file. A head has 64 channels in every transformer here, as in ViT-Ti, S, B and L.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import re
@@ -24,8 +22,7 @@ from mvitac.nn.weights import read_safetensors
 from mvitac.system.files import brief
 
 Tensors = dict[str, Tensor]
-HEAD = 64
-"""Channels of an attention head."""
+HEAD = 64  # channels of an attention head
 
 
 def read_tensors(file: Path) -> Tensors:
@@ -54,9 +51,8 @@ def under(tensors: Tensors, start: str, names: Mapping[str, str] = {}) -> Tensor
 
 def depth(tensors: Tensors, start: str = "blocks.") -> int:
     """Number of blocks: one more than the largest number after ``start``."""
-    return 1 + max(
-        (int(found[1]) for n in tensors if (found := re.match(rf"{re.escape(start)}(\d+)\.", n))), default=-1
-    )
+    found = (re.match(rf"{re.escape(start)}(\d+)\.", name) for name in tensors)
+    return 1 + max((int(match[1]) for match in found if match), default=-1)
 
 
 def shape(adapter: Adapter, tensors: Tensors, name: str, dims: int) -> tuple[int, ...]:
@@ -167,7 +163,7 @@ class Tower(nn.Module):
         z = self.head(tokens[:, self.num_prefix_tokens :].mean(1) if self.mean else tokens[:, 0])
         return z if self.scale is None else self.scale * F.normalize(z, dim=1)
 
-    def resize(self, size: tuple[int, int]) -> Tower:
+    def resize(self, size: tuple[int, int]) -> "Tower":
         """This tower for images of another size: learned positions are interpolated."""
         places = self.positions[0, self.placed :].unflatten(0, self.grid).permute(0, 3, 1, 2)
         grid = patches(size, self.patch)

@@ -4,8 +4,6 @@ Names, shapes and preprocessing were read from Max-Fu/tvl @f489503 and huggingfa
 No owner's weights were at hand; no owner's code is used.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -5,8 +5,6 @@ the code they come with is named. No owner's weights were at hand; no owner's co
 key and value more than tokens (``bias_k``, ``bias_v``), and tokens are not normalised before the first block.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -18,11 +16,9 @@ from mvitac.nn.external.base import Adapter, Loaded
 from mvitac.nn.external.preprocessing import CLIP, Preprocessing
 from mvitac.nn.external.tower import HEAD, projection, read_tensors, shape, tower, under
 
-PREFIX = 6
-"""Leading characters of every name in the file that the owner drops."""
+PREFIX = 6  # leading characters of every name in the file that the owner drops
 NAMES = {"cls_token": "front", "rgbt_stem.proj.1": "embed", "pos_embedding_helper.pos_embed": "positions"}
-LENGTH = 5.0
-"""Length of the features."""
+LENGTH = 5.0  # length of the features
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,58 @@
+"""Retrieval across modalities: a touch finds the picture of its group in the space that both share, and back."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvitac.data.pack import Pack
+from mvitac.evaluation import diagnostics
+from mvitac.evaluation.features import features
+from mvitac.evaluation.probe import group_numbers
+from mvitac.model import Model
+
+MIN_GALLERY = 11  # least number of test groups; with fewer, the first five are half of all groups or more
+
+
+def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor]:
+    """Projections [len(rows), E] of each modality into the space that they share, on the CPU."""
+    device = next(model.parameters()).device
+    z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in ("touch", "vision")}
+    return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
+
+
+def retrieved_rows(pack: Pack) -> np.ndarray:
+    """Test rows with all modalities, of the phase that the first task is about."""
+    only = pack.spec.tasks[0].only if pack.spec.tasks else None
+    return pack.rows("test", only=only, having=pack.spec.modalities)
+
+
+def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:
+    """Retrieval of groups across modalities among ``rows`` (default: ``retrieved_rows``), one record per direction.
+
+    A record has R@1, R@5, R@10, chance level R@5 and the hits at 5 of each group. There is none without a shared space,
+    on data of one modality, or with fewer than ``MIN_GALLERY`` groups.
+    """
+    if len(model.projectors) < 2 or len(pack.spec.modalities) < 2:
+        return []
+    rows = retrieved_rows(pack) if rows is None else rows
+    sizes = np.bincount(group_numbers(pack, rows))
+    if len(sizes) < MIN_GALLERY:
+        return []
+    z, groups = shared_space(model, pack, rows), torch.from_numpy(group_numbers(pack, rows))
+    records = []
+    for query, gallery in (("vision", "touch"), ("touch", "vision")):
+        ranks = diagnostics.retrieval_ranks(z[query], z[gallery], groups)
+        hits = np.bincount(groups.numpy(), weights=(ranks < 5).numpy(), minlength=len(sizes)).astype(int)
+        records.append(
+            {
+                "direction": f"{query} -> {gallery}",
+                **diagnostics.recall_at(ranks),
+                "chance R@5": min(1.0, 5 / len(sizes)),
+                "num_groups": len(sizes),
+                "group_sizes": sizes.tolist(),
+                "group_correct": hits.tolist(),
+            }
+        )
+    return records
