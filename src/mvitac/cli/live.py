@@ -101,7 +101,8 @@ def live(argv: list[str]) -> None:
     recorder = None
     if options.record:
         channels = {m: s[2] for m, s in frame_shapes(engine).items()}
-        recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as)
+        said_so = {"tell": lambda text: _say(console, text, "yellow")}
+        recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as, **said_so)
     loop = _loop(engine, streams, options.live, console, nearest=nearest, record=recorder)
     said: list[Any] = []
     with _lines(options.predictions) as write:
