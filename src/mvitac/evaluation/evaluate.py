@@ -1,6 +1,7 @@
 """Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from html import escape
@@ -132,7 +133,7 @@ def probe_runs(
         found_of = ((n, m, r) for n, m in found_by for r in sensor_records(m, pack))
         result["sensors"] = [{"source": n, "seed": m.run.seed, **r} for n, m, r in found_of]
     for path in paths:
-        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
+        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result, sealed=True)
     return Scores(result)
 
 
@@ -194,7 +195,9 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
         asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
         scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
         same = result["pack"] == pack.digest and result["models"] == _digests(paths)
-    except (ValueError, KeyError, TypeError):  # 0.1.0 wrote the scores of the run alone
+    except (ValueError, KeyError, TypeError) as error:  # 0.1.0 wrote the scores of the run alone
+        if isinstance(error, ValueError) and (paths[0] / "probe.json").exists():
+            print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)
         return None
     whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
     whole &= not asked.standardise
