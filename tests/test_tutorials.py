@@ -76,7 +76,8 @@ def test_later_pages_run(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch
                 Image.fromarray(pack.images[modality][row]).save(f"my_sensor/{name}")
             table.writerow([*names.values(), pack.labels("bright")[row], pack.column("group")[row]])
     names: dict[str, Any] = {"__name__": "encoders"}
-    code = [source for page in ("encoders", "policies") for kind, source in cells(DOCS / f"{page}.md") if kind == "code"]
+    pages = DOCS / "encoders.md", DOCS / "policies.md"
+    code = [source for page in pages for kind, source in cells(page) if kind == "code"]
     assert len(code) == 6  # one of each section
     for source in code:
         exec(compile(source, "page", "exec"), names)
