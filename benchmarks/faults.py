@@ -43,8 +43,10 @@ from mvitac.cli.main import COMMANDS as ALL
 from mvitac.cli.main import main as mvitac
 from mvitac.data.pack import Pack
 from mvitac.evaluation.features import features
+from mvitac.evaluation.leaks import FILE, read_sources
 from mvitac.model import load, safetensors_digest
 from mvitac.run import load_run
+from mvitac.system.files import read_json
 from mvitac.training import checkpoint
 from mvitac.training.step import Step
 
@@ -218,7 +220,12 @@ def kills(base: Path, name: str, points: int) -> dict[str, Any]:
 
 def readers(base: Path) -> dict[str, tuple[list[Path], Callable[[], Any]]]:
     """What is flipped: name -> files, and a function that reads them and returns their content."""
-    run, _ = load_run(base / "run")
+    words = f"probe {base}/run --probes knn --no-controls --json {base}/scores.json".split()
+    os.environ["MVITAC_CACHE"] = str(base / "probed")
+    if child(lambda: mvitac(words), base / "said"):
+        raise RuntimeError((base / "said").read_text())
+    run, record = load_run(base / "run")
+    probed = read_json(base / "scores.json", "scores")
     model, pack = load(base / "run"), Pack(base / "pack")
     method = run.method.build(pack.spec, run.encoder)
     os.environ["MVITAC_CACHE"] = str(base / "cache")
@@ -244,6 +251,14 @@ def readers(base: Path) -> dict[str, tuple[list[Path], Callable[[], Any]]]:
         images = {m: hashlib.sha256(np.ascontiguousarray(i).tobytes()).hexdigest() for m, i in found.images.items()}
         return found.spec, found.num, found.size, found.digest, found.table.to_pydict(), images
 
+    def recorded() -> Any:
+        found, scores = load_run(base / "run"), read_json(base / "run" / "probe.json", "scores")
+        learned = [
+            [s.name, s.ids.tolist(), s.groups.tolist()] for s in read_sources(base / "run", run, None, pack) or ()
+        ]
+        # An entry more is a flipped name of the digest itself, without which the file is read as it is.
+        return found[0], [found[1][name] for name in record], [scores[name] for name in probed], learned
+
     def computed() -> Any:
         return np.array_equal(features(model, pack, "touch", rows), known)
 
@@ -253,6 +268,7 @@ def readers(base: Path) -> dict[str, tuple[list[Path], Callable[[], Any]]]:
         "model": ([base / "run" / "model.safetensors"], trained),
         "pack": (files, packed),
         "feature cache": (cached, computed),
+        "records": ([base / "run" / name for name in ("run.json", "probe.json", FILE)], recorded),
     }
 
 

@@ -52,6 +52,10 @@ READING = {
     "explore": "explore {base}/run --port 0",
     "find": "find {base}/table/touch0.png --in {base}/index --from touch --to vision",
     "completion": "completion bash",
+    "pretrain mix": "pretrain --recipe smoke --data mix --data.parts a={base}/pack:1 b={base}/pack:2 --augment.size 16"
+    " --steps 2 --batch-size 8 --eval-every 0 --quiet --out {out}/m",
+    "bench board": "bench board {base}/result.json --out {out}/board.html",
+    "bench check": "bench check {base}/result.json",
 }
 COMMANDS = {**WRITING, **READING}
 """One call of each command that works; ``base`` holds its inputs."""
@@ -220,9 +224,11 @@ def main(argv: list[str] | None = None) -> int:
         for words in (
             f"export {base}/run --format onnx --rows 4 --out {base}/export",
             f"index {base}/pack --model {base}/run --out {base}/index",
+            f"bench {base}/run --suite {base}/suite.toml --data-root {base} --out {base}/results",
         ):
             if child(lambda words=words: mvitac(words.split()), said):  # type: ignore[misc]
                 raise RuntimeError(said.read_text())
+        next((base / "results").glob("*.json")).rename(base / "result.json")
         made = [one for name in chosen.commands for one in calls(name, base, out)]
         rng, num = np.random.default_rng(chosen.seed), min(chosen.calls or len(made), len(made))
         picked = np.sort(rng.permutation(len(made))[:num])

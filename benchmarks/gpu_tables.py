@@ -62,7 +62,7 @@ def step_table(found: dict[str, Any]) -> str:
             rows.append(
                 [batch, shown, "not possible" if lost else figures[0], *figures[1:], number(row.get("peak_gib"))]
             )
-    heads = ["batch", "step", "pairs/s", "of the floor", "of the matrix-product peak", "times typical", "peak GiB"]
+    heads = ["batch", "step", "pairs/s", "share of floor", "share of matrix-product peak", "times typical", "peak GiB"]
     return table(heads, rows, 2)
 
 

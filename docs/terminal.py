@@ -44,7 +44,7 @@ def screen(output: str) -> list[str]:
             lines += [""] * (row == len(lines))
         elif code.endswith("A"):
             row -= int(code[2:-1] or 1)
-        elif code.endswith("K"):
+        elif code.endswith("K") or code == "\r":
             lines[row] = ""
     while lines and not lines[-1].strip():
         lines.pop()

@@ -1,6 +1,6 @@
 """The tutorials run: every cell of every page, in order, in an empty folder; their notebooks hold the same cells.
 
-So does the how-to page docs/encoders.md, on the files that a tutorial leaves.
+So do the how-to pages docs/add_a_dataset.md, and docs/encoders.md and policies.md on the files that a tutorial leaves.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from PIL import Image
 from mvitac.data.pack import Pack
 from support.processes import begin, finish
 
-PAGES = sorted(p for p in (Path(__file__).parents[1] / "docs/tutorials").glob("*.md") if p.name != "index.md")
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted(p for p in (DOCS / "tutorials").glob("*.md") if p.name != "index.md")
 
 
 def cells(file: Path) -> list[tuple[str, str]]:
@@ -46,7 +47,7 @@ def run(page: Path, folder: Path) -> None:
             assert main(arguments) == 0, command
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", [*PAGES, DOCS / "add_a_dataset.md"], ids=lambda p: p.stem)
 def test_every_cell_runs(page: Path, tmp_path: Path) -> None:
     """In a process of its own: a tutorial may register a method that the other tests must not see."""
     (folder := tmp_path / "folder").mkdir()
@@ -60,7 +61,7 @@ def test_notebook_is_the_page(page: Path) -> None:
     assert not any(cell.get("outputs") for cell in jupytext.read(notebook).cells)
 
 
-def test_encoders_page_runs(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_later_pages_run(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the folder that "Your own sensor" leaves."""
     monkeypatch.chdir(tmp_path)
     Path("artifacts").mkdir()
@@ -75,11 +76,10 @@ def test_encoders_page_runs(artifact: Path, pack: Pack, tmp_path: Path, monkeypa
                 Image.fromarray(pack.images[modality][row]).save(f"my_sensor/{name}")
             table.writerow([*names.values(), pack.labels("bright")[row], pack.column("group")[row]])
     names: dict[str, Any] = {"__name__": "encoders"}
-    page = Path(__file__).parents[1] / "docs/encoders.md"
-    code = [source for kind, source in cells(page) if kind == "code"]
-    assert len(code) == 5  # one of each section
+    code = [source for page in ("encoders", "policies") for kind, source in cells(DOCS / f"{page}.md") if kind == "code"]
+    assert len(code) == 6  # one of each section
     for source in code:
-        exec(compile(source, page.name, "exec"), names)
+        exec(compile(source, "page", "exec"), names)
     assert names["features"]["touch"].shape == (72, 64) and names["scores"].mean() > 0.75  # chance is .5
     assert np.allclose(
         names["theirs"](Image.open(names["touches"][0])), names["prepare"](names["touches"][0]), atol=1e-5

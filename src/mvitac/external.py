@@ -93,10 +93,12 @@ class ExternalModel(Model):
         return tuple(dict.fromkeys(part.loaded.trained_on for part in self.parts.values()))
 
     def on(self, pack: Pack) -> "tuple[ExternalModel, Pack]":
-        """This model and ``pack``, for each other; ValueError if they do not fit.
+        """This model and ``pack``, for each other.
 
-        The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows
-        yet.
+        The pack gets windows if an encoder wants several frames, the pack can order its frames, and it has no windows yet.
+
+        Raises:
+            ValueError: If the data has no image that this model reads, or the windows that were asked for are impossible.
         """
         parts = {m: part for m, part in self.parts.items() if m in pack.spec.modalities}
         if not parts:
@@ -186,7 +188,11 @@ def is_noncommercial(licence: str) -> bool:
 
 
 def load_external(text: str) -> ExternalModel:
-    """Open the encoders that ``text`` names: one, or one for each sense joined by "+"."""
+    """Open the encoders that ``text`` names: one, or one for each sense joined by "+".
+
+    Raises:
+        ValueError: If there is no such encoder, or two encoders read the same sense.
+    """
     texts = [START + part for part in text.removeprefix(START).split(f"+{START}")]
     opened = [open_encoder(each) for each in texts]
     parts: dict[str, OpenEncoder] = {}

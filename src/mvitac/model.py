@@ -39,15 +39,19 @@ class Model(nn.Module):
     ``embed`` and ``predict`` take raw images of any kind and compute no gradients. ``forward`` takes tensors and computes
     gradients, so the model can be trained further like any torch module.
 
-    ``spec`` describes the training data; ``stored`` is the side in pixels of its images, to which raw images are first
-    resized.
+    Args:
+        method: The method, trained or not.
+        run: The run that trains it.
+        spec: Description of the training data.
+        stored: Side in pixels of the images in the training pack. Raw images are first resized to it.
 
     Attributes:
         encoders: modality -> trunk.
         projectors: modality -> head into the shared space.
         tasks: Names of the tasks of the method's own heads (``classifiers``); empty for a self-supervised method.
         probes: Name -> linear probe, if the model is a published artifact.
-        foreign: Whether it is from an artifact or an index, maybe a stranger's: no place that ``run`` names is opened.
+        foreign: Whether it is from an artifact or an index, which may be a stranger's: no place that ``run`` names is
+            opened.
     """
 
     foreign = False
@@ -92,15 +96,22 @@ class Model(nn.Module):
     def forward(
         self, *unnamed: Tensor, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False
     ) -> dict[str, Tensor]:
-        """Features of batches of images, with gradients, for fine-tuning: modality -> [B, D].
+        """Features of batches of images, with gradients, for fine-tuning.
 
         The features are those of ``embed``. After loading, the model is in eval mode: BatchNorm keeps its statistics.
-        ``train()`` changes that, as for any torch module. Images need the name of their modality.
+        ``train()`` changes that, as for any torch module.
 
         Args:
+            unnamed: Not allowed: images need the name of their modality.
             vision: Camera images [B, C, H, W], uint8 or float in [0, 1], e.g. a batch of ``transform("vision")``.
             touch: Tactile images, likewise. For models trained on difference images: the differences.
-            shared: Return embeddings [B, E] in the space shared by both modalities, L2-normalised, instead of features.
+            shared: Return embeddings in the space shared by both modalities, L2-normalised, instead of features.
+
+        Returns:
+            modality -> [B, D], or [B, E] with ``shared``.
+
+        Raises:
+            ValueError: If images do not fit the model.
         """
         if unnamed:
             raise ValueError(f"images need a name: {' or '.join(f'model({m}=images)' for m in self.encoders)}")
@@ -135,9 +146,14 @@ class Model(nn.Module):
     def transform(self, modality: str, *, normalize: bool = False, background: ImageInput | None = None) -> Preprocess:
         """The preprocessing of one image as a function, e.g. for the dataset of a ``DataLoader``.
 
-        It takes a path, PIL image, array or tensor and gives uint8 [C, stored, stored] for ``forward``, or with
-        ``normalize`` the input fp32 [C, S, S] of ``trunk``. It can be pickled. For models trained on difference images,
-        ``background`` is one image of the sensor without contact, to subtract.
+        Args:
+            modality: vision or touch.
+            normalize: Return the normalised input of ``trunk`` instead of the images that ``forward`` takes.
+            background: For models trained on difference images: the sensor without contact, one image, to subtract.
+
+        Returns:
+            A function from an image (path, PIL image, array, tensor) to uint8 [C, stored, stored], or with ``normalize``
+            to fp32 [C, S, S]. It can be pickled.
         """
         self.check_modality(modality)
         self._check_background(modality, background)
@@ -150,6 +166,9 @@ class Model(nn.Module):
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
 
         Its ``pretrained_cfg`` has the input size, mean and std that ``timm.data.resolve_model_data_config`` reads.
+
+        Raises:
+            ValueError: If the model has no such encoder, or it is not a single timm model.
         """
         self.check_modality(modality)
         channels, size = self.spec.channels(modality), self.run.augment.eval_size
@@ -158,10 +177,17 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
-        """Pooled features [B, D] in fp32 of images from a pack (uint8 [B, C, H, W], or floats in [0, 1]), without gradients.
+        """Pooled features of images from a pack, without gradients.
 
-        With ``for_heads`` they are those that ``project`` and ``classify`` take, of images at the size of the training
-        views (``Augment.size``); probes see images at ``Augment.eval_size``.
+        Args:
+            modality: vision or touch.
+            images: uint8 [B, C, H, W], as a pack stores them, or floats in [0, 1].
+            for_heads: Compute the features that ``project`` and ``classify`` take. They see images at the size of the
+                training views (``Augment.size``), while probes see them at ``Augment.whole``.
+            bf16: Compute in bf16.
+
+        Returns:
+            [B, D], fp32.
         """
         check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
@@ -179,15 +205,22 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def classify(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Class probabilities [B, K] of one of ``tasks``, by the head that a supervised method trained.
+        """Class probabilities [B, K] from the classifier that a supervised method trained with its encoders.
 
-        ``features``: modality -> ``features(..., for_heads=True)``.
+        Args:
+            task: One of ``tasks``, with classes.
+            features: modality -> ``features(..., for_heads=True)``.
         """
         return self._answer(task, features).softmax(dim=1)
 
     @torch.no_grad()
     def estimate(self, task: str, features: dict[str, Tensor]) -> Tensor:
-        """Values [B, T] of one of ``tasks`` in their units, as for ``classify``."""
+        """Values [B, T] in their units, from the head that a supervised method trained with its encoders.
+
+        Args:
+            task: One of ``tasks``, with values.
+            features: modality -> ``features(..., for_heads=True)``.
+        """
         return self._answer(task, features)
 
     def _answer(self, task: str, features: dict[str, Tensor]) -> Tensor:
@@ -224,6 +257,9 @@ class Model(nn.Module):
         Returns:
             modality -> [N, D], or [N, E] with ``shared``.
 
+        Raises:
+            ValueError: If images do not fit the model, or the model is in training mode.
+
         Example:
             >>> model.embed(touch=np.zeros((4, 240, 320, 3), np.uint8))["touch"].shape  # doctest: +SKIP
             torch.Size([4, 512])
@@ -258,10 +294,19 @@ class Model(nn.Module):
     def predict(
         self, *, vision: ImageInput | None = None, touch: ImageInput | None = None, background: ImageInput | None = None
     ) -> dict[str, Tensor]:
-        """Classify or measure raw images, given as for ``embed``, with the probes of a published artifact.
+        """Classify or measure raw images with the probes of a published artifact.
 
-        Returns task -> class probabilities [N, K], or values [N, T] in the units of their targets; ``classes`` and
-        ``targets`` name the columns. If both modalities are given, the probes on both are used.
+        Args:
+            vision: As for ``embed``. If both modalities are given, the probes on both are used.
+            touch: As for ``embed``.
+            background: As for ``embed``.
+
+        Returns:
+            task -> class probabilities [N, K], or values [N, T] in the units of their targets. ``classes`` and ``targets``
+            name the columns.
+
+        Raises:
+            ValueError: As for ``embed``, or if the model has no probe on these modalities.
         """
         given = self.embed(vision=vision, touch=touch, background=background)
         asked = "both" if len(given) == 2 else next(iter(given))
@@ -320,8 +365,12 @@ def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
 def load(path: str | Path, which: Which = "last") -> Model:
     """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
 
-    ``which``: weights of a run's folder after its last step, or the best on split val (``Run.eval_every``). ValueError if
-    there is no such model, or the file is damaged or was changed.
+    Args:
+        path: The folder or the file.
+        which: Weights of a run's folder: those after its last step, or the best on split val (``Run.eval_every``).
+
+    Raises:
+        ValueError: If there is no such model, or the file is damaged or was changed.
     """
     path = Path(path)
     file = weights_file(path, which) if path.is_dir() else path

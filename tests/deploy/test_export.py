@@ -234,6 +234,21 @@ def test_bgr_input_is_named(model: Model, tmp_path: Path) -> None:
         parity(graph, bgr, model, pack, rows, wanted, EXACT)
 
 
+def test_refused_roundings_name_what_can_be_done(model: Model, pack: Pack) -> None:
+    graph, rows = ExportModule(model), pack.rows("test")
+    wanted = reference(model, graph, pack, rows)
+
+    def rounded(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        return [np.random.default_rng(0).normal(size=found.shape) for found in run_graph(graph)(arrays)]
+
+    for config, advice in (
+        (ExportConfig(kind="openvino", int8=True), ": use another precision, or allow less"),
+        (EXACT, "$"),
+    ):
+        with pytest.raises(ValueError, match=f"at least {config.min_cosine} is allowed{advice}"):
+            parity(graph, rounded, model, pack, rows, wanted, config)
+
+
 def test_corrupted_weights_in_the_graph_leave_no_export(
     model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

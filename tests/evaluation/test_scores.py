@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.calibration import rates_of_error
+from benchmarks.calibration import rates_of_error, value_rates_of_error
 from scipy.stats import t as student
 
 from mvitac.evaluation.scores import interval, least_p, paired_difference
@@ -25,6 +25,16 @@ def test_error_rates_are_no_more_than_stated(groups: int, equal: bool, seeds: in
     for accuracy, seed_sd in ((0.6, 0.03), (0.9, 0.012)):
         found = rates_of_error(groups, equal, seeds, accuracy, seed_sd, trials=150)
         assert (found["p < .05"] is None) == (seeds == 1)
+        assert found["p < .05"] is None or found["p < .05"] <= 0.07
+        assert found["outside interval"] <= 0.07
+
+
+@pytest.mark.parametrize("equal", [True, False], ids=["equal", "unequal"])
+@pytest.mark.parametrize("groups", [4, 8, 29, 106])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_error_rates_of_values_are_no_more_than_stated(groups: int, equal: bool, seeds: int) -> None:
+    for r2, between in ((0.3, 0.7), (0.9, 0.1)):
+        found = value_rates_of_error(groups, equal, seeds, r2, between, 0.3, trials=150)
         assert found["p < .05"] is None or found["p < .05"] <= 0.07
         assert found["outside interval"] <= 0.07
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -382,6 +383,25 @@ def test_no_error_of_a_driver_ends_a_stream() -> None:
     assert [e.what for e in heard] == ["unplugged", "back"] and "own kind of error" in heard[0].text
 
 
+def test_a_device_that_is_back_is_not_stalled_before_its_first_frame() -> None:
+    """Else "back" is never said, and the sensor is not calibrated again."""
+
+    class Slow(Rig):
+        def read(self) -> np.ndarray:
+            if not self.fault:
+                clock.now += 0.3  # the first frame after opening takes time, while another thread asks
+                stream.check()
+            return super().read()
+
+    clock = Clock()
+    rig, heard = Slow(clock, 0), []
+    stream = Stream("touch", rig, clock=clock, tell=heard.append)
+    for rig.fault in ("", "unplugged", ""):
+        clock.now += 2
+        stream.pump()
+    assert [e.what for e in heard] == ["unplugged", "back"]
+
+
 def test_a_video_is_read_as_rgb(tmp_path: Path) -> None:
     import cv2
 
@@ -506,6 +526,24 @@ def test_a_rate_that_cannot_be_recorded(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=says):
             Recorder(tmp_path / "out", {"touch": 3}, fps=fps, form=form)  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_ends_the_recording_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, write: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    said: list[str] = []
+    recorder = Recorder(tmp_path / "out", {"touch": 3}, fps=1.0, tell=said.append)
+    image = np.zeros((16, 16, 3), np.uint8)
+    for i in range(200):
+        if i == 100:
+            monkeypatch.setattr("mvitac.live.recorder.write_atomic", full)
+        recorder({"touch": image}, {"time": float(i), "contact": True, "touch_number": 1})
+    assert len(said) == 1 and re.search("recording stopped, prediction goes on: .*No space left", said[0])
+    with pytest.raises(OSError, match="No space"):
+        recorder.close()
+    monkeypatch.undo()
+    assert recorder.close() == Pack(tmp_path / "out").num == 128  # as many as were kept until then
 
 
 @pytest.mark.parametrize("form", ["pack", "lerobot"])

@@ -40,7 +40,7 @@ from mvitac.report.galleries import nearest_groups
 from mvitac.report.report import wall_seconds, write_report
 from mvitac.report.tables import retrieval_rows
 from mvitac.run import Run
-from mvitac.system.files import write_json
+from mvitac.system.files import read_json, write_json
 from mvitac.training.loop import train
 
 
@@ -124,7 +124,7 @@ def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def result(materials: Path) -> dict[str, Any]:
-    return json.loads((materials / "probe.json").read_text())
+    return read_json(materials / "probe.json", "scores")
 
 
 def noise(tmp_path: Path, source: Noise, **changes: Any) -> tuple[Path, Pack]:
@@ -388,7 +388,9 @@ def test_one_test_group_proves_nothing(tmp_path: Path) -> None:
     assert "(1 test thing, so no interval)" in card and re.search(r"\| untrained \| \S+ \[0\.0, 100\.0\] \|", card)
 
 
-def test_only_a_complete_result_of_the_same_weights_is_used_again(materials: Path, result: dict[str, Any]) -> None:
+def test_only_a_complete_result_of_the_same_weights_is_used_again(
+    materials: Path, result: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     runs, pack = [materials / "run0", materials / "run1"], Pack(materials / "pack")
     file = runs[0] / "probe.json"
     write_json(file, result)
@@ -406,7 +408,10 @@ def test_only_a_complete_result_of_the_same_weights_is_used_again(materials: Pat
         write_json(file, {**result, **change})
         assert stored_result(runs, pack) is None
     write_json(file, {key: result[key] for key in ("data", "pack", "records", "retrieval")})  # as 0.1.0 wrote it
-    assert stored_result(runs, pack) is None
+    assert stored_result(runs, pack) is None and not capsys.readouterr().err
+    write_json(file, result, sealed=True)
+    file.write_text(file.read_text().replace('"seed": 0', '"seed": 1', 1))
+    assert stored_result(runs, pack) is None and "probe.json does not match its digest" in capsys.readouterr().err
 
 
 def test_wall_time_adds_up_the_logged_speeds(materials: Path) -> None:

@@ -11,6 +11,7 @@ from benchmarks.faults import main
 from benchmarks.fuzz import calls, fuzz
 
 from mvitac.data.pack import Pack
+from mvitac.system.files import read_json, write_json
 from support.processes import begin, finish
 
 
@@ -26,6 +27,28 @@ def test_nothing_is_lost_or_goes_unnoticed(argv: list[str], counts: dict[str, in
     for name, found in json.loads((tmp_path / "said").read_text()).items():
         kinds = {kind: num for kind, num in found.items() if kind not in ("failed", "changes of the disk")}
         assert sum(kinds.values()) == int(argv[-1]) and kinds.items() <= counts.items(), (name, found)
+
+
+def test_any_change_of_a_sealed_file_is_told(tmp_path: Path) -> None:
+    file, value = tmp_path / "run.json", {"steps": 3, "losses": (1.5, 1e-9), "names": {"b": None, "a": "\u00df"}}
+    write_json(file, value, sealed=True)
+    whole = file.read_bytes()
+    assert read_json(file, "a record") == {**value, "losses": [1.5, 1e-9]}
+    silent = []
+    for bit in range(0, 8 * len(whole), 5):
+        file.write_bytes(whole[: bit // 8] + bytes([whole[bit // 8] ^ 1 << bit % 8]) + whole[bit // 8 + 1 :])
+        try:
+            found = read_json(file, "a record")
+        except ValueError:
+            continue
+        if {name: found.get(name) for name in value} != {**value, "losses": [1.5, 1e-9]}:
+            silent.append(bit)
+    assert not silent
+    file.write_bytes(whole.replace(b"3", b"4", 1))
+    with pytest.raises(ValueError, match=r"a record was damaged or edited.*delete the entry"):
+        read_json(file, "a record")
+    file.write_text(json.dumps({"steps": 4}))  # without a digest, as version 0.1.0 wrote
+    assert read_json(file, "a record") == {"steps": 4}
 
 
 def odd_calls(base: Path, said: Path) -> None:

@@ -1,4 +1,4 @@
-"""Validation while training: the start is the line to beat, the best weights are kept, one sentence says how it ended."""
+"""Validation while training: the start is the baseline, the best weights are kept, one sentence says how it ended."""
 
 from __future__ import annotations
 

@@ -225,5 +225,6 @@ def _kept(parts: Path, key: str, about: list[Any], score: Callable[[], Records])
     """The records of a part: those kept, else scored now and kept."""
     path = parts / f"{key[:16]}-{digest([key, *about])[:24]}.json"
     if not path.exists():
-        write_json(path, [trimmed(record) for record in score()])
-    return read_json(path, "a part of a bench")
+        write_json(path, {"records": [trimmed(record) for record in score()]}, sealed=True)
+    kept = read_json(path, "a part of a bench")
+    return kept["records"] if isinstance(kept, dict) else kept  # parts had no seal before 2026-11-23

@@ -78,7 +78,7 @@ def probe(argv: list[str]) -> None:
     print_retrieval(result, say)
     print_sensors(result, say)
     result["records"] += stressed
-    save_json(options.json, result)
+    save_json(options.json, result, sealed=True)
 
 
 def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -> list[dict[str, Any]]:

@@ -120,14 +120,14 @@ def console(json_file: Path | None) -> Any:
     return Console(markup=False, highlight=False, stderr=json_file == STDOUT)
 
 
-def save_json(path: Path | None, value: Any) -> None:
+def save_json(path: Path | None, value: Any, *, sealed: bool = False) -> None:
     """Write ``value`` to the file of a ``--json`` option, if it was given, and say so."""
     from mvitac.system.files import write_json
 
     if path == STDOUT:
         print(json.dumps(value, indent=1, allow_nan=False))
     elif path:
-        write_json(path, value)
+        write_json(path, value, sealed=sealed)
         print(f"written: {path}")
 
 

@@ -128,7 +128,10 @@ class MixedPack(Pack):
 class MixedImages(Lazy):
     """uint8 [N, S, S, C]: the images of several packs, one after another, resized to one side.
 
-    A number among ``pieces`` stands for so many rows without an image, which are zeros.
+    Args:
+        pieces: Images of each pack; a number stands for so many rows without an image, which are zeros.
+        size: Side S in pixels.
+        channels: C.
     """
 
     def __init__(self, pieces: Sequence[Images | int], size: int, channels: int) -> None:

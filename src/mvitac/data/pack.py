@@ -231,7 +231,11 @@ class Pack:
 
     @functools.cached_property
     def presses(self) -> np.ndarray:
-        """int64 [N], number of each row's press: its rows are moments of one press. ValueError without that column."""
+        """int64 [N], number of each row's press (column press): its rows are moments of one press.
+
+        Raises:
+            ValueError: If the pack has no such column.
+        """
         if "press" not in self.table.column_names:
             raise ValueError(
                 "same-press positives need a column 'press', which says which rows are moments of one press: simulate"

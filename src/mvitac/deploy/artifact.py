@@ -64,7 +64,13 @@ class PublishedModel(Model, ModelHubMixin):
     def from_pretrained(
         cls, pretrained_model_name_or_path: str | Path, *, revision: str | None = None, **options: Any
     ) -> "PublishedModel":
-        """The artifact in a folder or on the Hub ("owner/name"); options of ``huggingface_hub.snapshot_download``."""
+        """The artifact in a folder, or of "owner/name" on the Hub.
+
+        Args:
+            pretrained_model_name_or_path: folder or Hub id.
+            revision: branch, tag or commit on the Hub.
+            options: those of ``huggingface_hub.snapshot_download`` (token, cache_dir, local_files_only, force_download).
+        """
         local = Path(pretrained_model_name_or_path)
         return read(local if local.is_dir() else pull(str(pretrained_model_name_or_path), revision, **options))
 

@@ -61,9 +61,11 @@ def parity(
         values = cosines(found[name], wanted[name])
         report["cosine"][name] = {"min": float(values.min()), "mean": float(values.mean())}
         if not values.min() >= (config.min_cosine or 0):
+            rounded = config.int8 or config.precision != "fp32"
+            advice = ": use another precision, or allow less, --min-cosine" if rounded else ""
             raise ValueError(
                 f"the export is not the trained model: {name} has cosine {values.min():.4f} on real inputs, at least"
-                f" {config.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows)}"
+                f" {config.min_cosine} is allowed{explain(model, name.partition('_')[2], found, pack, rows) or advice}"
             )
     for task, known in graph.classes.items():
         labels = labels_of(pack, task, known, rows)

@@ -195,7 +195,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on another pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         _write_weights(model, partial)
-        write_json(partial / "run.json", record)
+        write_json(partial / "run.json", record, sealed=True)
         if learned is not None:
             write_sources(partial, learned)
         start = {"start": start} if (start := record.get("start")) else {}

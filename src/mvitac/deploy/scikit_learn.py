@@ -46,7 +46,11 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
         self.background = background
 
     def fit(self, X: Any, y: Any = None) -> "ImageFeatures":
-        """Load the model. ``X`` and ``y`` are not used."""
+        """Load the model. ``X`` and ``y`` are not used.
+
+        Raises:
+            ValueError: If there is no such model, or it has no such encoder.
+        """
         self.model_ = self.model if isinstance(self.model, Model) else load(self.model)
         for name in self._names():
             self.model_.check_modality(name)
@@ -54,9 +58,17 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
         return self
 
     def transform(self, X: Sequence[Any] | np.ndarray) -> np.ndarray:
-        """Features [N, D] of N images of any kind that ``Model.embed`` takes; for "both" N pairs (vision, touch).
+        """Features of images.
 
-        A data frame of paths is read by its columns "vision" and "touch". ValueError if images do not fit the model.
+        Args:
+            X: N images of any kind that ``Model.embed`` takes; for "both" N pairs (vision, touch). A data frame of paths
+                is read by its columns "vision" and "touch".
+
+        Returns:
+            [N, D] float32.
+
+        Raises:
+            ValueError: If images do not fit the model.
         """
         check_is_fitted(self)
         names = self._names()

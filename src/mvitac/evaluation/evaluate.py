@@ -1,6 +1,7 @@
 """Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from html import escape
@@ -83,14 +84,26 @@ def probe_runs(
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
-    ``pack`` is other data than the runs were trained on; ``encoders`` ("external:...") need it. With ``allow_leak``, its
-    test rows may be rows, or of groups, that a run was trained on. The result of the best ``weights`` is in
-    probe.best.json. ValueError if the runs and the data do not fit together.
+    Example:
+        >>> result = probe_runs([Path("runs/first")], ProbeConfig(probes=("linear", "knn")))
+        >>> result["summary"]["category"]["touch"]["mvitac"]["mean"]
+
+    Args:
+        paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
+        session: What to probe.
+        pack: Other data to probe on. Default: the data the runs were trained on.
+        allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
+        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
+        encoders: Other people's encoders to probe beside the runs ("external:..."). They need ``pack``.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
         "asked" (the config), "models" (digests of the weights) and "encoders" (``ExternalModel.describe``). A record has
         a "leak", which is empty unless its test rows, or their groups, were trained on.
+
+    Raises:
+        ValueError: If a path is no run, a run is given twice, the runs and the data do not fit together, or a run was
+            trained on rows or groups that other data than its own would score.
     """
     if paths or not encoders:
         _check_paths(paths)
@@ -131,7 +144,7 @@ def probe_runs(
         found = ((n, m, r) for n, m in zip(names, models, strict=True) for r in sensor_records(m, pack))
         result["sensors"] = [{"source": n, "seed": m.run.seed, **r} for n, m, r in found]
     for path in paths:
-        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result)
+        write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result, sealed=True)
     return Scores(result)
 
 
@@ -193,7 +206,9 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
         asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
         scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
         same = result["pack"] == pack.digest and result["models"] == _digests(paths)
-    except (ValueError, KeyError, TypeError):  # 0.1.0 wrote the scores of the run alone
+    except (ValueError, KeyError, TypeError) as error:  # 0.1.0 wrote the scores of the run alone
+        if isinstance(error, ValueError) and (paths[0] / "probe.json").exists():
+            print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)
         return None
     whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
     whole &= not asked.standardise
@@ -237,8 +252,9 @@ def check_unseen(
 ) -> list[list[Source] | None]:
     """What each run at ``paths`` learned from; None where that is not known.
 
-    ValueError if a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
-    its own data follows from the split that was chosen, so there the scores only say LEAK.
+    Raises:
+        ValueError: If a run, or a model whose weights it started from, saw what would be scored. What a run itself saw of
+            its own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
     for path, model in zip(paths, models, strict=True):
@@ -284,7 +300,8 @@ def _probe_run(
 def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     """Names of the runs: the method, the recipe if recipes differ, and the folder if runs of one name differ further.
 
-    ValueError if two runs are the same, since they would count as two seeds.
+    Raises:
+        ValueError: If two runs are the same, since they would count as two seeds.
     """
     several = len({model.run.recipe for model in models}) > 1
     names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]

@@ -1,7 +1,7 @@
 """Test rows that a model was trained on: what a run learned from is kept beside it, and compared with what is scored.
 
     <run>/trained_on.safetensors    for each source i: <i>.ids and <i>.groups, sorted hashes (uint64) of the ids and groups
-                                    of the rows trained on; its name in the header
+                                    of the rows trained on; its name in the header. sha256: digest of all
 
 The first source of a run is its own training rows. A run that starts from another model's weights adds the sources of that
 model. A source without rows stands for weights of which nothing says what they were trained on.
@@ -21,7 +21,7 @@ from mvitac.data.row_hashes import row_hashes
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.run import Run
-from mvitac.system.files import brief, write_atomic
+from mvitac.system.files import SEAL, brief, digest, write_atomic
 
 FILE = "trained_on.safetensors"
 UNKNOWN = "unknown"  # a leak that cannot be checked, because nothing says what the run was trained on
@@ -66,8 +66,15 @@ def _same(a: Source, b: Source) -> bool:
 def write_sources(folder: Path, sources: Sequence[Source]) -> None:
     """Write what the run in ``folder`` learns from."""
     arrays = {f"{i}.{key}": getattr(source, key) for i, source in enumerate(sources) for key in ("ids", "groups")}
+    arrays[SEAL] = _digest(sources)
     data = safetensors.numpy.save(arrays, metadata={str(i): source.name for i, source in enumerate(sources)})
     write_atomic(folder / FILE, lambda file: file.write(data))
+
+
+def _digest(sources: Sequence[Source]) -> np.ndarray:
+    """uint8 [32]"""
+    content = [[source.name, source.ids.tolist(), source.groups.tolist()] for source in sources]
+    return np.frombuffer(bytes.fromhex(digest(content)), np.uint8)
 
 
 def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list[Source] | None:
@@ -81,7 +88,11 @@ def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list
             with safetensors.safe_open(folder / FILE, framework="numpy") as file:
                 names = file.metadata()
                 tensors = file.get_tensor
-                return [Source(names[i], tensors(f"{i}.ids"), tensors(f"{i}.groups")) for i in sorted(names, key=int)]
+                seal = tensors(SEAL) if SEAL in file.keys() else None  # noqa: SIM118 # 0.1.0 wrote none
+                found = [Source(names[i], tensors(f"{i}.ids"), tensors(f"{i}.groups")) for i in sorted(names, key=int)]
+            if seal is not None and not np.array_equal(seal, _digest(found)):
+                raise ValueError("it does not match its digest")
+            return found
         except Exception as error:  # safetensors raises several types for damaged files
             raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
     own = pack if pack.digest == digest else _own_pack(folder, run)

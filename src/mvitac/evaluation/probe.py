@@ -55,10 +55,17 @@ class ProbeSplit:
 
 
 def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
-    """Labelled (or measured) rows of ``task`` by split, with an image of ``modality`` ("both": of both, "none": any).
+    """Labelled (or measured) rows of ``task`` by split.
 
-    Without a validation split, a fifth of the training groups is set aside for it. ValueError if no labelled row is
-    left in train or in test, or a target has no different values there.
+    Without a validation split, a fifth of the training groups is set aside for it.
+
+    Args:
+        pack: The data.
+        task: The task whose labels, row filter and split column apply.
+        modality: Rows must have an image of this modality; "both" asks for both, "none" for no image.
+
+    Raises:
+        ValueError: If no labelled row is left in train or in test, or a target has no different values there.
     """
     having = names_in(modality, pack)
     known = pack.answered(task)
@@ -156,7 +163,8 @@ def fit_probe(
 ) -> tuple[Classifier, dict[str, Any]]:
     """Fit one probe on features ``x`` of ``rows.fitted``.
 
-    Returns a function from features [N, D] to class probabilities [N, K], and what was chosen (C of ``linear``).
+    Returns:
+        A function from features [N, D] to class probabilities [N, K], and what was chosen (C of ``linear``).
     """
     labels = labels_of(pack, task)
     y, y_whole, num = labels[rows.train], labels[rows.fitted], len(task.classes)
@@ -204,10 +212,13 @@ def probe_model(
     probes: Sequence[str],
     standardise: tuple[Standardise, ...] = (),
 ) -> list[dict[str, Any]]:
-    """Probe every task and modality that ``model`` has an encoder for, and its own heads ("own") where it has some.
+    """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
 
-    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones. Returns one
-    record per (task, modality, probe): these names and the scores of ``scores.score``.
+    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones.
+
+    Returns:
+        One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
+        model's own head is "own".
     """
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:

@@ -103,7 +103,7 @@ def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
 
     The interval of an accuracy is computed on the logit scale, which keeps it within 0 and 1, around
     (correct + 1) / (rows + 2). Its variance is at least that of independent rows: a few groups that are all right say
-    little.
+    little. That of R2 is computed on the scale of log(1 - R2). Its lower end is -inf if it is below 1 - 1000 (1 - R2).
 
     Args:
         records: One record per seed, all on the same test groups.
@@ -118,8 +118,10 @@ def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
         return mean, least_of(records[0]), 1.0
     groups, seeds = _over_groups(correct.mean(0), sizes), _over_seeds(correct, sizes)
     if "group_sums" in records[0]:
-        margin = _margin(groups, seeds)
-        return mean, mean - margin, min(1.0, mean + margin)
+        error = max(1 - mean, 1e-12)
+        margin = _margin(_heavy_tailed(groups, correct.mean(0), sizes), seeds) / error
+        low = 1 - error * math.exp(margin) if margin < math.log(1000) else -math.inf
+        return mean, low, 1 - error * math.exp(-margin)
     centre = (mean * rows + 1) / (rows + 2)
     per_point = centre * (1 - centre)  # derivative of a probability by its logit
     margin = _margin(_Variance(max(groups.value, per_point / rows), groups.freedom), seeds)
@@ -231,6 +233,17 @@ def _over_groups(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
     off = (squares * zero) ** 2 + 2 * zero * two - 4 * squares * zero * one + 2 * one**2
     trace = off + float((share**2 * (1 + 2 * squares - 4 * w)).sum())
     return _Variance(float(share @ residuals**2), squares**2 / trace)
+
+
+def _heavy_tailed(variance: _Variance, shares: np.ndarray, sizes: np.ndarray) -> _Variance:
+    """``variance`` over groups with fewer degrees of freedom, as squared errors have heavier tails than counts.
+
+    The variance of a sample variance grows with the excess kurtosis k by 1 + k (G - 1) / 2G; k is estimated, and at least 1.
+    """
+    deviations = shares - sizes * shares.sum() / sizes.sum()
+    square = float((deviations**2).mean())
+    excess = float((deviations**4).mean()) / square**2 - 3 if square else 0.0
+    return _Variance(variance.value, 1 / (1 / variance.freedom + max(1.0, excess) / (2 * len(sizes))))
 
 
 def _over_seeds(correct: np.ndarray, sizes: np.ndarray) -> _Variance:

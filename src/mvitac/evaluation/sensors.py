@@ -52,11 +52,17 @@ def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> lis
 def touch_features(
     model: Model, pack: Pack, modality: str, rows: np.ndarray, standardise: tuple[Standardise, ...] = (), *, maps: bool
 ) -> np.ndarray:
-    """``features`` of pack rows (ascending), or ``maps`` [N, P, D]; those of touch by each sensor's statistics.
+    """``features`` of pack rows, those of touch in the statistics of each row's own sensor.
 
-    ``standardise``: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
-    each sensor. features: each sensor's features are standardised by their own mean and standard deviation. colours:
-    those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``. Features of vision stay as they are.
+    Args:
+        model: The model.
+        pack: The data.
+        modality: vision (nothing is changed) or touch.
+        rows: Pack rows, ascending.
+        standardise: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
+            each sensor. features: each sensor's features are standardised by their own mean and standard deviation.
+            colours: those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``.
+        maps: Return the trunk's last feature maps [N, P, D] instead of features [N, D].
     """
     if modality != "touch" or not standardise:
         return features(model, pack, modality, rows, maps=maps)
@@ -84,7 +90,10 @@ def touch_features(
 def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     """A copy of ``model`` whose touch encoder has the BatchNorm statistics of the touch images of ``rows``.
 
-    Source: Schneider et al., https://arxiv.org/abs/2006.16971. ValueError if the encoder has no BatchNorm.
+    Source: Schneider et al., https://arxiv.org/abs/2006.16971.
+
+    Raises:
+        ValueError: If the encoder has no BatchNorm.
     """
     made = copy.deepcopy(model)
     trunk = made.encoders["touch"]

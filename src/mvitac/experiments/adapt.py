@@ -82,7 +82,7 @@ def adapt(
             found = _scores(scored, one, known, retrieval=name != TRANSFER)
             records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
     result = {"ancestor": str(ancestor), "group_by": pack.spec.group_by, "records": records}
-    write_json(out / "adapted.json", result)
+    write_json(out / "adapted.json", result, sealed=True)
     return result
 
 

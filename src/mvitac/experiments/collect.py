@@ -157,7 +157,7 @@ def _encoders(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, lis
         return kept["records"], described, names
     records = probe_encoders(bound, *chosen(work.pack, session), session.probes, controls=session.controls)
     if bound:
-        write_json(path, {"key": key, "records": records})
+        write_json(path, {"key": key, "records": records}, sealed=True)
     return records, described, names
 
 
@@ -176,7 +176,7 @@ def _controls(work: Work, out: Path, session: ProbeConfig) -> tuple[Records, Rec
         return kept["records"], kept["retrieval"]
     tasks, modalities = chosen(work.pack, session)
     records, retrieval = controls_of(runs, work.pack, tasks, modalities, session.probes, session.imagenet)
-    write_json(path, {"key": key, "records": records, "retrieval": retrieval})
+    write_json(path, {"key": key, "records": records, "retrieval": retrieval}, sealed=True)
     return records, retrieval
 
 

@@ -51,7 +51,7 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     say("3/4 probing the frozen features and the controls")
     with shown(console):
         result = probe_runs(paths, ProbeConfig(), pack)
-    write_json(out / "probe.json", result)
+    write_json(out / "probe.json", result, sealed=True)
     write_json(out / "summary.json", result["summary"])
     say("4/4 drawing the report")
     with shown(console):

@@ -122,7 +122,7 @@ def finetune(
         "chosen": {f"{percent:g}": settings for percent, (_, settings) in found.items()},
         "models": [str(job.folder(asked.fractions[-1]) / f"seed{seed}") for seed in range(asked.seeds)],
     }
-    write_json(out / "scores.json", result)
+    write_json(out / "scores.json", result, sealed=True)
     return result
 
 
@@ -218,7 +218,8 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
             own = own_heads(load(path), job.pack, job.tasks, [job.modality])
             own = job.named(own, kind, percent, seed, read_sources(path, run, job.pack.digest, job.pack))
             own = [{**record, "run": str(path)} for record in own]
-            write_json(path / "scores.json", {"data": job.pack.spec.name, "pack": job.pack.digest, "records": own})
+            scores = {"data": job.pack.spec.name, "pack": job.pack.digest, "records": own}
+            write_json(path / "scores.json", scores, sealed=True)
             records += own
         frozen = [_frozen(job, percent, seed, task) for task in job.tasks]
         records += job.named(frozen, FROZEN, percent, seed, sources)
@@ -252,7 +253,7 @@ def _held_out_score(job: _Job, percent: float, kind: str, settings: dict[str, An
         held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
         found = own_heads(model, job.pack, job.tasks, [job.modality], held)
         tried[name] = float(np.mean([record["r2" if "r2" in record else "accuracy"] for record in found]))
-        write_json(file, tried)
+        write_json(file, tried, sealed=True)
         job.say(f"{percent:g} %: {name}: {100 * tried[name]:.1f} on held-out {job.pack.spec.group_by}s")
     shutil.rmtree(work, ignore_errors=True)
     return tried[name]

@@ -124,7 +124,7 @@ def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -
     try:
         train(job.run, job.out, resume=True, quiet=quiet, loggers=loggers, pack=pack)
     except Diverged as error:
-        write_json(job.out / "failed.json", {"error": str(error)})
+        write_json(job.out / "failed.json", {"error": str(error)}, sealed=True)
         return f"diverged: {error}"
     if measured:
         write_json(job.out / "memory.json", {"peak_bytes": torch.cuda.max_memory_allocated(gpu)})
@@ -132,9 +132,10 @@ def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -
     if job.stress:
         records = stress(load(job.out), pack, *chosen(pack, job.session))
         own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
-        write_json(job.out / "stress.json", {"asked": job.asked, "records": [{**own, **record} for record in records]})
+        found = {"asked": job.asked, "records": [{**own, **record} for record in records]}
+        write_json(job.out / "stress.json", found, sealed=True)
     scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
-    write_json(job.out / "scores.json", scores)
+    write_json(job.out / "scores.json", scores, sealed=True)
     job.drop_checkpoint()
     return f"{seconds_of(job.out):.0f} s of training"
 

@@ -89,11 +89,18 @@ class Live:
         record: Callable[[dict[str, np.ndarray], dict[str, Any]], None] | None = None,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> None:
-        """``streams``: one per camera and sensor, by modality; two touch sensors are stacked in channels.
+        """
+        Args:
+            engine: the exported model.
+            streams: one stream per camera and sensor, by modality; two touch sensors are stacked in channels.
+            config: contact detection and display.
+            clock: time in seconds, that of the streams.
+            nearest: turns the engine's outputs into descriptions of known touches.
+            record: called with every pair that was used (images, columns).
+            tell: called with every fault as it happens, in the thread that noticed it.
 
-        ``clock`` is that of the streams, in seconds. ``nearest`` turns the engine's outputs into descriptions of known
-        touches. ``record`` is called with every pair that was used (images, columns), ``tell`` with every fault as it
-        happens, in the thread that noticed it. ValueError if the engine takes other inputs.
+        Raises:
+            ValueError: the engine takes other inputs.
         """
         _check_inputs(engine, streams)
         self.engine, self.streams, self.config, self.clock = engine, streams, config, clock

@@ -20,12 +20,23 @@ SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
 
 class Recorder:
-    """Call it with every pair; ``close`` makes the pack or dataset. At most ``fps`` pairs per second are kept."""
+    """Call it with every pair; ``close`` makes the pack or dataset. At most ``fps`` pairs per second are kept.
+
+    Recording ends when pairs cannot be written (a full disk); ``tell`` gets a sentence, and prediction goes on.
+    """
 
     def __init__(
-        self, out: Path, channels: dict[str, int], *, fps: float = 10.0, form: Literal["pack", "lerobot"] = "pack"
+        self,
+        out: Path,
+        channels: dict[str, int],
+        *,
+        fps: float = 10.0,
+        form: Literal["pack", "lerobot"] = "pack",
+        tell: Callable[[str], object] = print,
     ) -> None:
         """Record into the new folder ``out``; ``channels``: modality -> C of its images, uint8 [S, S, C].
+
+        ``tell`` is called when recording ends early.
 
         ``fps`` is the maximum number of pairs per second, a whole number for lerobot.
         """
@@ -36,7 +47,7 @@ class Recorder:
         if out.exists():
             raise ValueError(f"{out} already exists: choose another --record, or delete it first")
         check_place(out)
-        self.out, self.every = out, 1 / fps
+        self.out, self.every, self.tell, self.failed = out, 1 / fps, tell, False
         self.spool = out.with_name(out.name + ".spool")
         if self.spool.exists():
             raise ValueError(
@@ -60,7 +71,7 @@ class Recorder:
     def __call__(self, images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
         """Keep one pair if the last one is long enough ago; ``columns`` has at least time, contact and touch_number."""
         time = columns["time"]
-        if time < self._next:
+        if time < self._next or self.failed:
             return
         # Counted from the last due time, not from this pair, as every delay would lower the rate. Pairs that were missed
         # (at the start, in a gap) are not replaced by more later.
@@ -69,7 +80,11 @@ class Recorder:
             self._next = time + self.every
         self.waiting.append((images, columns))
         if len(self.waiting) == SPOOL:
-            self._flush()
+            try:
+                self._flush()
+            except OSError as error:
+                self.failed = True
+                self.tell(f"recording stopped, prediction goes on: {error.filename}: {error.strerror}")
 
     def _flush(self) -> None:
         if not self.waiting:

@@ -131,7 +131,7 @@ class Stream:
     def check(self) -> None:
         """Report a device that has stopped giving frames; ``pump`` cannot, as it waits for the device."""
         now = self.clock()
-        last = self._newest.time if self._newest else self._opened_at
+        last = max(self._opened_at, self._newest.time) if self._newest else self._opened_at
         if self._open and not self.ended and not self._stalled and now - last > self.stale_after:
             self._stalled = True
             self._say("stalled", f"gives no frames since {now - last:.1f} s")

@@ -111,22 +111,38 @@ def brief(error: BaseException) -> str:
     return line if len(line) <= 160 else f"{line[:156].rsplit(' ', 1)[0]} ..."
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as indented JSON, atomically."""
+SEAL = "sha256"
+"""Entry of a sealed JSON file: the ``digest`` of all others."""
+
+
+def write_json(path: Path, value: Any, *, sealed: bool = False) -> None:
+    """Write ``value`` as indented JSON, atomically. With ``sealed`` (objects only), ``read_json`` notices any change."""
     text = json.dumps(value, indent=1, allow_nan=False) + "\n"
+    if sealed:
+        value = json.loads(text)
+        text = json.dumps({**value, SEAL: digest(value)}, indent=1) + "\n"
     write_atomic(path, lambda file: file.write(text.encode()))
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Read a JSON file; ValueError says if it is missing or damaged. ``what`` describes it in the message."""
+    """Read a JSON file; ValueError says if it is missing, damaged or changed. ``what`` describes it in the message.
+
+    Files without a seal, as all of version 0.1.0, are read as they are.
+    """
     try:
-        return parse_json(path.read_text())
+        value = parse_json(path.read_text())
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist: {what} is missing there") from None
     except (IsADirectoryError, NotADirectoryError):
         raise ValueError(f"{path} is a folder, or is below a file: give the file of {what}") from None
     except ValueError as error:  # also: invalid UTF-8, numbers of 5000 digits
         raise ValueError(f"{path} is not valid JSON ({brief(error)}): {what} is damaged") from None
+    if isinstance(value, dict) and SEAL in value and value.pop(SEAL) != digest(value):
+        raise ValueError(
+            f"{path} does not match its digest: {what} was damaged or edited: restore it, or delete it to make it again"
+            f' (to keep an edit, delete the entry "{SEAL}")'
+        )
+    return value
 
 
 def parse_json(text: str) -> Any:

@@ -96,7 +96,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
                 print(f"mvitac: {line}", file=sys.stderr)
             if found := warning(start_weights, pack):
                 print(f"mvitac: warning: {found}", file=sys.stderr)
-        write_json(out / "run.json", {**record, **here, **provenance()})
+        write_json(out / "run.json", {**record, **here, **provenance()}, sealed=True)
     if world.writes and not (out / FILE).exists():
         own = source_of(pack, rows)
         write_sources(out, with_ancestors(own, start_weights.sources if start_weights else []))

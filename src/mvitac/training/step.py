@@ -24,7 +24,17 @@ Chunk = Callable[[], Views]
 
 
 class Step:
-    """Takes one optimiser step when called. ValueError if the method or the trunk does not support these settings."""
+    """Takes one optimiser step when called.
+
+    Args:
+        run: Settings of the optimiser, precision, chunks, recomputation and compilation.
+        method: The method to train, on ``device``.
+        device: Device of the method.
+        world: The processes that train together. Default: this one only.
+
+    Raises:
+        ValueError: If the method or the trunk does not support these settings.
+    """
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world = method, device, world or World()
@@ -43,10 +53,16 @@ class Step:
         self.forward = torch.compile(method, fullgraph=True) if run.compile else method
 
     def __call__(self, chunks: Sequence[Chunk], *, lr: float, seed: int, progress: float) -> dict[str, Tensor]:
-        """Take one step with the ``chunks`` of the batch that this process embeds; returns the detached losses.
+        """Take one step.
 
-        ``seed`` is that of dropout and of random draws in losses; ``progress`` is the share of the run done after this
-        step.
+        Args:
+            chunks: The chunks of the batch that this process embeds.
+            lr: Learning rate.
+            seed: Random seed of dropout and of random draws in losses.
+            progress: Share of the run that is done after this step, from 0 to 1.
+
+        Returns:
+            The losses, detached, on the device.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group.get("lr_scale", 1.0)

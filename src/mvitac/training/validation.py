@@ -1,6 +1,6 @@
 """Evaluation during training on held-out groups (split val, never test): what the features are worth, from step 0 on.
 
-A linear probe, kNN accuracy, retrieval and signs of collapse. The start (step 0) is the line to beat. The best weights are
+A linear probe, kNN accuracy, retrieval and signs of collapse. The start (step 0) is the baseline. The best weights are
 those with the highest mean of the linear probe over tasks and modalities: accuracy of classes, R2 of values (below 0: 0).
 """
 
