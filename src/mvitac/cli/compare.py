@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -60,6 +61,7 @@ class _Options:
     slurm_partition=gpu,timeout_min=600,gpus_per_node=1, and stop; the same command without it makes the tables."""
 
 
+_SAME = ("seeds", "folds", "probes", "stress")  # fields of a plan that are options, too
 _MANUAL = """Many runs into one table: methods x settings x seeds, next to controls and the paper's numbers.
 
     First choose, then change single fields below:
@@ -117,14 +119,8 @@ def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
         raise unknown("recipe", chosen.get("--recipe", plan.recipe), RECIPES)
     data = default(DatasetConfig, chosen["--data"]) if "--data" in chosen else plan.data
     data = data or default(DatasetConfig, "grasps" if plan.name == "table2" else "materials")
-    usual = _Options(
-        data=data,
-        out=Path("runs") / f"compare-{plan.name}-{data.name}",
-        seeds=plan.seeds,
-        folds=plan.folds,
-        probes=plan.probes,
-        stress=plan.stress,
-    )
+    same: Any = {name: getattr(plan, name) for name in _SAME}
+    usual = _Options(data=data, out=Path("runs") / f"compare-{plan.name}-{data.name}", **same)
     choices = {"plans": PLANS, "data": DatasetConfig.choices, "recipes": RECIPES}
     manual = _MANUAL.format(**{name: "|".join(values) for name, values in choices.items()}, recipe=plan.recipe)
     options = parse(_Options, rest, "compare", default=usual, description=manual)
@@ -136,13 +132,6 @@ def _parse(chosen: dict[str, str], rest: list[str], plan: Plan) -> _Options:
 
 def _changed(plan: Plan, recipe: str, options: _Options) -> Plan:
     """``plan`` as the options change it."""
-    return replace(
-        plan.only(options.rows),
-        data=options.data,
-        recipe=recipe,
-        seeds=options.seeds,
-        folds=options.folds,
-        probes=options.probes,
-        stress=options.stress,
-        set={**plan.set, **dict(setting(text) for text in options.set)},
-    )
+    same = {name: getattr(options, name) for name in ("data", *_SAME)}
+    changes = {**plan.set, **dict(setting(text) for text in options.set)}
+    return replace(plan.only(options.rows), recipe=recipe, set=changes, **same)

@@ -85,15 +85,8 @@ def check(argv: list[str]) -> int:
     data: Any = options.data
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
-    findings, blocks = examine_source(
-        source,
-        num=options.items,
-        size=options.thumbnail,
-        workers=data.workers,
-        quiet=options.quiet,
-        window=data.frame_window(),
-    )
-    return _report(name, findings, blocks, options)
+    asked: Any = {"num": options.items, "size": options.thumbnail, "workers": data.workers, "quiet": options.quiet}
+    return _report(name, *examine_source(source, window=data.frame_window(), **asked), options)
 
 
 def _check_places(options: _Options) -> None:

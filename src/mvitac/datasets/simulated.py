@@ -161,18 +161,9 @@ class Materials(Source):
         return [self._moment(*self._address(item), moment, through) for moment, through in numbers]
 
     def _moment(self, category: int, instance: int, touch: int, moment: int, through: int) -> Sample:
-        made = materials.touch(
-            self.config.seed,
-            category,
-            instance,
-            touch,
-            size=self.config.size,
-            background=self.config.difference,
-            moment=moment,
-            measured=self.config.contact,
-            sensors=self.config.choice(),
-            through=through,
-        )
+        config, which = self.config, {"moment": moment, "through": through}
+        asked: Any = {"background": config.difference, "measured": config.contact, "sensors": config.choice()}
+        made = materials.touch(config.seed, category, instance, touch, size=config.size, **which, **asked)
         labels = {f"label_{task}": int(made.pop(task)) for task in ("category", "soft", "rough")}
         vision, pressed = made.pop("vision"), made.pop("touch")
         if self.config.difference:
@@ -244,15 +235,9 @@ class Grasps(Source):
         obj, index = item % grasps.NUM_OBJECTS, item // grasps.NUM_OBJECTS
         place = int(np.flatnonzero(np.random.default_rng(106).permutation(grasps.NUM_OBJECTS) == obj)[0])
         split = "test" if place < 26 else "val" if place < 42 else "train"
-        samples = []
-        for made in grasps.grasp(
-            self.config.seed,
-            obj,
-            index,
-            size=self.config.size,
-            held_out_sensor=self.config.held_out_sensor,
-            measured=self.config.contact,
-        ):
+        config, samples = self.config, []
+        asked: Any = {"held_out_sensor": config.held_out_sensor, "measured": config.contact}
+        for made in grasps.grasp(config.seed, obj, index, size=config.size, **asked):
             vision = made.pop("vision")
             both = np.concatenate([made.pop("touch_left"), made.pop("touch_right")], axis=2)
             grasp_id = f"{obj:03d}-{index:04d}"

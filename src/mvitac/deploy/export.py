@@ -130,9 +130,6 @@ def _check_fits(model: Model, pack: Pack, modality: str) -> None:
         )
 
 
-# -- writing ----------------------------------------------------------------------------------------------------------
-
-
 def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:
     """Single real inputs: a sample of the train rows of ``pack``."""
     rows = pack.rows("train", "unlabelled", having=graph.modalities)
@@ -209,9 +206,6 @@ def silent() -> Iterator[None]:
             yield
     finally:
         logging.disable(level)
-
-
-# -- checking ---------------------------------------------------------------------------------------------------------
 
 
 def _measure(

@@ -141,9 +141,8 @@ def probe_runs(
     if session.standardise:
         result["statistics"] = describe_statistics(pack, session.standardise)
     if session.sensors:
-        found_by = zip(names, models, strict=True)
-        found_of = ((n, m, r) for n, m in found_by for r in sensor_records(m, pack))
-        result["sensors"] = [{"source": n, "seed": m.run.seed, **r} for n, m, r in found_of]
+        found = ((n, m, r) for n, m in zip(names, models, strict=True) for r in sensor_records(m, pack))
+        result["sensors"] = [{"source": n, "seed": m.run.seed, **r} for n, m, r in found]
     for path in paths:
         write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result, sealed=True)
     return Scores(result)

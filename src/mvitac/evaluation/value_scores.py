@@ -39,25 +39,17 @@ def score_values(y: np.ndarray, predicted: np.ndarray, groups: np.ndarray, targe
         terms = (np.ones(len(true)), abs(error), error**2, true, true**2)
         for name, term in zip(SUMS, terms, strict=True):
             sums[name].append(np.bincount(group, weights=term, minlength=num_groups).tolist())
-        scored.append(
-            {
-                "name": target.name,
-                "unit": target.unit,
-                "r2": float(r_squared({name: np.array(sums[name][-1]).sum() for name in SUMS})),
-                "mae": float(abs(error).mean()),
-                "rmse": float((error**2).mean() ** 0.5),
-                "ranges": error_by_range(true, error),
-            }
-        )
+        r2 = float(r_squared({name: np.array(sums[name][-1]).sum() for name in SUMS}))
+        errors = {"r2": r2, "mae": float(abs(error).mean()), "rmse": float((error**2).mean() ** 0.5)}
+        scored.append({"name": target.name, "unit": target.unit, **errors, "ranges": error_by_range(true, error)})
         shown = drawn[have[drawn]]
         points.append([[float(f"{v:.5g}") for v in (y[i, t], predicted[i, t])] for i in shown])
-    return {
-        "r2": float(np.mean([each["r2"] for each in scored])),
-        "targets": scored,
-        "num_test": int((~np.isnan(y)).any(1).sum()),
-        "group_sums": sums,
-        "points": points,
-    }
+    return _record(scored, int((~np.isnan(y)).any(1).sum()), sums, points)
+
+
+def _record(targets: list[dict[str, Any]], num_test: int, sums: dict[str, Any], points: list[Any]) -> dict[str, Any]:
+    r2 = float(np.mean([target["r2"] for target in targets]))
+    return {"r2": r2, "targets": targets, "num_test": num_test, "group_sums": sums, "points": points}
 
 
 def pool_values(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -70,23 +62,11 @@ def pool_values(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for t, target in enumerate(parts[0]["targets"]):
         total = {name: float(np.sum(sums[name][t])) for name in SUMS}
         true, guess = np.array(points[t], float).T
-        targets.append(
-            {
-                "name": target["name"],
-                "unit": target["unit"],
-                "r2": float(r_squared(total)),
-                "mae": total["error"] / total["n"],
-                "rmse": (total["squared_error"] / total["n"]) ** 0.5,
-                "ranges": error_by_range(true, guess - true),
-            }
-        )
-    return {
-        "r2": float(np.mean([target["r2"] for target in targets])),
-        "targets": targets,
-        "num_test": sum(part["num_test"] for part in parts),
-        "group_sums": sums,
-        "points": points,
-    }
+        mae, rmse = total["error"] / total["n"], (total["squared_error"] / total["n"]) ** 0.5
+        errors = {"r2": float(r_squared(total)), "mae": mae, "rmse": rmse}
+        named = {name: target[name] for name in ("name", "unit")}
+        targets.append({**named, **errors, "ranges": error_by_range(true, guess - true)})
+    return _record(targets, sum(part["num_test"] for part in parts), sums, points)
 
 
 def one_target(record: dict[str, Any], t: int) -> dict[str, Any]:

@@ -80,16 +80,11 @@ def target_lines(result: dict[str, Any], probe: str | None = None) -> dict[str, 
         mine = [record for record in values if record["task"] == task]
         split = [{**one_target(r, t), "task": each["name"]} for r in mine for t, each in enumerate(r["targets"])]
         records = by_cell(split, probe or from_json(Plan, result["plan"], "plan").probes[0])
-        found[task] = [
-            replace(
-                line,
-                cells={
-                    name: replace(cell, target=targets_of(records[name, line.modality, line.source])[0])
-                    for name, cell in line.cells.items()
-                },
-            )
-            for line in lines_of({**result, "records": split}, probe)
-        ]
+        found[task] = []
+        for line in lines_of({**result, "records": split}, probe):
+            targets = {name: targets_of(records[name, line.modality, line.source])[0] for name in line.cells}
+            cells = {name: replace(cell, target=targets[name]) for name, cell in line.cells.items()}
+            found[task].append(replace(line, cells=cells))
     return found
 
 

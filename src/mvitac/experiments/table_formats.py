@@ -39,9 +39,6 @@ def _tasks(lines: Sequence[Line]) -> list[str]:
     return list(dict.fromkeys(task for line in lines for task in line.cells))
 
 
-# -- Markdown ---------------------------------------------------------------------------------------------------------
-
-
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what was compared, the tables, stress tests, AUROC, retrieval and cost."""
     plan = _plan(result)
@@ -224,8 +221,6 @@ def _cost(result: dict[str, Any]) -> list[str]:
         )
     return [*text, "", *(f"- {line}" for line in about_lines(result.get("encoders", ())))]
 
-
-# -- LaTeX, CSV, figure -----------------------------------------------------------------------------------------------
 
 NAMES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "none": "-"}
 

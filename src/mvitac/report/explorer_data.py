@@ -109,15 +109,9 @@ class ExplorerData:
         hues = ("sky", "vermilion", "amber") if colour == "error" else MAP_HUES
         largest = [u for u in np.argsort(-counts, kind="stable") if names[used[u]] != "unlabelled"][: len(hues)]
         first = [names[0], names[1]] if colour == "error" else [names[used[u]] for u in sorted(largest)]
-        return self._json(
-            modality,
-            index,
-            np.searchsorted(used, values[index]),
-            legend=[str(names[v]) for v in used.tolist()],
-            coloured=first,
-            hues=[COLOURS[hue] for hue in hues],
-            by=task if colour == "label" else colour,
-        )
+        legend: dict[str, Any] = {"legend": [str(names[v]) for v in used.tolist()], "coloured": first}
+        legend |= {"hues": [COLOURS[hue] for hue in hues], "by": task if colour == "label" else colour}
+        return self._json(modality, index, np.searchsorted(used, values[index]), **legend)
 
     def _by_value(self, modality: str, index: np.ndarray, target: str) -> str:
         """The map coloured by the values of ``target``; "bar" is the range of the colours. 1 % at either end share one."""
@@ -125,16 +119,9 @@ class ExplorerData:
         low, high = np.nanpercentile(values, [1, 99]).tolist()
         share = np.clip((values[index] - low) / max(high - low, 1e-12), 0, 1)
         levels = [str(level) for level in range(LEVELS)]
-        return self._json(
-            modality,
-            index,
-            np.where(np.isnan(share), LEVELS, np.nan_to_num(share) * (LEVELS - 1)).round(),
-            legend=[*levels, "not measured"],
-            coloured=levels,
-            hues=ramp(LEVELS),
-            by=target,
-            bar=[f"{low:.3g}", f"{high:.3g}", target],
-        )
+        group = np.where(np.isnan(share), LEVELS, np.nan_to_num(share) * (LEVELS - 1)).round()
+        legend = {"legend": [*levels, "not measured"], "coloured": levels, "hues": ramp(LEVELS), "by": target}
+        return self._json(modality, index, group, **legend, bar=[f"{low:.3g}", f"{high:.3g}", target])
 
     def _json(self, modality: str, index: np.ndarray, group: np.ndarray, **legend: Any) -> str:
         """The points ``index``, each with the number of its group in the legend."""

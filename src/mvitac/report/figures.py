@@ -66,9 +66,6 @@ def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], 
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, labelcolor=colour("ink"), **options)
 
 
-# -- figures ----------------------------------------------------------------------------------------------------------
-
-
 @matplotlib.rc_context(STYLE)
 def bars(
     title: str, groups: Mapping[str, Mapping[str, Mapping[str, float]]], lines: Mapping[str, float], what: str
@@ -297,9 +294,6 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
     if classes or len(shown) > 1:
         legend_below(figure, handles, names, columns)
     return figure
-
-
-# -- to files and into the page ---------------------------------------------------------------------------------------
 
 
 @matplotlib.rc_context(STYLE)

@@ -132,9 +132,6 @@ def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finishe
     return [replace(run, source=names.get(run.path.resolve(), run.source)) for run in runs]
 
 
-# -- the page ---------------------------------------------------------------------------------------------------------
-
-
 def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
     sections = {

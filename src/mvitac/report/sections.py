@@ -75,9 +75,6 @@ class Study:
         return html.figure(figures.to_svg(drawing, safe, alt), caption)
 
 
-# -- retrieval ---------------------------------------------------------------------------------------------------------
-
-
 def retrieval(study: Study) -> str:
     """R@5 as bars with chance level, and the whole table."""
     found = study.result["retrieval"]
@@ -106,8 +103,6 @@ def _why_no_retrieval(study: Study) -> str:
         return "no method here has a space that both modalities share"
     return f"it takes {MIN_GALLERY} test {study.pack.spec.group_by}s with both modalities, and this data has fewer"
 
-
-# -- while training ---------------------------------------------------------------------------------------------------
 
 _NOT_LOSS = ("step", "lr", "pairs_per_s", "loss", "eval")
 
@@ -214,9 +209,6 @@ def _chance(study: Study, title: str) -> dict[str, float]:
             labels = labels[labels >= 0]
             return {"majority": float(np.bincount(labels).max() / len(labels))} if len(labels) else {}
     return {}
-
-
-# -- mistakes -----------------------------------------------------------------------------------------
 
 
 def confusions(study: Study) -> str:

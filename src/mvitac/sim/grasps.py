@@ -112,16 +112,8 @@ def grasp(
     bench = _bench(seed, obj)
     rng = np.random.default_rng([_PLAN, seed, obj, index])
     patch = skin.draw_patch(rng)
-    return _record(
-        bench,
-        patch,
-        draw_plan(bench.thing, patch, rng),
-        (seed, obj, index),
-        size=size,
-        held_out_sensor=held_out_sensor,
-        phases=phases,
-        measured=measured,
-    )
+    plan, what = draw_plan(bench.thing, patch, rng), {"phases": phases, "measured": measured}
+    return _record(bench, patch, plan, (seed, obj, index), size=size, held_out_sensor=held_out_sensor, **what)
 
 
 @lru_cache(maxsize=4)
@@ -180,16 +172,8 @@ class _Gels:
     ) -> np.ndarray:
         """Return the picture of one gel, uint8 [size, size, 3]."""
         x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
-        return gel.render(
-            imprint,
-            self.sensor,
-            rng,
-            pixel_mm=FIELD_MM / len(imprint),
-            shear_mm=(x, y),
-            size=size,
-            unit=int(self.units[side]),
-            gain=self.gain,
-        )
+        copy: Any = {"unit": int(self.units[side]), "gain": self.gain, "pixel_mm": FIELD_MM / len(imprint)}
+        return gel.render(imprint, self.sensor, rng, shear_mm=(x, y), size=size, **copy)
 
 
 def _draw_gels(rng: np.random.Generator, held_out: bool) -> _Gels:
@@ -247,11 +231,8 @@ def _relief(bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: 
 
 
 def _physics(bench: physics.Bench, grid: int) -> dict[str, float]:
-    return {
-        "stiffness": bench.thing.stiffness,
-        "pixel_mm": FIELD_MM / grid,
-        "dome_radius_mm": objects.DOME_RADIUS_MM,
-    }
+    stiffness, dome = bench.thing.stiffness, objects.DOME_RADIUS_MM
+    return {"stiffness": stiffness, "pixel_mm": FIELD_MM / grid, "dome_radius_mm": dome}
 
 
 def _measured(

@@ -32,7 +32,7 @@ CLUTTER = (("box", ".03 .02 .04"), ("sphere", ".028"), ("cylinder", ".022 .045")
 """MuJoCo types and sizes of the clutter."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Part:
     """One primitive of an object, in the object's frame."""
 
@@ -134,61 +134,55 @@ def _mm(rng: np.random.Generator, *ranges: tuple[float, float]) -> list[float]:
 
 def _box(rng: np.random.Generator) -> tuple[Part, ...]:
     x, y, z = _mm(rng, (11, 27), (30, 72), (13, 32))
-    return (Part(shape="box", size=(x, y, z), center=(0, 0, z)),)
+    return (Part("box", (x, y, z), (0, 0, z)),)
 
 
 def _can(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h = _mm(rng, (16, 31), (24, 52))
-    return (Part(shape="cylinder", size=(r, h), center=(0, 0, h)),)
+    return (Part("cylinder", (r, h), (0, 0, h)),)
 
 
 def _rod(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h = _mm(rng, (12, 24), (38, 78))
-    return (Part(shape="cylinder", size=(r, h), center=(0, 0, r), lying=True),)
+    return (Part("cylinder", (r, h), (0, 0, r), lying=True),)
 
 
 def _ellipsoid(rng: np.random.Generator) -> tuple[Part, ...]:
     x, y, z = _mm(rng, (16, 30), (26, 58), (15, 28))
-    return (Part(shape="ellipsoid", size=(x, y, z), center=(0, 0, z)),)
+    return (Part("ellipsoid", (x, y, z), (0, 0, z)),)
 
 
 def _capsule(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h = _mm(rng, (13, 25), (22, 55))
-    return (Part(shape="capsule", size=(r, h), center=(0, 0, r), lying=True),)
+    return (Part("capsule", (r, h), (0, 0, r), lying=True),)
 
 
 def _hammer(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h, x, y, z = _mm(rng, (11, 16), (45, 65), (16, 22), (7, 11), (15, 20))
     side = rng.choice([-1, 1])
     return (
-        Part(shape="cylinder", size=(r, h), center=(0, 0, z), lying=True),
-        Part(shape="box", size=(x, y, z), center=(0, side * (h + y), z), density=rng.uniform(1.0, 1.3)),
+        Part("cylinder", (r, h), (0, 0, z), lying=True),
+        Part("box", (x, y, z), (0, side * (h + y), z), density=rng.uniform(1.0, 1.3)),
     )
 
 
 def _mug(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h, y, z = _mm(rng, (22, 31), (32, 48), (9, 14), (16, 26))
     side = rng.choice([-1, 1])
-    return (
-        Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
-        Part(shape="box", size=(0.005, y, z), center=(0, side * (r + y - 0.001), h)),
-    )
+    return Part("cylinder", (r, h), (0, 0, h)), Part("box", (0.005, y, z), (0, side * (r + y - 0.001), h))
 
 
 def _bottle(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h, neck, tall = _mm(rng, (18, 30), (26, 44), (10, 14), (12, 20))
-    return (
-        Part(shape="cylinder", size=(r, h), center=(0, 0, h)),
-        Part(shape="cylinder", size=(neck, tall), center=(0, 0, 2 * h + tall)),
-    )
+    return Part("cylinder", (r, h), (0, 0, h)), Part("cylinder", (neck, tall), (0, 0, 2 * h + tall))
 
 
 def _tee(rng: np.random.Generator) -> tuple[Part, ...]:
     x, y, z, a, b, c = _mm(rng, (11, 20), (36, 62), (13, 20), (12, 26), (12, 22), (10, 22))
     shift = rng.choice([-1, 1]) * rng.uniform(0.3, 0.75) * y
     return (
-        Part(shape="box", size=(x, y, z), center=(0, 0, z)),
-        Part(shape="box", size=(a, b, c), center=(0, shift, 2 * z + c), density=rng.uniform(0.8, 1.4)),
+        Part("box", (x, y, z), (0, 0, z)),
+        Part("box", (a, b, c), (0, shift, 2 * z + c), density=rng.uniform(0.8, 1.4)),
     )
 
 
@@ -196,24 +190,14 @@ def _dumbbell(rng: np.random.Generator) -> tuple[Part, ...]:
     r, h, left, right = _mm(rng, (10, 15), (28, 48), (17, 28), (17, 28))
     z = max(left, right)
     return (
-        Part(shape="capsule", size=(r, h), center=(0, 0, z), lying=True),
-        Part(shape="cylinder", size=(z, left / 2), center=(0, -h, z), lying=True, density=rng.choice([1.0, 1.5])),
-        Part(shape="cylinder", size=(z, right / 2), center=(0, h, z), lying=True),
+        Part("capsule", (r, h), (0, 0, z), lying=True),
+        Part("cylinder", (z, left / 2), (0, -h, z), lying=True, density=rng.choice([1.0, 1.5])),
+        Part("cylinder", (z, right / 2), (0, h, z), lying=True),
     )
 
 
-_DRAW = {
-    "box": _box,
-    "can": _can,
-    "rod": _rod,
-    "ellipsoid": _ellipsoid,
-    "capsule": _capsule,
-    "hammer": _hammer,
-    "mug": _mug,
-    "bottle": _bottle,
-    "tee": _tee,
-    "dumbbell": _dumbbell,
-}
+_ALL = (_box, _can, _rod, _ellipsoid, _capsule, _hammer, _mug, _bottle, _tee, _dumbbell)
+_DRAW = {draw.__name__[1:]: draw for draw in _ALL}
 """Shape kind -> function that draws its parts, which stand on z = 0."""
 KINDS = tuple(_DRAW)  # shape kinds. Objects cycle through them, so that every split by object has all kinds.
 

@@ -173,9 +173,8 @@ def _studs(u: F, v: F, t: F) -> F:
 def _weave(u: F, v: F, t: F) -> F:
     over = _sin(0.5 * u) * _sin(0.5 * v) > 0
     warp, weft = np.abs(_sin(0.5 * u)), np.abs(_sin(0.5 * v))
-    return np.where(over, warp + 0.5 * weft, weft + 0.5 * warp) + 0.3 * np.where(
-        over, noise(6 * u, v, t[0]), noise(u, 6 * v, t[1])
-    )
+    fine = np.where(over, noise(6 * u, v, t[0]), noise(u, 6 * v, t[1]))
+    return np.where(over, warp + 0.5 * weft, weft + 0.5 * warp) + 0.3 * fine
 
 
 def _rib(u: F, v: F, t: F) -> F:
@@ -187,27 +186,9 @@ def _plain(u: F, v: F, t: F) -> F:
     return noise(0.45 * u, 0.45 * v, t[0]) + 0.12 * noise(5 * u, 5 * v, t[1])
 
 
-KINDS: dict[str, Callable[[F, F, F], F]] = {
-    "blotch": _blotch,
-    "pores": _pores,
-    "grains": _grains,
-    "pebbles": _pebbles,
-    "facets": _facets,
-    "crackle": _crackle,
-    "brick": _brick,
-    "tiles": _tiles,
-    "brushed": _brushed,
-    "wood": _wood,
-    "fissures": _fissures,
-    "blades": _blades,
-    "veins": _veins,
-    "fibres": _fibres,
-    "emboss": _emboss,
-    "studs": _studs,
-    "weave": _weave,
-    "rib": _rib,
-    "plain": _plain,
-}
+_CELLS = (_blotch, _pores, _grains, _pebbles, _facets, _crackle, _brick, _tiles)
+_LINES = (_brushed, _wood, _fissures, _blades, _veins, _fibres, _emboss, _studs, _weave, _rib, _plain)
+KINDS: dict[str, Callable[[F, F, F], F]] = {draw.__name__[1:]: draw for draw in (*_CELLS, *_LINES)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

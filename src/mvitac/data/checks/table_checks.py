@@ -150,15 +150,10 @@ def leaks(pack: Pack) -> list[Finding]:
         if split != "split" and not notes:
             sound.append(split)
             continue
-        findings.append(
-            Finding(
-                "groups across splits" if split == "split" else f"groups across column {split}",
-                verdict,
-                "; ".join(notes) or f"none of {', '.join(names)} is in more than one split",
-                bool(notes) * "split by the largest of these keys, or report what test shares with train",
-                rows=tuple(rows),
-            )
-        )
+        item = "groups across splits" if split == "split" else f"groups across column {split}"
+        evidence = "; ".join(notes) or f"none of {', '.join(names)} is in more than one split"
+        advice = bool(notes) * "split by the largest of these keys, or report what test shares with train"
+        findings.append(Finding(item, verdict, evidence, advice, tuple(rows)))
     if sound:
         evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
         findings.append(Finding("groups across split columns", "ok", evidence))
@@ -324,12 +319,7 @@ def published(counts: list[Count]) -> list[Finding]:
     for count in counts:
         same = count.published == count.found
         detail = f"; {count.detail}" if count.detail else ""
-        findings.append(
-            Finding(
-                f"published: {count.what}",
-                "ok" if same else "look",
-                f"{count.found} found, {count.published} published{detail}",
-                "" if same else "fine for a part of the data; mention it with every result",
-            )
-        )
+        evidence = f"{count.found} found, {count.published} published{detail}"
+        advice = "" if same else "fine for a part of the data; mention it with every result"
+        findings.append(Finding(f"published: {count.what}", "ok" if same else "look", evidence, advice))
     return findings

@@ -200,16 +200,9 @@ class Rows(Source):
         read = [read_task(selected, column, counts) for column in label_columns]
         values, measured = read_values(selected, value_tasks, counts)
         tasks, labels = [*(task for task, _ in read), *value_tasks], [*(label for _, label in read), *measured]
-        splits = split_rows(
-            selected,
-            self._split,
-            grouping,
-            tasks,
-            labels,
-            shares=(config.test_share, config.val_share),
-            seed=config.split_seed,
-            allow_leak=config.allow_leak,
-        )
+        shares, seed = (config.test_share, config.val_share), config.split_seed
+        how: Any = {"shares": shares, "seed": seed, "allow_leak": config.allow_leak}
+        splits = split_rows(selected, self._split, grouping, tasks, labels, **how)
         extra, controls = read_controls(selected, config.control_columns(), labels)
 
         own: dict[str, Sequence[Any]] = {"id": selected.ids(), "group": grouping.groups}

@@ -25,8 +25,10 @@ class File(Adapter):
     name: ClassVar[str] = "file"
     expects: ClassVar[str] = f"a file that exists ({', '.join(FILES)})"
     reads: Literal["touch", "vision", "both"] = "both"
-    trunk: str = ""  # name of the timm model, for .safetensors and .pth
-    prefix: int = 0  # tokens in front that are no places (class, registers), of TorchScript and ONNX
+    trunk: str = ""
+    """Name of the timm model, for .safetensors and .pth."""
+    prefix: int = 0
+    """Tokens in front that are no places (class, registers), of TorchScript and ONNX."""
 
     def load(self) -> Loaded:
         file = self.path()
