@@ -126,9 +126,11 @@ def record_on_a_full_disk(rig: Rig, disk: Path, *, also_at_the_end: bool) -> str
     out, said = disk / "recording", list[str]()
     channels = {m: shape[2] for m, shape in frame_shapes(rig.engine).items()}
     rig.live.record = recorder = Recorder(out, channels, fps=30.0, tell=said.append)
-    rig.run(6)
+    for _ in range(20):
+        if not recorder.num:
+            rig.run(3)
     filler = fill(disk)
-    kept, num = recorder.num, rig.run(6)
+    kept, num = recorder.num, sum(0 if recorder.failed else rig.run(3) for _ in range(20)) + rig.run(3)
     events = {e.what for e in rig.heard} - set(CALM)
     if not recorder.failed or len(said) != 1 or not num or not kept or events:
         return f"recorded {kept}, then {num} predictions, {said} and {events}"
