@@ -143,7 +143,7 @@ class Run:
     """Steps between evaluations (linear probes, kNN, signs of collapse) on held-out groups (split val, never test). The
     weights that are best there are kept as model.best.safetensors. 0 = only at the start and the end."""
     checkpoint_every: int = 0
-    """Steps between checkpoints. 0 = about every tenth of the run."""
+    """Steps between checkpoints. 0 = about every tenth of the run, at least 10 steps apart."""
 
     def __post_init__(self) -> None:
         if self.batch_size < 2:

@@ -111,7 +111,7 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
                 "simulate",
                 "materials",
                 "--num",
-                "400",
+                "240",
                 "--touches",
                 "2",
                 "--size",

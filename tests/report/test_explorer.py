@@ -8,9 +8,7 @@ import html
 import json
 import re
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +25,7 @@ from mvitac.report.explorer_data import LEVELS, ExplorerData
 from mvitac.report.guard import MAX_BODY, Guard, as_text
 from mvitac.report.palette import COLOURS, MAP_HUES
 from support.browser import CHROMIUM, Browser
+from support.processes import begin
 from support.toy import reordered
 
 
@@ -213,22 +212,43 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def serving(arguments: list[str], port: int) -> Iterator[None]:
-    """The server in a process of its own, until it answers on ``port``."""
-    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+def serving(folder: Path, port: int, work: Callable[..., int | None], *given: Any) -> Iterator[None]:
+    """``work(*given)``, which serves, in a process of its own, until it answers on ``port``."""
+    process = begin(work, *given, output=folder / "said")
     try:
         while True:
             with socket.socket() as one:
                 if one.connect_ex(("127.0.0.1", port)) == 0:
                     break
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(0.1)
-                assert process.stderr
-                raise AssertionError(process.stderr.read().decode()[-2000:])
+            process.join(0.1)
+            assert process.is_alive(), (folder / "said").read_text()[-2000:]
         yield
     finally:
-        process.terminate()
-        process.communicate()
+        process.kill()
+        process.join()
+
+
+@pytest.fixture(scope="module")
+def explored(artifact: Path, smoke_run: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """The port of `mvitac explore` with two models on the striped pairs."""
+    port = free_port()
+    command = ["explore", str(artifact), str(smoke_run), "--on", str(pack.path), "--port", str(port)]
+    with serving(tmp_path_factory.mktemp("explored"), port, main, command):
+        yield port
+
+
+def serve_many(port: int, artifact: Path, pack: Path) -> None:
+    """Serve 100,000 rows, in which every answer is right."""
+    from mvitac.report.explorer import page, serve
+
+    land = ExplorerData(mvitac.load(artifact), Pack(pack))
+    i = np.arange(100_000) % len(land.rows)
+    land.rows, land.split = land.rows[i], np.full(len(i), "test")
+    noise = np.random.default_rng(0).normal(0, 0.05, (len(i), 64)).astype("f4")
+    land.x = {m: x[i] + noise for m, x in land.x.items()}
+    land.labels = {t: x[i] for t, x in land.labels.items()}
+    land.guess = dict(land.labels)
+    serve(page({"run": land}), port=port)
 
 
 def listeners(port: int) -> set[str]:
@@ -242,46 +262,41 @@ def listeners(port: int) -> set[str]:
     return found
 
 
-def test_the_page_in_a_browser(
-    browser: Browser, land: ExplorerData, pack: Pack, artifact: Path, smoke_run: Path, tmp_path: Path
-) -> None:
+def test_the_page_in_a_browser(browser: Browser, explored: int, land: ExplorerData, pack: Pack, tmp_path: Path) -> None:
     """Map, hover, click, filter, two runs side by side, a phone's width; listens on loopback only."""
-    port = free_port()
-    command = ["-m", "mvitac", "explore", str(artifact), str(smoke_run), "--on", str(pack.path), "--port", str(port)]
-    with serving(command, port):
-        assert listeners(port) == {"127.0.0.1"}
-        browser.resize(1200, 900)
-        browser.open(f"http://127.0.0.1:{port}")
-        browser.wait(f"{POINTS} == {len(pack.rows('test'))}")
-        assert browser.run("document.querySelectorAll('.map canvas').length") == 2
-        row = int(pack.rows("test")[0])
+    assert listeners(explored) == {"127.0.0.1"}
+    browser.resize(1200, 900)
+    browser.open(f"http://127.0.0.1:{explored}")
+    browser.wait(f"{POINTS} == {len(pack.rows('test'))}")
+    assert browser.run("document.querySelectorAll('.map canvas').length") == 2
+    row = int(pack.rows("test")[0])
 
-        def hover() -> None:
-            browser.mouse("mouseMoved", 1, 1)
-            browser.mouse("mouseMoved", *centre_of_a_point(browser, land, row))
+    def hover() -> None:
+        browser.mouse("mouseMoved", 1, 1)
+        browser.mouse("mouseMoved", *centre_of_a_point(browser, land, row))
 
-        browser.until("document.querySelector('.tip').style.display == 'block'", hover)
-        shown = browser.run("document.querySelector('.tip').textContent")
-        pictured = browser.run("document.querySelectorAll('.tip img').length")
-        assert pictured == 2 and shown.split(" ·")[0] in pack.column("id")
-        browser.until(
-            "document.querySelectorAll('.found img').length == 12",
-            lambda: browser.click(*centre_of_a_point(browser, land, row)),
-        )
-        check_marks(browser, land, row)
-        check_legend(browser)
-        check_keys(browser)
-        check_zoom(browser, land, row)
-        browser.run(CLICK_BOX)
-        wrong = len(land.shown("test", "pattern", mistakes=True))
-        browser.wait(f"{POINTS} == {wrong}")
-        browser.resize(390, 844, mobile=True)
-        browser.wait("document.documentElement.scrollWidth <= 390")
-        browser.wait("document.querySelector('.map canvas').clientWidth > 200")
-        browser.screenshot(tmp_path / "phone.png")
-        with Image.open(tmp_path / "phone.png") as picture:
-            assert picture.size == (390, 844)
-        assert browser.problems == []
+    browser.until("document.querySelector('.tip').style.display == 'block'", hover)
+    shown = browser.run("document.querySelector('.tip').textContent")
+    pictured = browser.run("document.querySelectorAll('.tip img').length")
+    assert pictured == 2 and shown.split(" ·")[0] in pack.column("id")
+    browser.until(
+        "document.querySelectorAll('.found img').length == 12",
+        lambda: browser.click(*centre_of_a_point(browser, land, row)),
+    )
+    check_marks(browser, land, row)
+    check_legend(browser)
+    check_keys(browser)
+    check_zoom(browser, land, row)
+    browser.run(CLICK_BOX)
+    wrong = len(land.shown("test", "pattern", mistakes=True))
+    browser.wait(f"{POINTS} == {wrong}")
+    browser.resize(390, 844, mobile=True)
+    browser.wait("document.documentElement.scrollWidth <= 390")
+    browser.wait("document.querySelector('.map canvas').clientWidth > 200")
+    browser.screenshot(tmp_path / "phone.png")
+    with Image.open(tmp_path / "phone.png") as picture:
+        assert picture.size == (390, 844)
+    assert browser.problems == []
 
 
 def check_marks(browser: Browser, land: ExplorerData, row: int) -> None:
@@ -386,18 +401,16 @@ def test_the_server_answers_only_itself() -> None:
     )
 
 
-def test_the_running_server_refuses_rebinding_and_large_uploads(artifact: Path, pack: Pack) -> None:
-    port = free_port()
-    address = f"http://127.0.0.1:{port}/"
-    with serving(["-m", "mvitac", "explore", str(artifact), "--on", str(pack.path), "--port", str(port)], port):
-        own = httpx.get(address)
-        assert own.status_code == 200 and "default-src 'self'" in own.headers["content-security-policy"]
-        assert httpx.get(address, headers={"host": "evil.example"}).status_code == 403
-        cross = httpx.get(f"{address}config", headers={"origin": "http://evil.example"})
-        assert cross.status_code == 403 and "access-control-allow-origin" not in cross.headers
-        files = {"files": ("big.png", bytes(MAX_BODY + 1))}
-        assert httpx.post(f"{address}gradio_api/upload", files=files).status_code == 413
-        assert httpx.post(f"{address}gradio_api/upload", content=iter([b"chunk"])).status_code == 411
+def test_the_running_server_refuses_rebinding_and_large_uploads(explored: int) -> None:
+    address = f"http://127.0.0.1:{explored}/"
+    own = httpx.get(address)
+    assert own.status_code == 200 and "default-src 'self'" in own.headers["content-security-policy"]
+    assert httpx.get(address, headers={"host": "evil.example"}).status_code == 403
+    cross = httpx.get(f"{address}config", headers={"origin": "http://evil.example"})
+    assert cross.status_code == 403 and "access-control-allow-origin" not in cross.headers
+    files = {"files": ("big.png", bytes(MAX_BODY + 1))}
+    assert httpx.post(f"{address}gradio_api/upload", files=files).status_code == 413
+    assert httpx.post(f"{address}gradio_api/upload", content=iter([b"chunk"])).status_code == 411
 
 
 def test_labels_are_text_in_markdown() -> None:
@@ -417,20 +430,10 @@ def test_labels_are_text_in_markdown() -> None:
         assert html.unescape(re.sub("<[^>]*>", "", text)).strip() == label
 
 
-def test_a_page_of_very_many_and_of_none(browser: Browser, artifact: Path, pack: Pack) -> None:
+def test_a_page_of_very_many_and_of_none(browser: Browser, artifact: Path, pack: Pack, tmp_path: Path) -> None:
     """100,000 rows, in which every answer is right: filtered to its mistakes, there is nothing to show."""
     port = free_port()
-    code = (
-        "import mvitac, numpy as np; from mvitac.report.explorer import page, serve;"
-        "from mvitac.report.explorer_data import ExplorerData;"
-        f"land = ExplorerData(mvitac.load({str(artifact)!r}), mvitac.Pack({str(pack.path)!r}));"
-        "i = np.arange(100_000) % len(land.rows); land.rows = land.rows[i]; land.split = np.full(len(i), 'test');"
-        "noise = np.random.default_rng(0).normal(0, 0.05, (len(i), 64)).astype('f4');"
-        "land.x = {m: x[i] + noise for m, x in land.x.items()};"
-        "land.labels = {t: x[i] for t, x in land.labels.items()}; land.guess = dict(land.labels);"
-        f"serve(page({{'run': land}}), port={port})"
-    )
-    with serving(["-c", code], port):
+    with serving(tmp_path, port, serve_many, port, artifact, pack.path):
         browser.resize(1200, 900)
         browser.open(f"http://127.0.0.1:{port}")
         browser.wait(f"{POINTS} == 100000")

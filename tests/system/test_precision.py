@@ -35,7 +35,7 @@ from mvitac.system import device as devices
 from mvitac.system.device import describe_precision, pick_precision
 from mvitac.training.loop import train
 from mvitac.training.step import Step
-from support.training_runs import assert_equal_weights, power_cut
+from support.training_runs import assert_equal_weights, power_cut, smoke
 
 CPU = torch.device("cpu")
 OLD_CPU = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
@@ -50,7 +50,7 @@ def hardware(monkeypatch: pytest.MonkeyPatch) -> Hardware:
 
 
 def auto(pack: Pack, **changes: object) -> Run:
-    return replace(recipe("smoke", PackConfig(path=pack.path)), precision="auto", **changes)  # type: ignore[arg-type]
+    return smoke(pack, precision="auto", eval_every=0, **changes)
 
 
 # -- the choice -------------------------------------------------------------------------------------------------------
@@ -150,27 +150,28 @@ def test_what_auto_became_is_printed_and_kept(
 ) -> None:
     hardware(own)
     became = "bf16" if own else "fp32"
-    out = train(auto(pack), tmp_path / "r")
+    asked = auto(pack, steps=2)  # bf16 is slow where it is emulated
+    out = train(asked, tmp_path / "r")
     assert f"precision: {became} (auto" in capsys.readouterr().out
     run, record = load_run(out)
     assert (run.precision, record["precision"]) == ("auto", became)
     assert mvitac.load(out).run.precision == became
-    assert train(replace(auto(pack), precision=became), tmp_path / "explicit", quiet=True)  # type: ignore[arg-type]
+    assert train(replace(asked, precision=became), tmp_path / "explicit", quiet=True)  # type: ignore[arg-type]
     assert_equal_weights(out, tmp_path / "explicit")
     assert not capsys.readouterr().out
     # Another machine decides anew, and what is finished stays what it is.
     hardware(not own)
-    again = ["pretrain", "--from", str(out / "run.json"), "--quiet", "--steps", "2", "--out", str(tmp_path / "again")]
+    again = ["pretrain", "--from", str(out / "run.json"), "--quiet", "--steps", "1", "--out", str(tmp_path / "again")]
     assert main(again) == 0
     assert load_run(tmp_path / "again")[1]["precision"] == ("fp32" if own else "bf16")
-    assert train(auto(pack), out, resume=True, quiet=True) == out
+    assert train(asked, out, resume=True, quiet=True) == out
 
 
 def test_a_checkpoint_goes_on_in_its_own_precision_alone(pack: Pack, tmp_path: Path, hardware: Hardware) -> None:
-    run, out = auto(pack, checkpoint_every=2), tmp_path / "r"
+    run, out = auto(pack, steps=4, checkpoint_every=2), tmp_path / "r"
     hardware(True)
     train(run, tmp_path / "straight", quiet=True)
-    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(run, out, quiet=True)
     hardware(False)
     with pytest.raises(
@@ -185,9 +186,9 @@ def test_a_checkpoint_goes_on_in_its_own_precision_alone(pack: Pack, tmp_path: P
 
 def test_runs_from_before_auto_go_on(pack: Pack, tmp_path: Path, hardware: Hardware) -> None:
     """Recipes that are auto now asked for bf16 then, and records did not say what a run computed in."""
-    run, out = auto(pack, checkpoint_every=2), tmp_path / "r"
+    run, out = auto(pack, steps=4, checkpoint_every=2), tmp_path / "r"
     old = replace(run, precision="bf16")
-    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(old, out, quiet=True)
     record = json.loads((out / "run.json").read_text())
     assert record["run"]["precision"] == record.pop("precision") == "bf16"

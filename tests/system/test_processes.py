@@ -76,14 +76,10 @@ def test_probes_do_not_depend_on_it(
     assert scores(2) == scores(1)
 
 
-def sleep_and_tell(path: Path) -> None:
-    path.with_suffix(".begun").touch()
-    time.sleep(300)
-    path.touch()
-
-
-def ctrl_c_answer() -> str:
-    return signal.getsignal(signal.SIGINT).name  # type: ignore[union-attr]
+SLEEP_AND_TELL = (
+    "import pathlib, time; pathlib.Path({0!r} + '.begun').touch(); time.sleep(300); pathlib.Path({0!r}).touch()"
+)
+"""For exec, because a function of this file would make each new process import the file, and torch with it."""
 
 
 @pytest.mark.usefixtures("ctrl_c")
@@ -91,10 +87,10 @@ def test_an_error_beside_them_cuts_off_what_is_under_way_and_begins_no_more(tmp_
     def work() -> None:
         with side_by_side(2) as pool:
             # From their first import on they leave Ctrl-C to the parent.
-            assert pool.submit(ctrl_c_answer).result() == "SIG_IGN"
+            assert pool.submit(signal.getsignal, signal.SIGINT).result() is signal.SIG_IGN
             assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
             for i in range(6):
-                pool.submit(sleep_and_tell, tmp_path / str(i))
+                pool.submit(exec, SLEEP_AND_TELL.format(str(tmp_path / str(i))))
             while len(list(tmp_path.glob("*.begun"))) < 2:
                 time.sleep(0.02)
             raise ValueError("enough")

@@ -203,7 +203,7 @@ def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:
 
 
 def command(pack: Pack, out: Path) -> list[str]:
-    fields = ["--steps", "30", "--checkpoint-every", "1", "--eval-every", "0", "--log-every", "1", "--quiet"]
+    fields = ["--steps", "16", "--checkpoint-every", "1", "--eval-every", "0", "--log-every", "1", "--quiet"]
     choice = ["--recipe", "smoke", "--data", "pack", "--data.path", str(pack.path)]
     return ["pretrain", *choice, *fields, "--out", str(out), "--resume"]
 
@@ -214,7 +214,7 @@ def test_sigkill_at_random_moments(pack: Pack, tmp_path: Path) -> None:
     finish(begin(main, command(pack, tmp_path / "straight")))
     out, rng = tmp_path / "killed", random.Random()
     killed = 0
-    for goal in sorted(rng.sample(range(2, 26), 3)):
+    for goal in sorted(rng.sample(range(2, 14), 3)):
         process = begin(main, command(pack, out))
         while process.is_alive():
             log = out / "log.jsonl"
