@@ -19,6 +19,7 @@ from mvitac.experiments.adapt import NEW, OLD, TRANSFER, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
 from mvitac.model import load
 from mvitac.run import load_run
+from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from support.toy import Toy, toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
@@ -80,7 +81,7 @@ def test_the_command_continues_a_finished_one_and_prints_one_table(
 
 def tried_in(folder: Path) -> dict[str, float]:
     """Score by settings, without the digest of the run."""
-    return {name.split(" (")[0]: score for name, score in json.loads((folder / "choice.json").read_text()).items()}
+    return {name.split(" (")[0]: score for name, score in read_json(folder / "choice.json", "").items()}
 
 
 def test_settings_are_the_best_on_held_out_groups(tuned: Path) -> None:

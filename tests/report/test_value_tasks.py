@@ -39,6 +39,7 @@ from mvitac.report import contact_sheet, figures
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_summary
 from mvitac.report.value_figures import predicted
+from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from support.toy import Toy
 
@@ -129,7 +130,7 @@ def test_the_report_shows_values(scored: tuple[Path, Pack, dict[str, Any]], tmp_
 
 def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
     run, _, result = scored_run(tmp_path, OneTested(values=True, vision_channels=0, num=48))
-    stored = json.loads((run / "probe.json").read_text())
+    stored = read_json(run / "probe.json", "scores")
     cell = stored["summary"]["both"]["touch"]["pixels"]
     assert cell["low"] is None and cell["groups"] == 1 and cell["targets"][0]["low"] is None
     assert stored == result

@@ -33,6 +33,7 @@ from mvitac.recipes import RECIPES, recipe
 from mvitac.run import Run, load_run
 from mvitac.system import device as devices
 from mvitac.system.device import describe_precision, pick_precision
+from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from mvitac.training.step import Step
 from support.training_runs import assert_equal_weights, power_cut, smoke
@@ -190,7 +191,7 @@ def test_runs_from_before_auto_go_on(pack: Pack, tmp_path: Path, hardware: Hardw
     old = replace(run, precision="bf16")
     with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(old, out, quiet=True)
-    record = json.loads((out / "run.json").read_text())
+    record = read_json(out / "run.json", "a record")
     assert record["run"]["precision"] == record.pop("precision") == "bf16"
     (out / "run.json").write_text(json.dumps(record))
     assert torch.load(out / "checkpoint.pt", weights_only=True)["run"] == old.digest()
