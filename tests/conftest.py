@@ -1,8 +1,9 @@
 from __future__ import annotations
 
+import gc
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # Before anything imports the hub's client, which reads it once: no test reaches the network.
@@ -14,6 +15,7 @@ os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 import pytest
 import torch
+from filelock import FileLock
 
 from mvitac.data.pack import Pack
 
@@ -24,11 +26,17 @@ pytest.register_assert_rewrite("support")  # before it is imported: a failed ass
 torch.set_num_threads(1)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest tests first, so that no process waits for another's last one."""
+    items.sort(key=lambda item: item.path.name != "test_tutorials.py")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Packs and features of the tests live and die with them."""
     path = tmp_path_factory.mktemp("cache")
     os.environ["MVITAC_CACHE"] = str(path)
+    gc.freeze()  # what was imported stays: the garbage collector need not look at it again and again
     return path
 
 
@@ -75,15 +83,26 @@ def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return publish(smoke_run, tmp_path_factory.mktemp("artifact") / "artifact")
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that ``make`` fills, in the first of pytest's processes that asks for it. Tests only read it."""
+    folder = factory.getbasetemp()
+    folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / name
+    with FileLock(f"{folder}.lock"):
+        if not folder.exists():
+            (making := factory.mktemp(name, numbered=True)).rmdir()
+            make(making)
+            making.rename(folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """That artifact, exported for ONNX Runtime."""
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import ExportConfig, export
 
-    out = tmp_path_factory.mktemp("export") / "onnx"
-    export(load(artifact), pack, out, ExportConfig(kind="onnx"))
-    return out
+    config = ExportConfig(kind="onnx")
+    return made_once(tmp_path_factory, "onnx", lambda out: export(load(artifact), pack, out, config))
 
 
 @pytest.fixture(scope="session")
@@ -104,9 +123,11 @@ def value_artifact(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> 
     from mvitac.recipes import recipe
     from mvitac.training.loop import train
 
-    folder = tmp_path_factory.mktemp("values")
-    run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
-    return publish(train(run, folder / "run", quiet=True), folder / "artifact")
+    def make(folder: Path) -> None:
+        run = replace(recipe("smoke", PackConfig(path=measured.path)), steps=2, eval_every=0)
+        publish(train(run, folder / "run", quiet=True), folder / "artifact")
+
+    return made_once(tmp_path_factory, "values", make) / "artifact"
 
 
 @pytest.fixture(scope="session")
@@ -115,6 +136,5 @@ def value_onnx(value_artifact: Path, measured: Pack, tmp_path_factory: pytest.Te
     from mvitac.deploy.artifact import load
     from mvitac.deploy.export import ExportConfig, export
 
-    out = tmp_path_factory.mktemp("value export") / "onnx"
-    export(load(value_artifact), measured, out, ExportConfig(kind="onnx"))
-    return out
+    config = ExportConfig(kind="onnx")
+    return made_once(tmp_path_factory, "value-onnx", lambda out: export(load(value_artifact), measured, out, config))

@@ -17,6 +17,7 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import StreamConfig
 from mvitac.run import load_run
+from support.training_runs import power_cut
 
 OLD = Path(__file__).parent / "fixtures" / "0.1.0"
 EXPECTED: dict[str, Any] = json.loads((OLD / "expected.json").read_text())
@@ -115,13 +116,15 @@ def test_report_reads_run_and_probe() -> None:
     assert Path("report", "report.html").stat().st_size > 10_000
 
 
-def test_interrupted_run_resumes_to_its_end() -> None:
+def test_interrupted_run_goes_on_where_it_stopped() -> None:
+    """For 40 of its other 359 steps, with a checkpoint every 20."""
     before = Path("touch_cut", "log.jsonl").read_text()
-    assert main(["pretrain", "--from", "touch_cut/run.json", "--out", "touch_cut", "--resume", "--quiet"]) == 0
+    with power_cut(40), pytest.raises(RuntimeError, match="power cut"):
+        main(["pretrain", "--from", "touch_cut/run.json", "--out", "touch_cut", "--resume", "--quiet"])
     assert Path("touch_cut", "log.jsonl").read_text().startswith(before)
-    assert list(losses("touch_cut")) == list(range(2, 401, 2))
+    assert list(losses("touch_cut")) == list(range(2, 81, 2))
     assert load_run(Path("touch_cut"))[0].digest() == EXPECTED["run_digests"]["touch_cut"]
-    assert mvitac.load("touch_cut").embed(touch=images()["touch"])["touch"].isfinite().all()
+    assert torch.load("touch_cut/checkpoint.pt", weights_only=True)["step"] == 80
 
 
 def test_from_repeats_a_run() -> None:

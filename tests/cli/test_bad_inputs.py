@@ -62,7 +62,7 @@ class WorkBegan(AssertionError):
 
 @pytest.fixture(scope="module")
 def finished(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A good run of two steps, with a checkpoint at the first."""
+    """A good run of two steps."""
     run = replace(recipe("smoke", PackConfig(path=pack.path, size=pack.size)), steps=2, eval_every=0)
     return train(run, tmp_path_factory.mktemp("finished") / "run", quiet=True)
 
@@ -80,6 +80,11 @@ def snapshot(folder: Path) -> dict[str, str]:
         content = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
         found[str(path.relative_to(folder))] = content
     return found
+
+
+def stamps(folder: Path) -> dict[Path, tuple[int, int, int]]:
+    """Every file and folder below ``folder``: what changes when it is written or replaced."""
+    return {path: (s.st_ino, s.st_size, s.st_mtime_ns) for path in folder.rglob("*") for s in [path.stat()]}
 
 
 @pytest.fixture
@@ -104,7 +109,7 @@ def refused(
                 (probe_module, "features"),
             ):
                 monkeypatch.setattr(module, name, trap(name))
-        before, elsewhere = snapshot(tmp_path), {**snapshot(pack.path), **snapshot(finished)}
+        before, elsewhere = snapshot(tmp_path), stamps(pack.path) | stamps(finished)
         capsys.readouterr()
         code = main(words)
         _, error = capsys.readouterr()
@@ -122,7 +127,7 @@ def refused(
         assert not new, f"left behind: {new}"
         assert not [path for path in after if path.endswith(".tmp")]
         assert {path: after.get(path) for path in before} == before, "what was there changed"
-        assert {**snapshot(pack.path), **snapshot(finished)} == elsewhere
+        assert stamps(pack.path) | stamps(finished) == elsewhere
         return error
 
     return refuse
@@ -333,7 +338,7 @@ def impossible(config: Any, start: str, prefix: str = "") -> Iterator[tuple[str,
     for name, kind in numbers(config, prefix):
         option = "--" + name.replace("_", "-")
         whole = int in (kind, *typing.get_args(kind))
-        values = ["-1", "0.5", "1e3"] if whole else ["-1", "nan", "inf", "x"]
+        values = ["-1", "0.5"] if whole else ["-1", "nan", "inf"]
         if whole and name.split(".")[-1] not in HARMLESS_IF_HUGE:
             values.append("1" + "0" * 30)
         for value in values:

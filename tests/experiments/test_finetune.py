@@ -20,11 +20,18 @@ from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
 from mvitac.model import load
 from mvitac.run import load_run
 from mvitac.system.files import read_json
+from mvitac.training import loop
 from mvitac.training.loop import train
 from support.toy import Toy, toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
 
 ASKED = Finetuning(labels=("pattern",), lr=(1e-3, 3e-3), steps=(3,), batch_size=16)
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkpoint after every step of short runs, too."""
+    monkeypatch.setattr(loop, "MIN_BETWEEN_CHECKPOINTS", 1)
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +133,7 @@ def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp
     assert right[1] <= 1 - right[0] + 1e-9  # the rows that were right are wrong now
 
 
+@pytest.mark.usefixtures("often")
 @pytest.mark.parametrize("after", [4, 10])  # while settings are tried, and in the final run
 def test_killed_and_resumed_equals_straight(
     ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, after: int
@@ -255,6 +263,7 @@ def no_label(row: dict[str, Any]) -> int:
     return -1
 
 
+@pytest.mark.usefixtures("often")
 def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tmp_path: Path) -> None:
     asked = Adaptation(steps=4, batches=3, old=bare.path)
     straight = adapted(ancestor, bare, tmp_path / "straight", asked)

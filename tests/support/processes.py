@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 CONTEXT: Any = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(
-    ["mvitac.training.loop", "mvitac.experiments.jobs", "mvitac.transforms.numba_views", "torch._dynamo"]
-)
+CONTEXT.set_forkserver_preload(["support.warm", "torch._dynamo"])
 
 
 def _work(work: Callable[..., int | None], args: tuple[Any, ...], output: str, environment: dict[str, str]) -> None:

@@ -194,11 +194,11 @@ def test_a_folder_that_is_deleted_during_training_is_an_error(pack: Pack, tmp_pa
 
 def test_dropout_and_sgd_resume_too(pack: Pack, tmp_path: Path) -> None:
     method = replace(smoke(pack).method, dropout=0.5)  # type: ignore[call-arg]
-    run = smoke(pack, method=method, optim=Optim(name="sgd", lr=0.05, schedule="cosine"), checkpoint_every=1)
-    train(run, tmp_path / "straight", quiet=True)
-    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "cut", quiet=True)
-    train(run, tmp_path / "cut", resume=True, quiet=True)
+    run = smoke(pack, method=method, optim=Optim(name="sgd", lr=0.05, schedule="cosine"), checkpoint_every=1, steps=4)
+    train(run, tmp_path / "straight", quiet=True, validate=False)
+    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "cut", quiet=True, validate=False)
+    train(run, tmp_path / "cut", resume=True, quiet=True, validate=False)
     assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
 
 
@@ -223,6 +223,7 @@ def test_sigkill_at_random_moments(pack: Pack, tmp_path: Path) -> None:
                 process.kill()
                 process.join()
                 killed += process.exitcode == -signal.SIGKILL
+            time.sleep(0.002)
     finish(begin(main, command(pack, out)))
     assert killed == 3
     assert_equal_weights(tmp_path / "straight", out)
@@ -266,13 +267,13 @@ def test_the_package_has_the_function_every_time(pack: Pack, tmp_path: Path) -> 
     import mvitac
 
     for name in ("a", "b"):
-        assert mvitac.train(smoke(pack, steps=1), tmp_path / name, quiet=True) == tmp_path / name
+        assert mvitac.train(smoke(pack, steps=1), tmp_path / name, quiet=True, validate=False) == tmp_path / name
     assert_equal_weights(tmp_path / "a", tmp_path / "b")
 
 
 def test_a_run_tells_its_speed_soon(pack: Pack, tmp_path: Path) -> None:
     """Steps after the first, which starts everything, so that whoever reads its log can tell the time left."""
-    log = train(smoke(pack, steps=12, log_every=10), tmp_path / "r", quiet=True) / "log.jsonl"
+    log = train(smoke(pack, steps=12, log_every=10), tmp_path / "r", quiet=True, validate=False) / "log.jsonl"
     said = [json.loads(line) for line in log.read_text().splitlines()]
     assert [line["step"] for line in said if "loss" in line] == [3, 10, 12]
 
@@ -280,7 +281,7 @@ def test_a_run_tells_its_speed_soon(pack: Pack, tmp_path: Path) -> None:
 def test_seed_decides(pack: Pack, straight: Path, tmp_path: Path) -> None:
     train(smoke(pack), tmp_path / "same", quiet=True)
     assert_equal_weights(straight, tmp_path / "same")
-    train(smoke(pack, seed=1), tmp_path / "other", quiet=True)
+    train(smoke(pack, seed=1, steps=1), tmp_path / "other", quiet=True, validate=False)
     assert not torch.equal(
         weights(straight)["encoders.touch.conv1.0.weight"], weights(tmp_path / "other")["encoders.touch.conv1.0.weight"]
     )
@@ -301,10 +302,10 @@ def test_from_run_json_repeats_it(pack: Pack, straight: Path, tmp_path: Path) ->
 
 
 def test_learns_the_stripes(tmp_path: Path) -> None:
-    """150 steps on three patterns: kNN on unseen instances well above the untrained trunk's, by touch and by vision."""
+    """80 steps on three patterns: kNN on unseen instances well above the untrained trunk's, by touch and by vision."""
     pack = toy_pack(tmp_path / "pack", num=360)
     optim = Optim(name="adamw", lr=3e-3, schedule="cosine", warmup=0.1)
-    run = smoke(pack, steps=150, batch_size=60, optim=optim, eval_every=0)
+    run = smoke(pack, steps=80, batch_size=60, optim=optim, eval_every=0)
     before = evaluate(fresh(run, pack.spec, pack.size), pack, run)
     log = train(run, tmp_path / "r", quiet=True) / "log.jsonl"
     lines = [json.loads(line) for line in log.read_text().splitlines()]
@@ -317,7 +318,7 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
 
 def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
     method = SupervisedConfig(tasks=("pattern",), labels="train")
-    run = smoke(pack, method=method, steps=60, batch_size=30, optim=Optim(name="adamw", lr=3e-3))
+    run = smoke(pack, method=method, steps=30, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=3e-3))
     out = train(run, tmp_path / "r", quiet=True)
     values = json.loads((out / "log.jsonl").read_text().splitlines()[-1])["eval"]
     assert values["touch/knn pattern"] > 0.9, values
@@ -468,10 +469,9 @@ def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> 
 
 
 def test_same_touch_positives_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        train(smoke(pack, positives="same-touch"), tmp_path / name, quiet=True)
+    for name, positives in (("a", "same-touch"), ("b", "same-touch"), ("c", "same-image")):
+        train(smoke(pack, positives=positives, steps=2), tmp_path / name, quiet=True, validate=False)
     assert_equal_weights(tmp_path / "a", tmp_path / "b")
-    train(smoke(pack, positives="same-image"), tmp_path / "c", quiet=True)
     first = "encoders.touch.conv1.0.weight"
     assert not torch.equal(weights(tmp_path / "a")[first], weights(tmp_path / "c")[first])
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from scipy.special import expit, logit, stdtr, stdtrit
-from sklearn.metrics import confusion_matrix, f1_score, recall_score, roc_auc_score
+from sklearn.metrics import confusion_matrix, precision_recall_fscore_support, roc_auc_score
 
 from mvitac.evaluation.events import lead_of, pool_events, shares
 from mvitac.evaluation.value_scores import one_target, pool_values, r2_without_each_group
@@ -39,12 +39,13 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
     num_groups = int(groups.max()) + 1
     auroc = None
     no_division: dict[str, Any] = {"zero_division": 0}  # a class that is never predicted has precision 0
+    _, recall, f1, _ = precision_recall_fscore_support(y, guess, labels=present, average="macro", **no_division)
     if num_classes == 2 and len(present) == 2:
         auroc = float(roc_auc_score(y, probabilities[:, 1]))
     return {
         "accuracy": float((guess == y).mean()),
-        "balanced_accuracy": float(recall_score(y, guess, labels=present, average="macro", **no_division)),
-        "macro_f1": float(f1_score(y, guess, labels=present, average="macro", **no_division)),
+        "balanced_accuracy": float(recall),
+        "macro_f1": float(f1),
         "auroc": auroc,
         "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist(),
         "num_test": len(y),

@@ -305,8 +305,8 @@ def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # class names in other scripts
-        if figure.get_layout_engine() is not None:
-            figure.draw_without_rendering()
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)
             figure.set_layout_engine(None)
         printed = canvas(figure)
         (printed.print_svg if isinstance(printed, FigureCanvasSVG) else printed.print_png)(buffer, **options)

@@ -5,6 +5,7 @@ import importlib.metadata
 import os
 import platform
 import subprocess
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,12 @@ def provenance() -> dict[str, Any]:
     }
 
 
+@cache
 def git_commit() -> str | None:
-    """Return the commit of the checkout this package is imported from, with '+' if it has changes; None outside one."""
+    """Return the commit of the checkout this package is imported from, with '+' if it has changes; None outside one.
+
+    As of the first call in a process, which runs the code that was there then.
+    """
     try:
         top = Path(_git("rev-parse", "--show-toplevel"))
         if Path(__file__).parent != top / "src" / "mvitac" / "system":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,7 @@ def path_of(obj: int) -> np.ndarray:
     return np.cumsum(steps)
 
 
+@cache
 def camera(obj: int, k: int) -> np.ndarray:
     rng = np.random.default_rng([1, obj])
     y, x = np.mgrid[0:SIDE, 0:SIDE].astype(float)
@@ -133,6 +135,7 @@ def camera(obj: int, k: int) -> np.ndarray:
     return noisy(image, [2, obj, k])
 
 
+@cache
 def gel(obj: int, k: int) -> np.ndarray:
     y, x = np.mgrid[0:SIDE, 0:SIDE].astype(float)
     rng = np.random.default_rng([3, obj])
@@ -145,7 +148,9 @@ def gel(obj: int, k: int) -> np.ndarray:
 
 
 def noisy(image: np.ndarray, seed: list[int]) -> np.ndarray:
-    return np.clip(image + np.random.default_rng(seed).normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+    made = np.clip(image + np.random.default_rng(seed).normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+    made.flags.writeable = False  # it is kept for the next fault
+    return made
 
 
 def check(fault: str, tmp_path: Path) -> dict[str, Finding]:
