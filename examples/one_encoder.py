@@ -37,7 +37,9 @@ from mvitac.system.files import read_json, write_json
 FOLDS, SIDE = 3, 72
 TARGETS = "pose=pose_z_mm:mm,pose_Rx_deg:deg,pose_Ry_deg:deg,shear_x_mm:mm,shear_y_mm:mm,shear_Rz_deg:deg"
 LABELS = ("material", "hardness", "roughness", "bumpiness")
-SETS: dict[str, dict[str, Any]] = {  # "stratum" and "of" are not options: what spreads objects over folds, other sensors
+SETS: dict[
+    str, dict[str, Any]
+] = {  # "stratum" and "of" are not options: what spreads objects over folds, other sensors
     "physiclear": {"labels": LABELS, "group": "object", "touch_group": "video", "stratum": "material"},
     "slip_grasp": {"labels": ("success",), "group": "object", "touch_group": "grasp", "label_only": ("seq<=4",)},
     "vt60": {"labels": ("category",), "group": "object"},
@@ -67,7 +69,8 @@ def manifest_of(name: str, manifests: Path, out: Path) -> Path:
         if name == "physiclear":  # some of its objects are in slip_gsmini too: tested in the same fold
             other = {row["object"]: row for row in read(manifests / "slip_gsmini.csv")}
             for row in rows:
-                row.update({f"fold{k}": other[row["object"]][f"fold{k}"] for k in range(1, FOLDS + 1) if row["object"] in other})
+                same = other.get(row["object"], row)
+                row.update({f"fold{k}": same[f"fold{k}"] for k in range(1, FOLDS + 1)})
         write(rows, file, manifests, images)
     return file
 
@@ -93,7 +96,18 @@ def pretrain(out: Path, *options: str) -> Path:
     """Pre-train unless ``out`` has a finished run."""
     if not (out / "model.safetensors").exists():
         resume = ["--resume"] if (out / "run.json").exists() else []
-        command = [sys.executable, "-m", "mvitac", "pretrain", "--recipe", "quick", "--out", str(out), "--eval-every", "0"]
+        command = [
+            sys.executable,
+            "-m",
+            "mvitac",
+            "pretrain",
+            "--recipe",
+            "quick",
+            "--out",
+            str(out),
+            "--eval-every",
+            "0",
+        ]
         subprocess.run([*command, *options, *resume], check=True)
     return out
 
@@ -112,7 +126,9 @@ class Encoders:
 
     def _own(self, name: str, fold: int, seed: int, out: Path, *more: str) -> Path:
         packs = [str(pack.path) for pack in packs_of(name, fold, self.manifests, self.out)]
-        data = ["--data", "mix", "--data.parts", *packs] if len(packs) > 1 else ["--data", "pack", "--data.path", *packs]
+        data = (
+            ["--data", "mix", "--data.parts", *packs] if len(packs) > 1 else ["--data", "pack", "--data.path", *packs]
+        )
         steps = ["--steps", str(self.own_steps), "--seed", str(seed)]
         return pretrain(out, *data, *steps, *more)
 
@@ -169,9 +185,15 @@ def score(source: str, seed: int | None, name: str, encoders: Encoders) -> list[
                 model = untrained(packs[0], seed or 0)
             else:
                 model = mvitac.load(getattr(encoders, source.replace(" ", "_"))(name, fold, seed or 0))
-            found[m] = joined(packs, m, lambda pack, rows, m=m, model=model: pack_features(model, pack, m, rows).numpy())
+            found[m] = joined(
+                packs, m, lambda pack, rows, m=m, model=model: pack_features(model, pack, m, rows).numpy()
+            )
         folds.append(list(records_of(source, seed, packs, found)))
     return pool(folds)
+
+
+def lead(record: dict[str, Any]) -> float:
+    return record["accuracy"] if "accuracy" in record else record["r2"]
 
 
 def show(kept: dict[str, list[dict[str, Any]]]) -> None:
@@ -211,7 +233,7 @@ def main() -> None:
                 if (key := f"{name}: {source} seed {seed}") not in kept:
                     kept[key] = score(source, None if source == "pixels" else seed, name, encoders)
                     write_json(file, kept)
-                    print(key, *(f"{r['task']} {r['modality']} {percent(r['accuracy' if 'accuracy' in r else 'r2'])}" for r in kept[key]), flush=True)
+                    print(key, *(f"{r['task']} {r['modality']} {percent(lead(r))}" for r in kept[key]), flush=True)
     show(kept)
 
 
