@@ -28,7 +28,7 @@ from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.engine import Call, Engine, cosines
 from mvitac.deploy.export import ExportConfig, export
 from mvitac.deploy.export_module import ExportModule
-from mvitac.model import fresh
+from mvitac.model_files import fresh
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe
 from mvitac.system.provenance import provenance

@@ -27,7 +27,7 @@ from mvitac.data.windows import windowed
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.engine import Engine
 from mvitac.deploy.export import ExportConfig, export
-from mvitac.model import fresh
+from mvitac.model_files import fresh
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe
 from mvitac.system.provenance import provenance

@@ -23,7 +23,7 @@ from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import percent, with_interval
 from mvitac.evaluation.scores import interval, pool
-from mvitac.model import fresh
+from mvitac.model_files import fresh
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe
 

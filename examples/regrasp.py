@@ -34,7 +34,8 @@ from mvitac.deploy.policy import ObservationEncoder
 from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.probe import ProbeSplit, split_rows
 from mvitac.evaluation.scores import interval, paired_difference
-from mvitac.model import Model, fresh
+from mvitac.model import Model
+from mvitac.model_files import fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.system.files import check_place, write_json
 

@@ -28,7 +28,7 @@ from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import lead_text, percent, with_interval
 from mvitac.evaluation.scores import event_of, interval, paired_difference, pool
-from mvitac.model import fresh
+from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from mvitac.system.files import read_json, write_json
 

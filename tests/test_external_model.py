@@ -30,7 +30,7 @@ from mvitac.experiments.plan import Row
 from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import markdown
 from mvitac.external import ExternalModel, is_noncommercial, load_external
-from mvitac.model import fresh
+from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from support.owners import OWNERS
 from support.small_plans import ROWS, small

@@ -8,10 +8,9 @@ Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the
 """
 
 import json
-from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,16 +19,16 @@ from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Target
 from mvitac.methods.base import Method
-from mvitac.nn.encoders import SCRATCH, last_map, num_features, timm_trunk
+from mvitac.nn.encoders import last_map, num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
-from mvitac.nn.weights import check_tensors, read_model, safetensors_digest, write_model
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.nn.weights import safetensors_digest, write_model
+from mvitac.registry import to_json, unknown
 from mvitac.run import Run
-from mvitac.system.files import brief, digest, parse_json
+from mvitac.system.files import digest
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
-BEST = "model.best.safetensors"  # weights of a run that were best on split val, kept with ``Run.eval_every``
+ABOUT = ("run", "spec", "stored")  # texts in the header of a file of weights
 EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px
 
 
@@ -343,57 +342,3 @@ class Model(nn.Module):
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
         about = json.dumps(to_json(self.run)), json.dumps(to_json(self.spec)), str(self.stored)
         write_model(path, tensors, dict(zip(ABOUT, about, strict=True)))
-
-
-ABOUT = ("run", "spec", "stored")
-Which = Literal["last", "best"]
-
-
-def weights_file(folder: Path, which: Which) -> Path:
-    """The file of a run's weights; ValueError if the best ones were not kept."""
-    if which == "best" and not (folder / BEST).is_file():
-        raise ValueError(f"{folder} has no {BEST}: train with --eval-every N to keep the best weights, or use the last")
-    return folder / (BEST if which == "best" else "model.safetensors")
-
-
-def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
-    """The model of ``run`` before training, initialised from its seed. Used as a control, and to load weights into."""
-    torch.manual_seed(run.seed)
-    return Model(run.method.build(spec, run.encoder), run, spec, stored)
-
-
-def load(path: str | Path, which: Which = "last") -> Model:
-    """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
-
-    Args:
-        path: The folder or the file.
-        which: Weights of a run's folder: those after its last step, or the best on split val (``Run.eval_every``).
-
-    Raises:
-        ValueError: If there is no such model, or the file is damaged or was changed.
-    """
-    path = Path(path)
-    file = weights_file(path, which) if path.is_dir() else path
-    if not file.is_file():
-        hint = "; the run is not finished: `mvitac pretrain --resume`" if (path / "checkpoint.pt").exists() else ""
-        raise ValueError(f"no trained model at {file}{hint}")
-    header, tensors = read_model(file, ABOUT)
-    try:
-        run = Run.load(parse_json(header["run"]))
-        spec: DataSpec = from_json(DataSpec, parse_json(header["spec"]), "spec")
-        stored = int(from_json(int, parse_json(header["stored"]), "stored"))
-        # Older headers have no spec.difference; it is in the data config.
-        spec = replace(spec, difference=spec.difference or bool(getattr(run.data, "difference", False)))
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
-    # The file has all weights, so the empty model needs no pretrained ones, and no download.
-    empty = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
-    # Check shapes before allocating: a damaged header may describe a network larger than the memory.
-    with torch.random.fork_rng(devices=[]):  # keep the caller's random state
-        with torch.device("meta"):
-            check_tensors(file, fresh(empty, spec, stored).state_dict(), tensors)
-        model = fresh(empty, spec, stored)
-    model.run = run
-    model.foreign = any((file.parent / name).exists() for name in ("artifact.json", "index.json"))
-    model.load_state_dict(tensors)
-    return model

@@ -24,7 +24,7 @@ from mvitac.deploy.artifact import load
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.evaluation.value_scores import r_squared
-from mvitac.model import fresh
+from mvitac.model_files import fresh
 from mvitac.system.files import digest
 from support.toy import toy_pack
 

@@ -28,7 +28,7 @@ from mvitac.evaluation.probe import probe_all, probe_features, probe_model, spli
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.model import fresh, load
+from mvitac.model_files import fresh, load
 from mvitac.recipes import recipe
 from mvitac.report.report import _as_scored, open_runs
 from mvitac.report.tables import print_retrieval, print_summary

@@ -21,7 +21,8 @@ from mvitac.evaluation.robustness import CLEANED, DROPOUT, LEAK, MISSING, NOISE,
 from mvitac.experiments.collect import gather, lay_out
 from mvitac.experiments.jobs import do_all
 from mvitac.experiments.table_formats import write_tables
-from mvitac.model import Model, load
+from mvitac.model import Model
+from mvitac.model_files import load
 from mvitac.recipes import recipe
 from mvitac.run import Optim
 from mvitac.training.loop import train

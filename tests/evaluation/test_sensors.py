@@ -28,7 +28,8 @@ from mvitac.evaluation.sensors import (
     unlabelled_rows,
     with_statistics,
 )
-from mvitac.model import Model, load
+from mvitac.model import Model
+from mvitac.model_files import load
 from mvitac.transforms.preprocess import encoder_input
 from support.toy import Toy
 

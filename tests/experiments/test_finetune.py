@@ -17,7 +17,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import NEW, OLD, TRANSFER, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.run import load_run
 from mvitac.system.files import read_json
 from mvitac.training import loop

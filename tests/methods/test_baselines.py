@@ -26,7 +26,7 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.simclr import SimCLRConfig, nt_xent
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.methods.vicreg import VICReg, VICRegConfig, covariance, variance
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Bank, Queue, shard_banks
 from mvitac.recipes import with_method

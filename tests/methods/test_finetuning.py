@@ -15,7 +15,8 @@ from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.methods.supervised import Supervised, SupervisedConfig
-from mvitac.model import Model, load
+from mvitac.model import Model
+from mvitac.model_files import load
 from mvitac.registry import from_json, to_json
 from mvitac.run import Optim
 from mvitac.training.heads import fit_heads

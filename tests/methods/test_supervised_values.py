@@ -18,7 +18,7 @@ from mvitac.evaluation.probe import probe_model, split_rows
 from mvitac.methods.base import Views
 from mvitac.methods.calandra import CalandraConfig
 from mvitac.methods.supervised import SupervisedConfig, ValueHead
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import values_of

@@ -32,7 +32,7 @@ from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.experiments import table_formats
 from mvitac.experiments.plan import Plan, Row
 from mvitac.experiments.table import lines_of, target_lines
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.report import contact_sheet, figures

@@ -17,7 +17,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.system.processes import in_threads, side_by_side
 
 

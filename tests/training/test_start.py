@@ -22,7 +22,7 @@ from mvitac.evaluation.leaks import read_sources
 from mvitac.experiments.plan import Plan, Row
 from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.model import fresh, load
+from mvitac.model_files import fresh, load
 from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
 from mvitac.nn.initial import Init, adapt_stem, load_trunk
 from mvitac.nn.momentum import Momentum

@@ -11,8 +11,8 @@ from mvitac.bench.result import read_result, sign, write_result
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite
 from mvitac.deploy.artifact import load
-from mvitac.evaluation.evaluate import names_of
 from mvitac.evaluation.leaks import FILE, UNKNOWN, read_sources
+from mvitac.evaluation.run_names import names_of
 from mvitac.experiments.plan import slug
 from mvitac.external import ExternalModel
 from mvitac.model import Model

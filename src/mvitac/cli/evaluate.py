@@ -15,7 +15,7 @@ from mvitac.evaluation.external_encoders import about_lines
 from mvitac.evaluation.robustness import STRESSES, stress
 from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.evaluation.sensors import RecolouredPack
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_sensors, print_summary
 from mvitac.system.console import Console

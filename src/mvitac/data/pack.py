@@ -223,10 +223,7 @@ class Pack:
 
     @functools.cached_property
     def phased(self) -> bool:
-        """Whether rows of a touch group show the phases of a grasp (column phase: before, during, after).
-
-        Else they show repeated touches, or frames of one.
-        """
+        """Whether rows of a touch group show the phases of a grasp (column phase), not repeated touches or frames."""
         return "phase" in self.table.column_names and set(self.column("phase").astype(str)) <= set(PHASES)
 
     @functools.cached_property

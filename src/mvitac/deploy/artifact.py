@@ -19,7 +19,7 @@ import safetensors.torch
 from huggingface_hub import ModelHubMixin
 from torch import nn
 
-from mvitac import model as models
+from mvitac import model_files
 from mvitac.model import Model
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import from_json, to_json
@@ -79,7 +79,7 @@ class PublishedModel(Model, ModelHubMixin):
             shutil.copyfile(self.folder / name, save_directory / name)
 
 
-def load(path: str | Path, which: models.Which = "last") -> Model:
+def load(path: str | Path, which: model_files.Which = "last") -> Model:
     """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
     Args:
@@ -103,7 +103,7 @@ def load(path: str | Path, which: models.Which = "last") -> Model:
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
     if found and not local.exists() and not local.parent.is_dir():
         return read(pull(found["repo"], found["revision"]))
-    return read(local) if (local / MANIFEST).is_file() else models.load(local, which)
+    return read(local) if (local / MANIFEST).is_file() else model_files.load(local, which)
 
 
 def pull(repo: str, revision: str | None = None, **options: Any) -> Path:
@@ -140,7 +140,7 @@ def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]
 def read(folder: Path) -> PublishedModel:
     """The model in the artifact ``folder``, with its probes; ValueError if anything was changed since it was published."""
     manifest = read_manifest(folder)
-    model = models.load(folder / "model.safetensors")
+    model = model_files.load(folder / "model.safetensors")
     asked, given = preprocessing(model), manifest["preprocessing"]
     for name in ("colour_order", "mean", "std", "stored", "size", "channels", "window"):
         if given.get(name) != asked.get(name):

@@ -22,7 +22,8 @@ from mvitac.evaluation.probe import ProbeSplit, scorable, score_predictions, sco
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.value_scores import error_by_range
-from mvitac.model import Model, load
+from mvitac.model import Model
+from mvitac.model_files import load
 from mvitac.nn.encoders import SCRATCH, build_trunk
 from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo, constant, from_logistic, from_ridge
 from mvitac.registry import to_json

@@ -20,7 +20,8 @@ import pyarrow.parquet as pq
 import torch
 
 from mvitac.data.pack import Pack, has_difference
-from mvitac.model import Model, load
+from mvitac.model import Model
+from mvitac.model_files import load
 from mvitac.registry import unknown
 from mvitac.system.files import digest, digest_file, naming, read_json, write_atomic, write_json
 from mvitac.system.locks import new_folder

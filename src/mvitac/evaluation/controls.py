@@ -28,7 +28,8 @@ from mvitac.evaluation.probe import (
 )
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.sensors import Standardise
-from mvitac.model import Model, fresh
+from mvitac.model import Model
+from mvitac.model_files import fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.run import Run
 from mvitac.system.processes import in_threads

@@ -1,6 +1,5 @@
 """Evaluate finished runs: probe them and their controls together, in one result for tables and reports."""
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,17 +18,20 @@ from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sour
 from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows, with_classes
 from mvitac.evaluation.probe_config import ProbeConfig
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
+from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import describe_statistics, sensor_records
-from mvitac.model import Model, Which, load, weights_file
+from mvitac.model import Model
+from mvitac.model_files import Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run
-from mvitac.system.files import check_place, digest, digest_file, read_json, write_json
+from mvitac.system.files import check_place, digest_file, read_json, write_json
 from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
 
+Probed = tuple[Path, Model, str, list[Source] | None]  # a run: folder, model, name, and what it learned from
 END_TO_END = ", end to end"
 """Suffix of a source's name for the scores of its own heads, trained along with its encoders."""
 
@@ -84,10 +86,6 @@ def probe_runs(
 ) -> Scores:
     """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
 
-    Example:
-        >>> result = probe_runs([Path("runs/first")], ProbeConfig(probes=("linear", "knn")))
-        >>> result["summary"]["category"]["touch"]["mvitac"]["mean"]
-
     Args:
         paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
         session: What to probe.
@@ -118,34 +116,33 @@ def probe_runs(
     _check_tasks(pack, tasks, modalities)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
-    if session.controls:
-        _check_weights(runs, session)
+    _check_weights(runs, session)
     sources = check_unseen(paths, models, pack, tasks, allow_leak=allow_leak)
-    each = list(zip(paths, models, names, sources, strict=True))
+    each = [*zip(paths, models, names, sources, strict=True)]
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     records += probe_encoders(others, tasks, modalities, session.probes, controls=session.controls)
     if session.controls:
         specs = [m.spec for m in models]
         found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
-    result = {
-        **_describe_data(pack, tasks),
-        "asked": to_json(session),
-        "models": _digests(paths, weights),
-        "encoders": [model.describe() for model, _ in others],
-        "leaks": leaks_of([*records, *retrieval]),
-        "records": records,
-        "retrieval": retrieval,
-        "summary": summarise(records, session.probes[0]),
-    }
-    if session.standardise:
-        result["statistics"] = describe_statistics(pack, session.standardise)
-    if session.sensors:
-        found = ((n, m, r) for n, m in zip(names, models, strict=True) for r in sensor_records(m, pack))
-        result["sensors"] = [{"source": n, "seed": m.run.seed, **r} for n, m, r in found]
+    result = {**_describe_data(pack, tasks), "asked": to_json(session), "models": _digests(paths, weights)}
+    result |= {"encoders": [m.describe() for m, _ in others], "leaks": leaks_of([*records, *retrieval])}
+    result |= {"records": records, "retrieval": retrieval, "summary": summarise(records, session.probes[0])}
+    result |= _about_sensors(each, pack, session)
     for path in paths:
         write_json(path / ("probe.best.json" if weights == "best" else "probe.json"), result, sealed=True)
     return Scores(result)
+
+
+def _about_sensors(each: Sequence[Probed], pack: Pack, session: ProbeConfig) -> dict[str, Any]:
+    """Which statistics of touch sensors were used, and what features tell of the sensor, if either was asked for."""
+    found: dict[str, Any] = (
+        {"statistics": describe_statistics(pack, session.standardise)} if session.standardise else {}
+    )
+    if session.sensors:
+        scored = ((name, model, record) for _, model, name, _ in each for record in sensor_records(model, pack))
+        found["sensors"] = [{"source": name, "seed": model.run.seed, **record} for name, model, record in scored]
+    return found
 
 
 def _check_tasks(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> None:
@@ -180,7 +177,7 @@ def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
 
 
 def _probe_models(
-    each: Sequence[tuple[Path, Model, str, list[Source] | None]],
+    each: Sequence[Probed],
     pack: Pack,
     tasks: Sequence[AnyTask],
     modalities: Sequence[str],
@@ -272,7 +269,7 @@ def check_unseen(
 
 def _check_weights(runs: Sequence[Run], session: ProbeConfig) -> None:
     """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
-    for weights in start_weights(runs, session.imagenet):
+    for weights in start_weights(runs, session.imagenet) if session.controls else ():
         build_trunk(replace(runs[0].encoder, weights=weights), 3)
 
 
@@ -295,48 +292,6 @@ def _probe_run(
         record["leak"] = leaks[record["task"]]
     found = [{**own, **r, "leak": scored.leak(learned, retrieved_rows(pack))} for r in cross_modal(model, pack)]
     return records, found
-
-
-def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
-    """Names of the runs: the method, the recipe if recipes differ, and the folder if runs of one name differ further.
-
-    Raises:
-        ValueError: If two runs are the same, since they would count as two seeds.
-    """
-    several = len({model.run.recipe for model in models}) > 1
-    names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]
-    alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> settings -> seed -> folder
-    for name, path, model in zip(names, paths, models, strict=True):
-        seeds = alike.setdefault(name, {}).setdefault(_settings(path, model), {})
-        if model.run.seed in seeds:
-            raise ValueError(
-                f"{seeds[model.run.seed]} and {path} are the same run (equal settings, seed {model.run.seed}):"
-                " they would count as two seeds, give one of them"
-            )
-        seeds[model.run.seed] = path
-    where: dict[Path, str] = {}
-    for kinds in alike.values():
-        folders = [list(seeds.values()) for seeds in kinds.values()]
-        for group, place in zip(folders, _places(folders), strict=True):
-            where |= dict.fromkeys(group, f" ({place})" if len(folders) > 1 else "")
-    return [name + where[path] for name, path in zip(names, paths, strict=True)]
-
-
-def _settings(path: Path, model: Model) -> str:
-    """Digest of all settings but the seed, and of the data by content. Runs that share it are seeds of one method."""
-    record = load_run(path)[1] if (path / "run.json").exists() else {}
-    data = record.get("pack") or to_json(model.run.data)
-    return digest([replace(model.run, seed=0, data=PackConfig()).digest(), data])
-
-
-def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
-    """Shortest distinct names of groups of folders: from the folder that a group shares, else from all of its folders."""
-    whole = [[path.resolve() for path in group] for group in groups]
-    shared = [Path(os.path.commonpath(group)) for group in whole]
-    listed = [[place] for place in shared] if len(set(shared)) == len(groups) else whole
-    every = [place for group in listed for place in group]
-    num = next(n for n in range(1, 1000) if len({place.parts[-n:] for place in every}) == len(every))
-    return [", ".join("/".join(place.parts[-num:]) for place in group) for group in listed]
 
 
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:

@@ -28,7 +28,8 @@ from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split_rows
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.model import Model, load
+from mvitac.model import Model
+from mvitac.model_files import load
 from mvitac.nn.finetuning import Part
 from mvitac.nn.initial import Init
 from mvitac.run import Optim, Run

@@ -22,7 +22,7 @@ from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.robustness import stress
 from mvitac.experiments.plan import Plan
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.nn.encoders import SCRATCH
 from mvitac.nn.initial import Init
 from mvitac.registry import to_json

@@ -12,13 +12,14 @@ from typing import Any
 
 from mvitac import __version__
 from mvitac.data.pack import Pack
-from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, names_of, probe_runs, stored_result
+from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.retrieval import cross_modal
+from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import covered, percent, score_name, with_interval
 from mvitac.evaluation.scores import summarise
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.registry import to_json
 from mvitac.report import galleries, score_sections, tables
 from mvitac.report import html as page

@@ -15,7 +15,8 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
 from mvitac.methods.base import Method
 from mvitac.methods.supervised import Supervised, SupervisedConfig
-from mvitac.model import Model, load
+from mvitac.model import Model
+from mvitac.model_files import load
 from mvitac.nn.finetuning import renew_norms
 from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.nn.momentum import Momentum

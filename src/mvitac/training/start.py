@@ -10,7 +10,7 @@ from torch import Tensor
 from mvitac.data.pack import Pack
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, read_sources, unknown_source
 from mvitac.methods.base import Method
-from mvitac.model import load
+from mvitac.model_files import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import FORMAT, read_safetensors

@@ -18,7 +18,8 @@ from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features
 from mvitac.methods.base import Method
-from mvitac.model import BEST, Model
+from mvitac.model import Model
+from mvitac.model_files import BEST
 from mvitac.run import Run
 from mvitac.training.log import Log
 

@@ -1,0 +1,54 @@
+"""Names of runs in a result: seeds of one method share a name."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from mvitac.datasets.pack import PackConfig
+from mvitac.model import Model
+from mvitac.registry import to_json
+from mvitac.run import load_run
+from mvitac.system.files import digest
+
+
+def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
+    """Names of the runs: the method, the recipe if recipes differ, and the folder if runs of one name differ further.
+
+    Raises:
+        ValueError: If two runs are the same, since they would count as two seeds.
+    """
+    several = len({model.run.recipe for model in models}) > 1
+    names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]
+    alike: dict[str, dict[str, dict[int, Path]]] = {}  # name -> settings -> seed -> folder
+    for name, path, model in zip(names, paths, models, strict=True):
+        seeds = alike.setdefault(name, {}).setdefault(_settings(path, model), {})
+        if model.run.seed in seeds:
+            raise ValueError(
+                f"{seeds[model.run.seed]} and {path} are the same run (equal settings, seed {model.run.seed}):"
+                " they would count as two seeds, give one of them"
+            )
+        seeds[model.run.seed] = path
+    where: dict[Path, str] = {}
+    for kinds in alike.values():
+        folders = [list(seeds.values()) for seeds in kinds.values()]
+        for group, place in zip(folders, _places(folders), strict=True):
+            where |= dict.fromkeys(group, f" ({place})" if len(folders) > 1 else "")
+    return [name + where[path] for name, path in zip(names, paths, strict=True)]
+
+
+def _settings(path: Path, model: Model) -> str:
+    """Digest of all settings but the seed, and of the data by content. Runs that share it are seeds of one method."""
+    record = load_run(path)[1] if (path / "run.json").exists() else {}
+    data = record.get("pack") or to_json(model.run.data)
+    return digest([replace(model.run, seed=0, data=PackConfig()).digest(), data])
+
+
+def _places(groups: Sequence[Sequence[Path]]) -> list[str]:
+    """Shortest distinct names of groups of folders: from the folder that a group shares, else from all of its folders."""
+    whole = [[path.resolve() for path in group] for group in groups]
+    shared = [Path(os.path.commonpath(group)) for group in whole]
+    listed = [[place] for place in shared] if len(set(shared)) == len(groups) else whole
+    every = [place for group in listed for place in group]
+    num = next(n for n in range(1, 1000) if len({place.parts[-n:] for place in every}) == len(every))
+    return [", ".join("/".join(place.parts[-num:]) for place in group) for group in listed]
