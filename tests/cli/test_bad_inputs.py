@@ -170,7 +170,7 @@ WORDS: list[tuple[str, str, list[str]]] = [
     ("recipe", "pretrain --recipe pape --out {out}", ["'pape'", "did you mean 'paper'"]),
     ("logger", PRETRAIN + "--logger tensorbord", ["'tensorbord'", "did you mean 'tensorboard'"]),
     ("logger-by-its-old-name", PRETRAIN + "--sink tensorbord", ["'tensorbord'", "did you mean 'tensorboard'"]),
-    ("logger-not-installed", PRETRAIN + "--logger trackio", ["pip install", "mvitac[trackio]"]),
+    ("logger-not-installed", PRETRAIN + "--logger trackio", ["pip install", ".[trackio]"]),
     ("trunk", PRETRAIN + "--encoder.trunk resnet81", ["'resnet81'", "did you mean", "resnet18"]),
     ("trunk-empty", PRETRAIN + "--encoder.trunk=", ["trunk ''", "timm"]),
     ("trunk-tag", PRETRAIN + "--encoder.trunk resnet18.nobody_in1k", ["resnet18.nobody_in1k", "tag"]),

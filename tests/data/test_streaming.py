@@ -482,7 +482,7 @@ TRAIN = ["pretrain", "--recipe", "smoke", "--data", "stream", "--data.cache", "{
         ([*TRAIN, "--data.url", "{tmp}/nothing"], "no pack.json at {tmp}/nothing: make one with `mvitac data shard"),
         ([*TRAIN, "--data.url", "memory://nothing"], "no pack.json at memory://nothing"),
         ([*TRAIN, "--data.url", "odd://place"], "odd://place cannot be opened (Protocol not known: odd"),
-        ([*TRAIN, "--data.url", "s3://bucket/place"], "pip install 'mvitac[s3]'"),
+        ([*TRAIN, "--data.url", "s3://bucket/place"], "pip install -e '.[s3]'"),
         ([*TRAIN, "--data.url", "{shards}", "--data.cache-gb", "0.0001"], "give --data.cache-gb 0.001 per process"),
         ([*TRAIN, "--data.window", "0"], "window 0: give"),
         ([*TRAIN, "--data.cache-gb", "-1"], "cache_gb -1.0: give"),

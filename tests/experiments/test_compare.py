@@ -666,7 +666,7 @@ def test_slurm_without_submitit_is_one_line(
     monkeypatch.setitem(sys.modules, "submitit", None)  # as if it were not installed
     plan = write_plan(tmp_path / "plan.json", 1, 1, 2)
     assert main([*command(pack, plan, tmp_path / "out"), "--slurm", "slurm_partition=gpu"]) == 2
-    assert "pip install 'mvitac[slurm]'" in capsys.readouterr().err
+    assert "pip install -e '.[slurm]'" in capsys.readouterr().err
 
 
 # -- folds ------------------------------------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ def explore(argv: list[str]) -> None:
     except ModuleNotFoundError as error:
         if error.name != "gradio":
             raise
-        raise ValueError("the explorer needs gradio: pip install 'mvitac[explore]'") from None
+        raise ValueError("the explorer needs gradio: pip install -e '.[explore]' in mvitac's clone") from None
     print(f"explorer: http://{options.host}:{options.port or 7860} (or the next free port; Ctrl-C ends it)", flush=True)
     serve(blocks, host=options.host, port=options.port)
 

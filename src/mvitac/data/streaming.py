@@ -40,7 +40,9 @@ def reach(url: str) -> tuple[Any, str]:
     try:
         system, place = fsspec.url_to_fs(url)
     except ImportError as error:
-        raise ValueError(f"{url} cannot be opened ({brief(error)}): s3:// needs pip install 'mvitac[s3]'") from None
+        raise ValueError(
+            f"{url} cannot be opened ({brief(error)}): s3:// needs pip install -e '.[s3]' in mvitac's clone"
+        ) from None
     except ValueError as error:
         raise ValueError(f"{url} cannot be opened ({brief(error)}): give a folder, file:///..., s3://...") from None
     return system, place.rstrip("/")

@@ -132,7 +132,7 @@ def open_engine(folder: Path, kind: str, precision: str = "fp32", threads: int =
     try:
         return {"torch": _torch, "onnx": _onnx, "openvino": _openvino}[kind](path, precision, threads)
     except ImportError as error:
-        raise ValueError(f"{path} needs {error.name}: pip install 'mvitac[export]'") from None
+        raise ValueError(f"{path} needs {error.name}: pip install -e '.[export]' in mvitac's clone") from None
     except Exception as error:  # each engine has its own exceptions
         raise ValueError(f"{path} cannot be opened ({brief(error)}): export it again") from None
 

@@ -222,4 +222,4 @@ def _readable(files: Source, text: str) -> Source:
 
 def _need_opencv(text: str) -> None:
     if importlib.util.find_spec("cv2") is None:
-        raise ValueError(f"source {text!r} needs OpenCV: pip install 'mvitac[live]'")
+        raise ValueError(f"source {text!r} needs OpenCV: pip install -e '.[live]' in mvitac's clone")

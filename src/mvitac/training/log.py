@@ -142,7 +142,7 @@ def open_loggers(name: str | None, out: Path, run: Run) -> Iterator[tuple[Logger
     try:
         library = importlib.import_module("torch.utils.tensorboard" if name == "tensorboard" else name)
     except ImportError:
-        raise ValueError(f"--logger {name} needs its library: pip install 'mvitac[{name}]'") from None
+        raise ValueError(f"--logger {name} needs its library: pip install -e '.[{name}]' in mvitac's clone") from None
     # Start it with the first values: a run that is refused must leave no files, since --out must be new.
     started: list[Started] = []
 

@@ -40,7 +40,7 @@ class File(Adapter):
         try:
             network = OnnxNetwork(file) if file.suffix == ".onnx" else Plain(_torchscript(file), self.prefix)
         except ImportError as error:
-            raise ValueError(f"{file} needs {error.name}: pip install 'mvitac[export]'") from None
+            raise ValueError(f"{file} needs {error.name}: pip install -e '.[export]' in mvitac's clone") from None
         except Exception as error:  # torch and onnxruntime have their own exceptions
             raise ValueError(f"{file} cannot be opened as {file.suffix} ({brief(error)})") from None
         made = Preprocessing()
