@@ -285,7 +285,7 @@ def submit(work: Work, options: str) -> str:
         import submitit  # type: ignore[import-not-found]
     except ImportError:
         raise ValueError(
-            "--slurm needs submitit, which is not installed: pip install -e '.[slurm]' in mvitac's clone, or leave --slurm out"
+            "--slurm needs submitit: pip install -e '.[slurm]' in mvitac's clone, or leave --slurm out"
         ) from None
     parameters: dict[str, Any] = {}
     for pair in options.split(","):
