@@ -78,12 +78,22 @@ def validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cell
     if not isinstance(pack, MixedPack):
         return _validate(model, pack, run)
     values: dict[str, float] = {}
-    cells: Cells = {}
+    found: list[Cells] = []
     for part in pack.parts:
-        found = _validate(model, pack.alone(part), run)
-        values |= {f"{part} {name}": value for name, value in found[0].items()}
-        cells |= {f"{part} {name}": cell for name, cell in found[1].items()}
-    return values, cells
+        own, cells = _validate(model, pack.alone(part), run)
+        values |= {f"{part} {name}": value for name, value in own.items()}
+        found.append({f"{part} {name}": cell for name, cell in cells.items()})
+    return values, _side_by_side(found)
+
+
+def _side_by_side(parts: list[Cells]) -> Cells:
+    """The cells of all parts, each with a column for every group of every part; those of other parts are 0."""
+    nums = [next(iter(cells.values())).shape[1] if cells else 0 for cells in parts]
+    joined: Cells = {}
+    for i, cells in enumerate(parts):
+        around = (0, 0, sum(nums[:i]), sum(nums[i + 1 :]))
+        joined |= {name: torch.nn.functional.pad(cell, around) for name, cell in cells.items()}
+    return joined
 
 
 @torch.no_grad()
@@ -180,6 +190,11 @@ def _errors(guess: Tensor, true: Tensor) -> Tensor:
     return torch.cat([guess - true, true.mean() - true], dim=1).double().square()
 
 
+def _groups(cell: Tensor) -> Tensor:
+    """bool [groups]: those with rows in every target."""
+    return (cell[..., 1] > 0).all(0)
+
+
 def _scores(cell: Tensor) -> Tensor:
     """[targets]: accuracy or R2."""
     errors, guess = cell.sum(1).unbind(-1)
@@ -197,18 +212,18 @@ def verdict(start: Cells, end: Cells, by: str) -> str:
     The interval (95 %) is over groups, of the mean over tasks and modalities: a jackknife that leaves out one group at a
     time. Level means that it includes 0. It leaves out the variation between seeds.
     """
-    names = sorted(start.keys() & end.keys())
-    num = start[names[0]].shape[1] if names else 0
-    if num < 2:
+    same = [name for name in sorted(start.keys() & end.keys()) if start[name].shape == end[name].shape]
+    names = [name for name in same if _groups(end[name]).sum() > 1]
+    every = torch.stack([_groups(end[name]) for name in names]).any(0).nonzero()[:, 0] if names else torch.empty(0)
+    if (num := len(every)) < 2:
         return "no labelled groups of split val: nothing says whether the features are better than at the start"
 
     def gain(keep: Tensor) -> float:
         before, after = ({name: cells[name][:, keep] for name in names} for cells in (start, end))
         return 100 * (_mean(after) - _mean(before))
 
-    every = torch.arange(num)
     points = gain(every)
-    without = torch.tensor([gain(every[every != g]) for g in range(num)])
+    without = torch.tensor([gain(every[every != g]) for g in every])
     margin = float(stdtrit(num - 1, 0.975) * ((num - 1) / num * (without - without.mean()).square().sum()).sqrt())
     word = "level" if abs(points) <= margin else "better" if points > 0 else "worse"
     interval = f"[{points - margin:+.1f}, {points + margin:+.1f}]"
