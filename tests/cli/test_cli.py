@@ -106,6 +106,8 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
                 "--out",
                 str(pack),
                 "--quiet",
+                "--workers",
+                "1",
             ]
         )
         == 0
