@@ -32,12 +32,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Packs and features of the tests live and die with them."""
     path = tmp_path_factory.mktemp("cache")
     os.environ["MVITAC_CACHE"] = str(path)
     gc.freeze()  # what was imported stays: the garbage collector need not look at it again and again
-    return path
+    yield path
+    gc.unfreeze()
 
 
 @pytest.fixture(scope="session")

@@ -34,6 +34,7 @@ def run(page: Path, folder: Path) -> None:
     from mvitac.cli.main import main
 
     os.chdir(folder)
+    os.cpu_count = lambda: 1  # its share of the machine: new processes take longer to start than these small packs
     names = vars(sys.modules["__main__"])  # where a notebook's cells define their names, too
     for kind, source in cells(page):
         if kind != "code":

@@ -78,38 +78,16 @@ def test_data_commands_explain_themselves(command: str, capsys: pytest.CaptureFi
 def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["pretrain", *options]) == 2
     said = capsys.readouterr().err
-    for word in (
-        "--data",
-        "folder",
-        "--from RUN.JSON",
-        "mvitac demo",
-        "mvitac pretrain --data materials --recipe demo",
-    ):
+    commands = ("mvitac demo", "mvitac pretrain --data materials --recipe demo")
+    for word in ("--data", "folder", "--from RUN.JSON", *commands):
         assert word in said
 
 
 def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """simulate -> info -> pretrain -> probe -> report, as a user types it, on the real simulator."""
     pack, run, scores = tmp_path / "pack", tmp_path / "run", tmp_path / "scores.json"
-    assert (
-        main(
-            [
-                "data",
-                "simulate",
-                "materials",
-                "--num",
-                "240",
-                "--touches",
-                "2",
-                "--size",
-                "32",
-                "--out",
-                str(pack),
-                "--quiet",
-            ]
-        )
-        == 0
-    )
+    simulate = f"data simulate materials --num 240 --touches 2 --size 32 --out {pack} --quiet --workers 1"
+    assert main(simulate.split()) == 0
     assert main(["data", "info", str(pack)]) == 0
     assert "category" in capsys.readouterr().out
     choice = ["--data", "pack", "--data.path", str(pack), "--recipe", "smoke"]
@@ -129,21 +107,9 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = [
-        "--data.num",
-        "240",
-        "--data.touches",
-        "2",
-        "--data.size",
-        "32",
-        "--augment.size",
-        "32",
-        "--augment.whole",
-        "32",
-    ]
-    small += ["--data.workers", "1"]
-    tiny = ["--encoder.trunk", "mvitac_tiny", "--steps", "2", "--batch-size", "16", "--precision", "fp32"]
-    command = ["demo", "--out", str(tmp_path / "demo"), "--seeds", "2", *small, *tiny]
+    small = "--data.num 240 --data.touches 2 --data.size 32 --data.workers 1 --augment.size 32 --augment.whole 32"
+    tiny = "--encoder.trunk mvitac_tiny --steps 2 --batch-size 16 --precision fp32"
+    command = f"demo --out {tmp_path / 'demo'} --seeds 2 {small} {tiny}".split()
     assert main(command) == 0
     summary = json.loads((tmp_path / "demo" / "summary.json").read_text())
     for modality in ("touch", "vision", "both"):

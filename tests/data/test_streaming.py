@@ -201,16 +201,7 @@ def test_the_command_line(pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixt
     out, shards = str(tmp_path / "run"), f"file://{tmp_path}/shards"
     assert main(["data", "shard", str(pack.path), shards, "--shard-mb", str(SHARD_MB), "--quiet"]) == 0
     assert "120 samples in 15 shards" in capsys.readouterr().out
-    data = [
-        "--data",
-        "stream",
-        "--data.url",
-        shards,
-        "--data.cache",
-        str(tmp_path / "cache"),
-        "--data.cache-gb",
-        "0.01",
-    ]
+    data = f"--data stream --data.url {shards} --data.cache {tmp_path / 'cache'} --data.cache-gb 0.01".split()
     assert main(["pretrain", "--recipe", "smoke", *data, "--steps", "2", "--out", out, "--quiet"]) == 0
     assert main(["probe", out]) == 0
     assert json.loads((tmp_path / "run" / "run.json").read_text())["run"]["data"]["url"] == shards

@@ -688,18 +688,7 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, rows: Table, capsys: py
     assert error.count("\n") == 1
     assert "did you mean 'material'" in error
     assert not list(tmp_path.glob("bad*"))
-    good = [
-        "--labels",
-        "material",
-        "--group",
-        "object",
-        "--size",
-        "16",
-        "--only",
-        "seq<=1",
-        "--out",
-        str(tmp_path / "good"),
-    ]
+    good = f"--labels material --group object --size 16 --only seq<=1 --out {tmp_path / 'good'}".split()
     assert main([*common, *good]) == 0
     assert Pack(tmp_path / "good").num == 16
 

@@ -172,19 +172,8 @@ def test_something_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_the_command(clones: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    common = [
-        "data",
-        "pack",
-        "--data",
-        "slip_grasp",
-        "--path",
-        str(clones / "slip_grasp"),
-        "--quiet",
-        "--size",
-        "16",
-        "--workers",
-        "1",
-    ]
+    place = clones / "slip_grasp"
+    common = f"data pack --data slip_grasp --path {place} --quiet --size 16 --workers 1".split()
     assert main([*common, "--split", "fold3", "--only", "seq<=4", "--out", str(tmp_path / "p")]) == 0
     pack = Pack(tmp_path / "p")
     assert pack.num == 14 * 5

@@ -85,8 +85,8 @@ def test_the_papers_probe_learns_and_repeats() -> None:
     x = (10 * np.repeat(np.eye(3)[y], 100, axis=1) + rng.normal(0, 5, (2048, 300))).astype(np.float32)
     predict = fit_papers(x, [y], [3], seed=0)[0]
     assert (predict(x).argmax(1) == y).mean() > 0.9
-    assert np.array_equal(predict(x), fit_papers(x, [y], [3], seed=0)[0](x))
-    assert not np.array_equal(predict(x), fit_papers(x, [y], [3], seed=1)[0](x))
+    first, same, other = (fit_papers(x[:256], [y[:256]], [3], seed=seed)[0](x) for seed in (0, 0, 1))
+    assert np.array_equal(first, same) and not np.array_equal(first, other)
 
 
 def test_linear_equals_scikit_learn(pack: Pack) -> None:

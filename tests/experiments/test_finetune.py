@@ -285,19 +285,7 @@ def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tm
 def test_unlabelled_data_is_scored_by_retrieval(
     ancestor: Path, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [
-        "adapt",
-        str(ancestor),
-        "--data",
-        "pack",
-        "--data.path",
-        str(bare.path),
-        "--steps",
-        "0",
-        "--batches",
-        "2",
-        "--quiet",
-    ]
+    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 0 --batches 2 --quiet".split()
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     records = json.loads((tmp_path / "out" / "adapted.json").read_text())["records"]
     assert {(r["data"], r["task"]) for r in records if r["data"] == NEW} == {(NEW, "R@5")}
