@@ -96,7 +96,7 @@ class Rig:
         self.clock, self.engine, self.heard = Clock(), engine, list[Event]()
         self.sources = {m: Faulty(m, fps=FPS, size=32) for m in frame_shapes(engine)}
         self.streams = {m: Stream(m, s, clock=self.clock, stale_after=STALE) for m, s in self.sources.items()}
-        config = LiveConfig(calibration=15)
+        config = LiveConfig(calibration=6)  # a rest has 15 frames
         each = {m: [stream] for m, stream in self.streams.items()}
         self.live = Live(engine, each, config, clock=self.clock, tell=self.heard.append)
         self.news = threading.Event()
