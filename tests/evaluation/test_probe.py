@@ -23,9 +23,10 @@ from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_papers, train_heads
-from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, _places, probe_runs
+from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, probe_runs
 from mvitac.evaluation.probe import probe_all, probe_features, probe_model, split_rows
 from mvitac.evaluation.retrieval import cross_modal
+from mvitac.evaluation.run_names import _places
 from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model_files import fresh, load
