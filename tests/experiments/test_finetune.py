@@ -20,7 +20,6 @@ from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
 from mvitac.model_files import load
 from mvitac.run import load_run
 from mvitac.system.files import read_json
-from mvitac.training import loop
 from mvitac.training.loop import train
 from support.toy import Toy, toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
@@ -31,7 +30,7 @@ ASKED = Finetuning(labels=("pattern",), lr=(1e-3, 3e-3), steps=(3,), batch_size=
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """A checkpoint after every step of short runs, too."""
-    monkeypatch.setattr(loop, "MIN_BETWEEN_CHECKPOINTS", 1)
+    monkeypatch.setattr("mvitac.training.loop.MIN_BETWEEN_CHECKPOINTS", 1)
 
 
 @pytest.fixture(scope="module")
