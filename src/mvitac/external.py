@@ -69,7 +69,7 @@ class ExternalModel(Model):
     @property
     def run(self) -> NoReturn:  # type: ignore[override]
         """External encoders have none."""
-        raise ValueError(f"{self.text} was not trained here: use it with `mvitac probe --encoder` or `embed`")
+        raise ValueError(f"{self.text} has no run here: use it with `mvitac probe --encoder` or `embed`")
 
     @property
     def seed(self) -> int:

@@ -327,7 +327,7 @@ def test_opencv_is_asked_for_where_it_lacks(monkeypatch: pytest.MonkeyPatch, tmp
     (tmp_path / "a.mp4").touch()
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     for text in ("0", "serial:D20345", str(tmp_path / "a.mp4")):
-        with pytest.raises(ValueError, match=r"needs OpenCV: pip install 'mvitac\[live\]'"):
+        with pytest.raises(ValueError, match=r"needs OpenCV: pip install -e '.\[live\]'"):
             source(text, "touch")
 
 

@@ -143,7 +143,7 @@ def read_values(
                 columns[target.name][i] = value
     for name, found in columns.items():
         if len({value for value in found if value == value}) < 2:  # NaN differs from itself
-            raise ValueError(f"{selected.where}: column {name!r} has fewer than two values: nothing to predict")
+            raise ValueError(f"{selected.where}: column {name!r} has fewer than two different values")
     known = [
         [0 if any(not math.isnan(columns[t.name][i]) for t in task.targets) else -1 for i in range(len(counts))]
         for task in tasks

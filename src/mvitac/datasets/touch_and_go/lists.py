@@ -73,7 +73,7 @@ def read_lists(folder: Path) -> list[Frame]:
     elif not present and (folder / "label.txt").is_file():
         _add_list(known, folder / "label.txt", "label", False)
     else:
-        raise ValueError(f"{folder} has no train.txt and test.txt: give their folder as --data.lists ({LISTS_AT})")
+        raise ValueError(f"{folder} has no train.txt and test.txt: they are in {LISTS_AT} (--data.lists)")
     labelled = [frame for frame in known.values() if frame.category >= 0 or frame.rough >= 0]
     return sorted(labelled, key=lambda frame: (frame.recording, frame.number))
 

@@ -116,7 +116,7 @@ class TouchAndGo(Source):
         self._config, self._lists = config, _lists_folder(config)
         listed = read_lists(self._lists)
         if config.split == "official" and listed[0].listed == "label":
-            raise ValueError(f"{self._lists} has no train.txt and test.txt, for the official split: see {LISTS_AT}")
+            raise ValueError(f"{self._lists} has no train.txt and test.txt, which the official split needs: {LISTS_AT}")
         self._num_listed = len(listed)
         self._num_names = len({frame.recording for frame in listed})
         recordings, missing = _find_recordings(config, sorted({frame.recording for frame in listed}))
