@@ -241,8 +241,8 @@ def sources(
     if not given:
         return {m: tuple(f"sim:{i}" for i in range(shape[2] // 3)) for m, shape in inputs.items()}
     for modality in inputs.keys() - given.keys():
-        given = f"--{modality} SOURCE (--{modality} sim for a simulated one)"
-        raise ValueError(f"the model takes {modality} too: give {given}")
+        source = f"--{modality} SOURCE (--{modality} sim for a simulated one)"
+        raise ValueError(f"the model takes {modality} too: give {source}")
     for modality in given.keys() - inputs.keys():
         raise ValueError(f"the model has no input for {modality}: leave --{modality} out")
     return given
