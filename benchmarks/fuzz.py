@@ -47,7 +47,6 @@ READING = {
     "data check --data": "data check --data folder --path {base}/table --workers 1",
     "data sheet": f"data sheet materials --side {SIDE} --out {{out}}/sheet.png",
     "data show": f"data show {{base}}/pack --side {SIDE} --out {{out}}/show.png",
-    "export": "export {base}/run --format torch --rows 4 --out {out}/x",
     "live": "live {base}/export --vision {base}/table@99 --touch {base}/table@99 --seconds 1",
     "explore": "explore {base}/run --port 0",
     "find": "find {base}/table/touch0.png --in {base}/index --from touch --to vision",

@@ -31,8 +31,8 @@ def test_error_rates_are_no_more_than_stated(groups: int, equal: bool, seeds: in
 
 @pytest.mark.parametrize(("groups", "seeds"), [(4, 1), (8, 3), (29, 1)])
 def test_error_rates_of_values_are_no_more_than_stated(groups: int, seeds: int) -> None:
-    """Where errors differ between groups, 8 to 10 % of intervals missed that were symmetric around R2."""
-    found = value_rates_of_error(groups, True, seeds, r2=0.9, between=0.1, scale_sd=0.3, trials=300)
+    """Where errors differ much between groups, 8 to 13 % of intervals missed that were as long above R2 as below it."""
+    found = value_rates_of_error(groups, True, seeds, r2=0.9, between=0.1, scale_sd=0.6, trials=300)
     assert found["outside interval"] <= 0.07
     assert (found["p < .05"] is None) == (seeds == 1) and (found["p < .05"] or 0) <= 0.07
 
