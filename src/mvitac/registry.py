@@ -9,6 +9,7 @@ A *kind* is a direct subclass of ``Registered``. Each further subclass that has 
 
 import dataclasses
 import difflib
+import functools
 import importlib
 import pkgutil
 import types
@@ -80,19 +81,21 @@ def formerly(value: Any) -> dict[str, Any]:
     return {"formerly": value}
 
 
-def to_json(config: Any, *, for_digest: bool = False) -> Any:
+def to_json(config: Any, *, for_digest: bool = False, whole: bool = False) -> Any:
     """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``.
 
-    With ``for_digest``, the fields of ``LATER_IN_DIGEST`` and ``formerly`` that older files lack are left out.
+    With ``for_digest``, the fields of ``LATER_IN_DIGEST`` and ``formerly`` that older files lack are left out. With
+    ``whole``, none is, not even one of ``LATER`` at its default.
     """
+    inner = functools.partial(to_json, for_digest=for_digest, whole=whole)
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        written = [f for f in dataclasses.fields(config) if not _is_omitted(f, getattr(config, f.name), for_digest)]
-        fields = {f.name: to_json(getattr(config, f.name), for_digest=for_digest) for f in written}
+        values = {field: getattr(config, field.name) for field in dataclasses.fields(config)}
+        fields = {f.name: inner(v) for f, v in values.items() if whole or not _is_omitted(f, v, for_digest)}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
-        return {str(key): to_json(value, for_digest=for_digest) for key, value in config.items()}
+        return {str(key): inner(value) for key, value in config.items()}
     if isinstance(config, (list, tuple)):
-        return [to_json(value, for_digest=for_digest) for value in config]
+        return [inner(value) for value in config]
     return str(config) if isinstance(config, Path) else config
 
 

@@ -215,6 +215,8 @@ def test_some_rows_of_a_plan_stand_beside_its_reference() -> None:
 def test_changed_fields_are_checked() -> None:
     run = recipe("smoke")
     assert changed(run, {"optim.lr": 1, "steps": 7}).optim.lr == 1.0
+    assert changed(run, {"data.num_frames": 4}).data.num_frames == 4  # not written to files at its default
+    assert changed(run, {}) == run
     for name in ("optim.lrr", "steps.more", "nothing", "method.name", "optim"):
         with pytest.raises(ValueError, match=r"optim|steps|nothing|method"):
             changed(run, {name: 3})

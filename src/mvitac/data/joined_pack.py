@@ -20,10 +20,13 @@ class JoinedPack(Pack):
 
     Tasks are those that both packs have, with the classes of ``learn``. ValueError if there is none, or the packs have
     other image shapes, classes that ``learn`` lacks, or a group in both (its test rows would not be unseen).
+
+    Attributes:
+        learn: The first pack; its rows come first.
     """
 
     def __init__(self, learn: Pack, score: Pack) -> None:
-        self.path, self.meta = score.path, score.meta
+        self.path, self.meta, self.learn = score.path, score.meta, learn
         self.num, self.size, self.store = learn.num + score.num, learn.size, "raw"
         self.digests = {"learn": learn.digest, "score": score.digest}
         _check_shapes(learn, score)

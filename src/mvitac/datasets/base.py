@@ -76,6 +76,10 @@ class DatasetConfig(Registered, ABC):
     def source(self) -> Source:
         """Return the source of samples; ValueError if the data does not exist."""
 
+    def on_new_sensor(self) -> "DatasetConfig | None":
+        """Some of the same groups, touched with a sensor that this dataset never shows; None if there is none."""
+        return None
+
     def place(self, source: Source | None = None) -> Path:
         """Return the folder in the cache where ``open`` builds the pack of ``source``, by default of this dataset."""
         source = source or self.source()

@@ -3,11 +3,13 @@
 import hashlib
 import io
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic
@@ -64,12 +66,17 @@ def features(
 
     The cached file is a .npy followed by its sha256. One that does not match, or has none, is computed again.
     """
-    device = next(model.parameters()).device
-    whole, heads = model.sides  # the weights' digest covers the first
-    side = [heads] if for_heads and heads != whole else []
-    kind = [*side, *(["map"] if maps else [])]
-    key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device.type, *kind])
-    path = cache_dir() / "features" / f"{key[:32]}.npy"
+    asked = {"for_heads": for_heads, "maps": maps}
+    if isinstance(pack, JoinedPack) and (known := rows < pack.learn.num).any():
+        every = np.arange(pack.learn.num)
+        if _place(model, pack.learn, modality, every, **asked).exists():  # of a probe on that pack alone
+            learned = features(model, pack.learn, modality, every, **asked)[rows[known]]
+            values = np.empty((len(rows), *learned.shape[1:]), learned.dtype)
+            values[known] = learned
+            if not known.all():
+                values[~known] = features(model, pack, modality, rows[~known], **asked)
+            return values
+    path = _place(model, pack, modality, rows, **asked)
     if path.exists():
         data = path.read_bytes()
         if hashlib.sha256(memoryview(data)[:-32]).digest() == data[-32:]:
@@ -81,3 +88,12 @@ def features(
     buffer.write(hashlib.sha256(buffer.getbuffer()).digest())
     write_atomic(path, lambda file: file.write(buffer.getbuffer()))
     return values
+
+
+def _place(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool, maps: bool) -> Path:
+    """The file of these features in the cache."""
+    whole, heads = model.sides  # the weights' digest covers the first
+    kind = [*([heads] if for_heads and heads != whole else []), *(["map"] if maps else [])]
+    device = next(model.parameters()).device.type
+    key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device, *kind])
+    return cache_dir() / "features" / f"{key[:32]}.npy"

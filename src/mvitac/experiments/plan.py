@@ -146,7 +146,7 @@ def slug(label: str) -> str:
 
 def changed(run: Run, changes: Mapping[str, Any]) -> Run:
     """``run`` with fields changed by dotted name; values as in JSON."""
-    value = to_json(run)
+    value = to_json(run, whole=True)
     for name, new in changes.items():
         *path, last = ("init", "path") if name == "init" else name.split(".")
         inner = value

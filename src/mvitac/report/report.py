@@ -137,6 +137,7 @@ def _page(study: Study) -> str:
     title = f"{', '.join(study.sources)} on {study.pack.spec.name}"
     sections = {
         "scores": ("Scores of the frozen features", score_sections.probe),
+        "sensor": ("A sensor it never saw", score_sections.new_sensor),
         "retrieval": ("Finding the other modality", evidence.retrieval),
         "loss": ("Loss", evidence.loss),
         "collapse": ("Learning or collapsing?", evidence.collapse),

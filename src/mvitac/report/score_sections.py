@@ -56,6 +56,20 @@ def probe(study: Study) -> str:
     return html.paragraph(intro) + html.grid(drawn) + "".join(numbers)
 
 
+def new_sensor(study: Study) -> str:
+    """Scores on a sensor that was not trained on, of a demo; else ''."""
+    found = study.result.get("new sensor")
+    if not found:
+        return ""
+    intro = (
+        "Touches of the same unseen instances with another gel, lights and camera. Neither the encoder nor the probe saw"
+        " this sensor. In known colours: unlabelled images of it tell how it colours slope, so that its touches can be"
+        " shown as the known sensors would show them (mvitac probe --standardise colours features)."
+    )
+    notes = "".join(html.paragraph(f"{note}.") for note in found["notes"])
+    return html.paragraph(intro) + _scores(study, found["summary"]) + notes
+
+
 def _scores(study: Study, summary: dict[str, Any]) -> str:
     """A table of accuracies, one of R2, and one of each target."""
     parts = []
