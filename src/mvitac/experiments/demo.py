@@ -7,7 +7,7 @@ from concurrent.futures import FIRST_EXCEPTION, wait
 from dataclasses import replace
 from pathlib import Path
 
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.recipes import RECIPES
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_summary
@@ -50,7 +50,7 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     paths = [path for _, path in runs]
     say("3/4 probing the frozen features and the controls")
     with shown(console):
-        result = probe_runs(paths, ProbeConfig(), pack)
+        result = stored_result(paths, pack) or probe_runs(paths, ProbeConfig(), pack)
     write_json(out / "probe.json", result, sealed=True)
     write_json(out / "summary.json", result["summary"])
     say("4/4 drawing the report")
