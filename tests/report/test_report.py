@@ -249,6 +249,7 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     assert widths == {16, 32}  # two gels stand side by side
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_touch_alone(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(vision=0))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
@@ -258,6 +259,7 @@ def test_touch_alone(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "figures" / "map-vision.png").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_labels(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(labelled=False))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
@@ -266,6 +268,7 @@ def test_without_labels(tmp_path: Path) -> None:
     assert len(page.all("img")) == 2 * 8 * 6  # eight queries with five groups, both directions
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     first, pack = noise(tmp_path, Noise(), method=SupervisedConfig())
     second = train(smoke(pack), tmp_path / "second", quiet=True)
@@ -378,6 +381,7 @@ class OneTested(Noise):
         return {"one": 1}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_one_test_group_proves_nothing(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, OneTested())
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
