@@ -113,7 +113,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a simulated pack, two seeds trained on it, what their probe found, their report."""
     folder = tmp_path_factory.mktemp("materials")
-    pack = build(MaterialsConfig(num=240, touches=1, size=16).source(), folder / "pack", size=16, quiet=True)
+    pack = build(MaterialsConfig(num=120, touches=1, size=16).source(), folder / "pack", size=16, quiet=True)
     runs = [train(smoke(pack, seed=seed), folder / f"run{seed}", quiet=True) for seed in (0, 1)]
     assert main(["probe", *map(str, runs), "--json", str(folder / "probe.json")]) == 0
     with contextlib.redirect_stdout(io.StringIO()) as said:
