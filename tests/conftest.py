@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 # Before anything imports the hub's client, which reads it once: no test reaches the network.
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -14,16 +15,15 @@ os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 import pytest
-import torch
 from filelock import FileLock
 
-from mvitac.data.pack import Pack
+if TYPE_CHECKING:  # pytest's main process, which runs no test, needs no torch
+    from mvitac.data.pack import Pack
 
 # A test can kill a process, which loses nothing that was written, but not cut the power.
 os.fsync = lambda file: None
 
 pytest.register_assert_rewrite("support")  # before it is imported: a failed assertion there shows its values too
-torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -32,13 +32,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Packs and features of the tests live and die with them."""
+    import torch
+
     path = tmp_path_factory.mktemp("cache")
     os.environ["MVITAC_CACHE"] = str(path)
+    torch.set_num_threads(1)
     gc.freeze()  # what was imported stays: the garbage collector need not look at it again and again
-    yield path
-    gc.unfreeze()
+    return path
 
 
 @pytest.fixture(scope="session")
@@ -64,6 +66,16 @@ def forked_pools(monkeypatch: pytest.MonkeyPatch) -> None:
     from support.processes import CONTEXT
 
     monkeypatch.setattr(processes, "_Context", lambda: CONTEXT)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports with empty figures, for tests of their text: one has up to thirty, each of which takes 0.2 s to draw."""
+    from mvitac.report import figures, galleries
+
+    monkeypatch.setattr(figures, "to_png", lambda figure: b"")
+    monkeypatch.setattr(figures, "to_svg", lambda figure, name, alt: f"<svg><title>{figures.escape(alt)}</title></svg>")
+    monkeypatch.setattr(galleries, "embed_2d", lambda values: values[:, :2])
 
 
 @pytest.fixture(scope="session")

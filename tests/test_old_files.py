@@ -111,6 +111,7 @@ def test_probe_scores_the_run_as_before() -> None:
     assert accuracies("new.json") == pytest.approx(accuracies("probe.json"), abs=0.051)  # of 20 test rows, one
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_report_reads_run_and_probe() -> None:
     assert main(["report", "run", "--probe", "probe.json", "--out", "report", "--quiet"]) == 0
     assert Path("report", "report.html").stat().st_size > 10_000

@@ -83,6 +83,7 @@ def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest
         assert word in said
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """simulate -> info -> pretrain -> probe -> report, as a user types it, on the real simulator."""
     pack, run, scores = tmp_path / "pack", tmp_path / "run", tmp_path / "scores.json"
@@ -105,7 +106,10 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 @pytest.mark.usefixtures("forked_pools")
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ) -> None:
     small = "--data.num 240 --data.touches 2 --data.size 32 --data.workers 1 --augment.size 32 --augment.whole 32"
     tiny = "--encoder.trunk mvitac_tiny --steps 2 --batch-size 16 --precision fp32"
@@ -128,8 +132,11 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     assert "pre-training: 4/4 steps in" in shown  # of both seeds; no terminal: a line instead of bars
     weights = tmp_path / "demo" / "seed1" / "model.safetensors"
     before = weights.stat().st_mtime_ns
+    monkeypatch.setattr("mvitac.experiments.demo.probe_runs", None)  # calling it would raise
+    request.getfixturevalue("undrawn")
     assert main(command) == 0
     assert weights.stat().st_mtime_ns == before
+    assert json.loads((tmp_path / "demo" / "summary.json").read_text()) == summary
 
 
 def test_completion_in_bash(

@@ -62,6 +62,7 @@ def test_scores_of_rows_that_were_trained_on_are_refused(
     assert ALL in capsys.readouterr().err and not (tmp_path / "art").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_leak_stands_beside_every_score(
     run: Path, turned: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from benchmarks.calibration import rates_of_error, value_rates_of_error
 from scipy.stats import t as student
+from sklearn.metrics import confusion_matrix, f1_score
 
-from mvitac.evaluation.scores import interval, least_p, paired_difference
+from mvitac.evaluation.scores import interval, least_p, paired_difference, score
 
 
 def record(correct: list[int], seed: int | None, sizes: int = 10) -> dict:
@@ -46,6 +47,17 @@ def test_a_difference_in_every_group_is_found() -> None:
     assert (mean, low, high) == pytest.approx((0.1, 0.1, 0.1)) and p is not None and p < 0.002
     assert paired_difference(theirs, ours)[0] == pytest.approx(-0.1)
     assert paired_difference(ours, ours) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_scores_of_one_probe_are_scikit_learns() -> None:
+    """Classes that only the labels or only the answers have, or neither."""
+    rng = np.random.default_rng(0)
+    y, answers = rng.choice([0, 1, 3], 40), rng.choice([0, 2, 3], 40)
+    found = score(y, np.eye(5)[answers], np.arange(40) // 4, 5)
+    assert found["confusion"] == confusion_matrix(y, answers, labels=range(5)).tolist()
+    assert found["macro_f1"] == f1_score(y, answers, labels=[0, 1, 3], average="macro", zero_division=0)
+    assert found["accuracy"] == (y == answers).mean()
+    assert found["balanced_accuracy"] == pytest.approx(np.mean([(answers[y == k] == k).mean() for k in (0, 1, 3)]))
 
 
 # -- worked cases -----------------------------------------------------------------------------------------------------

@@ -113,7 +113,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a simulated pack, two seeds trained on it, what their probe found, their report."""
     folder = tmp_path_factory.mktemp("materials")
-    pack = build(MaterialsConfig(num=240, touches=1, size=16).source(), folder / "pack", size=16, quiet=True)
+    pack = build(MaterialsConfig(num=120, touches=1, size=16).source(), folder / "pack", size=16, quiet=True)
     runs = [train(smoke(pack, seed=seed), folder / f"run{seed}", quiet=True) for seed in (0, 1)]
     assert main(["probe", *map(str, runs), "--json", str(folder / "probe.json")]) == 0
     with contextlib.redirect_stdout(io.StringIO()) as said:
@@ -249,6 +249,7 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     assert widths == {16, 32}  # two gels stand side by side
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_touch_alone(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(vision=0))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
@@ -258,6 +259,7 @@ def test_touch_alone(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "figures" / "map-vision.png").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_labels(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, Noise(labelled=False))
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())
@@ -266,6 +268,7 @@ def test_without_labels(tmp_path: Path) -> None:
     assert len(page.all("img")) == 2 * 8 * 6  # eight queries with five groups, both directions
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
     first, pack = noise(tmp_path, Noise(), method=SupervisedConfig())
     second = train(smoke(pack), tmp_path / "second", quiet=True)
@@ -378,6 +381,7 @@ class OneTested(Noise):
         return {"one": 1}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_one_test_group_proves_nothing(tmp_path: Path) -> None:
     run, _ = noise(tmp_path, OneTested())
     page = Page(write_report([run], tmp_path / "out", quiet=True).read_text())

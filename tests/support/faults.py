@@ -101,26 +101,27 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def faulty(engine: Engine, minutes: int) -> tuple[World, list[tuple[str, str]], list[tuple[int, int]]]:
-    """Run ``minutes`` with one fault in each; returns the world, the (fault, stream) made, and at each minute the bytes
+def faulty(engine: Engine, num: int, seconds: float) -> tuple[World, list[tuple[str, str]], list[tuple[int, int]]]:
+    """Make ``num`` faults, one in each ``seconds``; returns the world, the (fault, stream) made, and after each the bytes
     that Python has allocated since the first and those of the whole process."""
     world = World(engine)
     world.run(9)
     made, memory = [], []
     tracemalloc.start()
     try:
-        for minute in range(minutes):
-            fault, stream = FAULTS[minute % len(FAULTS)], ("touch", "vision")[minute // len(FAULTS) % 2]
+        for i in range(num):
+            fault, stream = FAULTS[i % len(FAULTS)], ("touch", "vision")[i // len(FAULTS) % 2]
+            broken = 0.15 if fault == "damaged" else 4
             before = len(world.heard)
-            world.run(30)
+            world.run(seconds / 2)
             world.rigs[stream].fault = fault
-            world.run(0.15 if fault == "damaged" else 4)
+            world.run(broken)
             world.rigs[stream].fault = ""
-            world.run(30 - (0.15 if fault == "damaged" else 4))
+            world.run(seconds / 2 - broken)
             said = [e.what for e in world.heard[before:] if e.stream == stream and e.what in sum(NAMES.values(), ())]
-            assert tuple(dict.fromkeys(said)) == tuple(dict.fromkeys(NAMES[fault])), (minute, fault, stream, said)
+            assert tuple(dict.fromkeys(said)) == tuple(dict.fromkeys(NAMES[fault])), (i, fault, stream, said)
             others = Counter(e.what for e in world.heard[before:] if e.stream != stream)
-            assert not others, (minute, fault, stream, others)
+            assert not others, (i, fault, stream, others)
             made.append((fault, stream))
             del world.heard[:]
             memory.append((tracemalloc.get_traced_memory()[0], resident()))

@@ -248,6 +248,7 @@ def test_what_a_mix_cannot_do_is_refused(parts: dict[str, str], tmp_path: Path) 
     train(mix_run(*ragged, batch_size=8, chunk=4, steps=1, data={"batches": "one-part"}), tmp_path / "run", quiet=True)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path) -> None:
     """A task of one part is of its rows alone, a common one of all rows with the modality; a control where it is known."""
     run = mix_run(parts["a"], parts["gel"], steps=1, eval_every=0)

@@ -163,6 +163,7 @@ def test_probe_scores_the_best_weights(
     assert "has no model.best.safetensors: train with --eval-every N" in error and error.count("\n") == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_the_start_and_the_sentence(run: Path, tmp_path: Path) -> None:
     page = write_report([run], tmp_path / "report", quiet=True).read_text()
     assert "linear probe, pattern" in page and "Dashed: the value at the start" in page

@@ -91,13 +91,19 @@ def this_machine(kind: str) -> Literal["avx2", "vnni"]:
 
     Measured on the engine, not read from the CPU's flags: it chooses its instructions itself, and variables restrict it.
     """
-    conv = torch.nn.Conv2d(64, 64, 3, bias=False).requires_grad_(False)
-    conv.weight.fill_(1 / 576)
-    ones = torch.ones(1, 64, 8, 8)
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    ones, weight = np.ones((1, 64, 8, 8), np.float32), np.full((64, 64, 3, 3), 1 / 576, np.float32)
+    given = helper.make_tensor_value_info("ones", TensorProto.FLOAT, ones.shape)
+    mean = helper.make_tensor_value_info("mean", TensorProto.FLOAT, (1, 64, 6, 6))
+    conv = helper.make_node("Conv", ["ones", "weight"], ["mean"])
+    graph = helper.make_graph([conv], "mean", [given], [mean], [numpy_helper.from_array(weight, "weight")])
     with tempfile.TemporaryDirectory() as folder:
-        path = write_onnx(conv, (ones,), Path(folder), ["ones"], ["mean"], None)
-        quantise(path, ["ones"], [[ones.numpy()]], seven_bits=False)
+        path = Path(folder) / "model.onnx"
+        onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
+        quantise(path, ["ones"], [[ones]], seven_bits=False)
         if kind == "openvino":
             to_openvino(path)
-        found = open_engine(Path(folder), kind)([ones.numpy()])[0]
+        found = open_engine(Path(folder), kind)([ones])[0]
     return "vnni" if np.abs(found - 1).max() < 0.02 else "avx2"

@@ -14,7 +14,8 @@ from sklearn.model_selection import PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import SplineTransformer, StandardScaler
-from threadpoolctl import threadpool_limits
+
+from mvitac.evaluation.classifiers import threadpools
 
 Regressor = Callable[[np.ndarray], np.ndarray]
 
@@ -60,7 +61,7 @@ def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, basis: Callable[[], li
         mean, std = target[have].mean(), target[have].std() + 1e-12
         both = len(set(held[have])) == 2
         ridge = RidgeCV(ALPHAS, cv=PredefinedSplit(held[have]) if both else None)
-        with threadpool_limits(1):  # as for logistic regression: threads wait longer than they compute
+        with threadpools().limit(limits=1):  # as for logistic regression: threads wait longer than they compute
             pipeline = make_pipeline(StandardScaler(), *basis(), ridge).fit(x[have], (target[have] - mean) / std)
         fitted.append((pipeline, mean, std))
     return fitted

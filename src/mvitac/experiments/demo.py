@@ -10,7 +10,7 @@ from typing import Any
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.probe import probe_model
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import RecolouredPack, Standardise
@@ -57,8 +57,8 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
     paths = [path for _, path in runs]
     say("3/4 probing the frozen features and the controls")
     with shown(console):
-        result = probe_runs(paths, ProbeConfig(), pack)
-        if (other := run.data.on_new_sensor()) is not None:
+        result = stored_result(paths, pack) or probe_runs(paths, ProbeConfig(), pack)
+        if "new sensor" not in result and (other := run.data.on_new_sensor()) is not None:
             result["new sensor"] = scores_on_new_sensor(paths, pack, other.open(), result)
     for folder in (*paths, out):
         write_json(folder / "probe.json", result, sealed=True)
@@ -68,9 +68,9 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
         page = write_report(paths, out / "report", result=result, pack=pack)
     print_summary(result, console)
     print_retrieval(result, console)
-    if other is not None:
-        first = next(iter(result["new sensor"]["summary"]))
-        print_summary(result["new sensor"] | {"summary": {first: result["new sensor"]["summary"][first]}}, console)
+    if new := result.get("new sensor"):
+        first = next(iter(new["summary"]))
+        print_summary(new | {"summary": {first: new["summary"][first]}}, console)
     say(f"figures: {out / 'summary.json'}\nreport: {page}    (open it in a browser)")
     say(f"took {(time.perf_counter() - start) / 60:.1f} minutes")
     return page
