@@ -191,8 +191,8 @@ class Rows(Source):
         _check_columns(config, manifest, [*label_columns, *targets, self._group, self._split, self._sensor])
 
         selected = self._select(manifest)
-        columns = (self._vision, self._touch, selected.numbers)
-        missing = check_present(manifest, selected.refs, *columns, config.allow_missing)
+        asked = {"vision": [self._vision] if self._vision else [], "touch": self._touch}
+        missing = check_present(manifest, selected.refs, asked, selected.numbers, config.allow_missing)
         self._sizes, stamps = check_files(manifest, selected.refs, selected.backgrounds, selected.numbers)
 
         grouping = self._grouping(selected)
