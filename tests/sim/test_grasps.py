@@ -148,7 +148,7 @@ def test_a_harder_grip_prints_a_wider_patch():
     for force in (2.0, 5.0, 11.0):
         for moment in bench.moments(plan(force_n=force)):
             if moment.phase == "during":
-                imprint = grasps._imprint(bench, smooth, moment.data, 0, moment.left.normal_n, 64)
+                imprint, _ = grasps._pressed(bench, smooth, moment, 0, grasps.GRID, False)
                 patch.append(np.mean(imprint > 0.03))
     assert patch[0] < patch[1] < patch[2]
 

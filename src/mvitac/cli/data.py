@@ -242,12 +242,11 @@ def _describe(pack: Pack) -> dict[str, Any]:
 def _values(pack: Pack, rows: np.ndarray) -> list[dict[str, Any]]:
     """Each target with its unit, the number of measured rows, and their lowest and highest value."""
     targets = [(task.name, target) for task in pack.spec.values for target in task.targets]
-    return [
-        {"task": task, "target": target.name, "unit": target.unit, "rows": num, "low": low, "high": high}
-        if num
-        else {"task": task, "target": target.name, "unit": target.unit, "rows": 0, "low": None, "high": None}
-        for (task, target), (num, low, high) in zip(targets, measured(pack, rows), strict=True)
-    ]
+    found = []
+    for (task, target), (num, low, high) in zip(targets, measured(pack, rows), strict=True):
+        ends = {"low": low, "high": high} if num else {"low": None, "high": None}
+        found.append({"task": task, "target": target.name, "unit": target.unit, "rows": num, **ends})
+    return found
 
 
 def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:

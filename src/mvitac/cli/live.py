@@ -4,7 +4,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -107,8 +107,15 @@ def live(argv: list[str]) -> None:
     tell = lambda event: _say(console, event.text, "yellow")  # noqa: E731
     loop = Live(engine, streams, options.live, nearest=nearest, record=recorder, tell=tell)
     said: list[Any] = []
-    with _lines(options.predictions) as write:
-        _run(loop, console, window, options.seconds, lambda new: (write(new), options.plot and said.append(new)))
+    with options.predictions.open("w") if options.predictions else nullcontext() as file:
+
+        def keep(new: Any) -> None:
+            if file:
+                file.write(json.dumps(new) + "\n")
+            if options.plot:
+                said.append(new)
+
+        _run(loop, console, window, options.seconds, keep)
     summary = loop.summary()
     _print_summary(summary)
     if options.json:
@@ -158,16 +165,6 @@ def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
         pairs = zip(names, texts, strict=True)
         streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
     return streams
-
-
-@contextmanager
-def _lines(path: Path | None) -> Iterator[Callable[[Any], object]]:
-    """A function that writes one JSON line to ``path``, if there is one."""
-    if path is None:
-        yield lambda said: None
-        return
-    with path.open("w") as file:
-        yield lambda said: file.write(json.dumps(said) + "\n")
 
 
 def _run(

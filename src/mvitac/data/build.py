@@ -26,8 +26,7 @@ from mvitac.data.pack import FORMAT, FORMAT_VERSIONS, SUFFIXES, Pack, Store
 from mvitac.data.pack_table import check_table
 from mvitac.data.partial_pack import JpegFile, Part, RowFile
 from mvitac.data.source import Source
-from mvitac.data.spec import DataSpec
-from mvitac.registry import from_json, to_json, unknown
+from mvitac.registry import to_json, unknown
 from mvitac.system.console import Console
 from mvitac.system.files import brief, digest, digest_file, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
@@ -97,9 +96,12 @@ def build(
     beside = [out.absolute().with_name(f"{out.absolute().name}{left}") for left in (".partial", ".lock")]
     if not out.exists() or any(left.exists() for left in beside):
         with hold_lock(out, f"{out} is being packed by another process: waiting for it", wait=True, quiet=quiet):
+            # What identifies a pack; it is kept in request.json and pack.json.
+            request = {"fingerprint": source.fingerprint(), "size": size, "spec": to_json(source.spec())}
+            request |= stored_as(store, quality)
             if not out.exists():
-                return _build(source, out, size, workers, max_damaged, quiet, store, quality)
-            if _clean_up(out, _request(source, size, store, quality)):
+                return _build(source, out, request, workers, max_damaged, quiet)
+            if _clean_up(out, request):
                 return Pack(out)
     if exist_ok:
         return Pack(out)
@@ -118,33 +120,18 @@ def _clean_up(out: Path, request: dict[str, Any]) -> bool:
     return True
 
 
-def _request(source: Source, size: int, store: Store, quality: int) -> dict[str, Any]:
-    """Return what identifies a pack of ``source``; it is kept in request.json and pack.json."""
-    spec = to_json(source.spec())
-    return {"fingerprint": source.fingerprint(), "size": size, "spec": spec, **stored_as(store, quality)}
-
-
-def _build(
-    source: Source,
-    out: Path,
-    size: int,
-    workers: int,
-    max_damaged: float,
-    quiet: bool,
-    store: Store,
-    quality: int,
-) -> Pack:
+def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max_damaged: float, quiet: bool) -> Pack:
     """Build the pack in the process that holds the lock."""
-    spec, items, counts = source.spec(), source.items(), source.samples_per_item()
+    spec, counts, size = source.spec(), source.samples_per_item(), request["size"]
     num = sum(counts)
     if not num:
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
-    request = _request(source, size, store, quality)
     partial = out.with_name(out.name + ".partial")
     files: dict[str, RowFile | JpegFile] = {}
     for modality in spec.modalities:
-        path, shape = partial / "pack" / f"{modality}{SUFFIXES[store]}", (size, size, spec.channels(modality))
-        files[modality] = RowFile(path, num, shape) if store == "raw" else JpegFile(path, num, shape, quality)
+        name = f"{modality}{SUFFIXES[request.get('store', 'raw')]}"
+        place = partial / "pack" / name, num, (size, size, spec.channels(modality))
+        files[modality] = JpegFile(*place, request["quality"]) if "store" in request else RowFile(*place)
     disk = _check_disk(out, list(files.values()))
     _claim(partial, request, source.sizes_at)
     if not quiet:
@@ -153,8 +140,13 @@ def _build(
     for rows in files.values():
         rows.create()
     parts = _parts(source, partial)
-    digests = _write_parts(Work(source, spec, size, counts, files), parts, workers, quiet)
-    pack = _finish(partial, out, request, files, parts, digests, items, max_damaged)
+    job = Work(source, spec, size, counts, files)
+    digests = _write_parts(job, parts, workers, quiet)
+    _finish(partial / "pack", job, parts, digests, request, max_damaged)
+    with contextlib.suppress(FileExistsError):
+        out.parent.mkdir(parents=True)
+    os.rename(partial / "pack", out)
+    pack = Pack(out, verify=False)
     shutil.rmtree(partial)
     return pack
 
@@ -237,33 +229,24 @@ class _Contents:
 
 
 def _finish(
-    partial: Path,
-    out: Path,
-    request: dict[str, Any],
-    files: dict[str, RowFile | JpegFile],
-    parts: Sequence[Part],
-    digests: dict[str, str],
-    items: Sequence[str],
-    max_damaged: float,
-) -> Pack:
-    """Complete ``<partial>/pack`` and rename it to ``out``; ``digests`` are those of the image files."""
-    spec: DataSpec = from_json(DataSpec, json.loads(json.dumps(request["spec"])), "spec")
+    folder: Path, job: Work, parts: Sequence[Part], digests: dict[str, str], request: dict[str, Any], max_damaged: float
+) -> None:
+    """Complete the pack in ``folder``; ``digests`` are those of the image files."""
     contents = _Contents()
     for part in parts:
         contents.add(part)
-    damaged = _check_damage(contents, parts, items, max_damaged)
+    damaged = _check_damage(contents, parts, job.source.items(), max_damaged)
     num = len(contents.columns)
-    if any(num < rows.num for rows in files.values()):
+    if any(num < rows.num for rows in job.files.values()):
         # If killed here, the next build finds that the checksums of moved rows are wrong, and reads these rows again.
-        for rows in files.values():
+        for rows in job.files.values():
             rows.close_holes(contents.runs)
-        digests = {rows.path.name: digest_file(rows.path) for rows in files.values()}
-    folder = partial / "pack"
+        digests = {rows.path.name: digest_file(rows.path) for rows in job.files.values()}
     for path in folder.iterdir():  # left by a build that was killed here
         if path.name not in digests:
             path.unlink()
     table = io.BytesIO()
-    pq.write_table(_table(contents, files, spec), table)
+    pq.write_table(_table(contents, job), table)
     write_atomic(folder / "samples.parquet", lambda file: file.write(table.getvalue()))
     meta = {
         "format": FORMAT,
@@ -276,10 +259,6 @@ def _finish(
     write_json(folder / "pack.json", {**meta, "digest": digest(json.loads(json.dumps(meta)))})
     # In a file of its own, because packs of equal content must be byte-identical.
     write_json(folder / "provenance.json", provenance())
-    with contextlib.suppress(FileExistsError):
-        out.parent.mkdir(parents=True)
-    os.rename(folder, out)
-    return Pack(out, verify=False)
 
 
 def _check_damage(
@@ -303,7 +282,7 @@ def _check_damage(
     return named
 
 
-def _table(contents: _Contents, files: dict[str, RowFile | JpegFile], spec: DataSpec) -> pa.Table:
+def _table(contents: _Contents, job: Work) -> pa.Table:
     """Return the table of the pack, with a checksum (and the length of a JPEG) per image."""
     arrays = {}
     for name in dict.fromkeys(name for row in contents.columns for name in row):
@@ -312,10 +291,10 @@ def _table(contents: _Contents, files: dict[str, RowFile | JpegFile], spec: Data
         except pa.ArrowException as error:
             raise ValueError(f"column {name!r} mixes kinds of values: {brief(error)}") from None
     table = pa.table(arrays)
-    for name in [f"{kind}_{modality}" for kind in ("crc", "bytes") for modality in files]:
+    for name in [f"{kind}_{modality}" for kind in ("crc", "bytes") for modality in job.files]:
         if name in contents.numbers:
             # A manifest that was made from another pack has these columns already.
             table = table.drop_columns(name) if name in table.column_names else table
             table = table.append_column(name, pa.array(contents.numbers[name], pa.uint32()))
-    check_table(table, spec)
+    check_table(table, job.spec)
     return table

@@ -71,7 +71,7 @@ class MixedPack(Pack):
                 raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
             notes.append(found)
         self.spec = mixed_spec(self.parts, tasks, channels, notes)
-        pieces = {m: [_of(pack, m) for pack in packs] for m in self.spec.modalities}
+        pieces = {m: [pack.images.get(m, pack.num) for pack in packs] for m in self.spec.modalities}
         self.images: dict[str, Images] = {m: MixedImages(each, self.size, channels[m]) for m, each in pieces.items()}
 
     def has(self, modality: str) -> np.ndarray:
@@ -159,10 +159,6 @@ class MixedImages(Lazy):
         images = piece[rows - self.starts[number]]
         size = self.shape[1]
         return images if images.shape[1] == size else np.stack([fit(image, size) for image in images])
-
-
-def _of(pack: Pack, modality: str) -> Images | int:
-    return pack.images.get(modality, pack.num)
 
 
 def _check(parts: Mapping[str, Pack]) -> dict[str, int]:

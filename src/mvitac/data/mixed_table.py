@@ -55,8 +55,8 @@ class MixedTasks:
         self.of: dict[tuple[str, str], AnyTask] = {}
         first: dict[str, AnyTask] = {}
         for (part, name), task in given.items():
-            one = len(alike[name]) == 1
-            self.of[part, name] = first.setdefault(name, task) if one else _apart(task, part)
+            own = replace(task, name=f"{part}/{task.name}", only={**task.only, "part": part})
+            self.of[part, name] = first.setdefault(name, task) if len(alike[name]) == 1 else own
         used = {
             (part, name): tuple(columns[part][c] for c in given)
             for part, pack in parts.items()
@@ -74,10 +74,6 @@ class MixedTasks:
     @property
     def values(self) -> tuple[ValueTask, ...]:
         return tuple({t.name: t for t in self.of.values() if isinstance(t, ValueTask)}.values())
-
-
-def _apart(task: AnyTask, part: str) -> AnyTask:
-    return replace(task, name=f"{part}/{task.name}", only={**task.only, "part": part})
 
 
 def _renamed(task: AnyTask, columns: Mapping[str, str]) -> AnyTask:

@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
+from mvitac.evaluation.score_text import cell_text, columns_of, covered, pipes, score_name, sources_of, tested_on
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ValueInfo
 
@@ -96,9 +96,8 @@ def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
     ]
     for name, task in scores["summary"].items():
         columns = columns_of(task)
-        lines += [f"| {name} ({tested_on(task, by)}) | {' | '.join(columns)} |", "|---" + "|---:" * len(columns) + "|"]
-        lines += [f"| {s} | {' | '.join(cell_text(task, s, m) for m in columns)} |" for s in sources_of(task)]
-        lines.append("")
+        rows = [[s, *(cell_text(task, s, m) for m in columns)] for s in sources_of(task)]
+        lines += pipes([f"{name} ({tested_on(task, by)})", *columns], rows, words=1)
         lines += _errors([r.info for r in model.probes.values() if r.info.task == name])
     return [*lines, *(line for note in scores["notes"] for line in (f"Note: {note}.", ""))]
 
@@ -108,12 +107,11 @@ def _errors(infos: list[Any]) -> list[str]:
     infos = [q for q in infos if isinstance(q, ValueInfo)]
     if not infos:
         return []
-    head = f"| mean absolute error (root mean square) | {' | '.join(q.modality for q in infos)} |"
-    lines = [head, "|---" + "|---:" * len(infos) + "|"]
+    rows = []
     for t, target in enumerate(infos[0].targets):
         found = [f"{q.errors[t].mae:.3g} ({q.errors[t].rmse:.3g}) {target.unit}" for q in infos]
-        lines.append(f"| {target.name} | {' | '.join(found)} |")
-    return [*lines, ""]
+        rows.append([target.name, *found])
+    return pipes(["mean absolute error (root mean square)", *(q.modality for q in infos)], rows, words=1)
 
 
 def _usage(given: dict[str, Any]) -> list[str]:

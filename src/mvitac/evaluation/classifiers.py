@@ -16,6 +16,8 @@ from sklearn.linear_model import LogisticRegression
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+from mvitac.evaluation.diagnostics import knn_votes
+
 Classifier = Callable[[np.ndarray], np.ndarray]
 
 STRENGTHS = (0.001, 0.01, 0.1, 1.0)  # candidate values of C, the inverse regularisation strength of logistic regression
@@ -114,16 +116,14 @@ def _linear_probabilities(z: np.ndarray, head: np.ndarray) -> np.ndarray:
     return np.asarray(torch.softmax(torch.from_numpy(z @ head[:, :-1].T + head[:, -1]), 1))
 
 
-def fit_knn(x: np.ndarray, y: np.ndarray, num_classes: int, k: int = 20) -> Classifier:
-    """Weighted vote of the k nearest rows by cosine, as in ``diagnostics.knn_accuracy``; returns vote shares."""
-    bank = F.normalize(torch.from_numpy(x).float(), dim=1)
-    return partial(_knn_shares, bank=bank, labels=torch.from_numpy(y).long(), num_classes=num_classes, k=k)
+def fit_knn(x: np.ndarray, y: np.ndarray, num_classes: int) -> Classifier:
+    """Weighted vote of the 20 nearest rows by cosine (``diagnostics.knn_votes``); returns vote shares."""
 
+    def shares(z: np.ndarray) -> np.ndarray:
+        votes = knn_votes(torch.from_numpy(x), torch.from_numpy(y).long(), torch.from_numpy(z), num_classes)
+        return (votes / votes.sum(1, keepdim=True)).numpy()
 
-def _knn_shares(z: np.ndarray, bank: Tensor, labels: Tensor, num_classes: int, k: int) -> np.ndarray:
-    near = (F.normalize(torch.from_numpy(z).float(), dim=1) @ bank.T).topk(min(k, len(bank)), dim=1)
-    votes = torch.zeros(len(z), num_classes).scatter_add_(1, labels[near.indices], (near.values / 0.07).exp())
-    return (votes / votes.sum(1, keepdim=True)).numpy()
+    return shares
 
 
 def spread_out(probabilities: np.ndarray, seen: np.ndarray, num_classes: int) -> np.ndarray:

@@ -75,14 +75,23 @@ def controls_of(
     starts, weights = starts_of(runs, specs or [pack.spec] * len(runs)), start_weights(runs, imagenet)
     fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
+
+    def probed(model: Model) -> Records:
+        return probe_model(model, pack, tasks, modalities, probes, standardise)
+
     with work("fitting probes of the controls", num, "probes"):
         records += pixel_controls(pack, tasks, modalities)
-        found, retrieval = _untrained_trunks(starts, pack, tasks, modalities, probes, standardise)
-        records += found
+        # Built one by one: threads would share the random generator.
+        models = [fresh(scratch(run), spec, pack.size) for run, spec in starts]
+        retrieval: Records = []
+        scored = in_threads(lambda model: (probed(model), cross_modal(model, pack)), models)
+        for (run, _), (found, ranked) in zip(starts, scored, strict=True):
+            records += _named("untrained", run.seed, found)
+            retrieval += _named("untrained", run.seed, ranked)
         for name in weights:
             run, spec = starts[0]
             start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
-            records += _named("imagenet", None, probe_model(start, pack, tasks, modalities, probes, standardise))
+            records += _named("imagenet", None, probed(start))
     return records, retrieval
 
 
@@ -126,28 +135,6 @@ def pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[st
         found = probe_all(lambda m, rows: borders(pack, m, rows), pack, tasks, ["touch"], ["linear"], 0)
         records += _named("border", None, found)
     return records
-
-
-def _untrained_trunks(
-    starts: Sequence[tuple[Run, DataSpec]],
-    pack: Pack,
-    tasks: Sequence[AnyTask],
-    modalities: Sequence[str],
-    probes: Sequence[str],
-    standardise: tuple[Standardise, ...],
-) -> tuple[Records, Records]:
-    # Built one by one: threads would share the random generator.
-    models = [fresh(scratch(run), spec, pack.size) for run, spec in starts]
-
-    def scores(model: Model) -> tuple[Records, Records]:
-        return probe_model(model, pack, tasks, modalities, probes, standardise), cross_modal(model, pack)
-
-    scored = in_threads(scores, models)
-    records, retrieval = [], []
-    for (run, _), (found, ranked) in zip(starts, scored, strict=True):
-        records += _named("untrained", run.seed, found)
-        retrieval += _named("untrained", run.seed, ranked)
-    return records, retrieval
 
 
 def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run, DataSpec]]:

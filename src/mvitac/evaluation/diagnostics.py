@@ -61,15 +61,21 @@ def knn_accuracy(
     test_labels: Int[Tensor, " M"],
     k: int = 20,
 ) -> float:
-    """kNN accuracy: the ``k`` nearest ``train`` rows vote with weight exp(cosine / .07).
+    """kNN accuracy: the class with most of the ``knn_votes``."""
+    votes = knn_votes(train, train_labels, test, int(max(train_labels.max(), test_labels.max())) + 1, k)
+    return float((votes.argmax(1) == test_labels).float().mean())
+
+
+def knn_votes(
+    train: Float[Tensor, "N D"], labels: Int[Tensor, " N"], test: Float[Tensor, "M D"], num_classes: int, k: int = 20
+) -> Float[Tensor, "M K"]:
+    """Votes of the ``k`` nearest ``train`` rows for each class, with weight exp(cosine / .07).
 
     Source: https://arxiv.org/abs/1805.01978 (Wu et al., section 3.4).
     """
-    similarity = F.normalize(test.float(), dim=1) @ F.normalize(train.float(), dim=1).T
-    near = similarity.topk(min(k, len(train)), dim=1)
-    votes = torch.zeros(len(test), int(max(train_labels.max(), test_labels.max())) + 1)
-    votes.scatter_add_(1, train_labels[near.indices], (near.values / 0.07).exp())
-    return float((votes.argmax(1) == test_labels).float().mean())
+    near = (F.normalize(test.float(), dim=1) @ F.normalize(train.float(), dim=1).T).topk(min(k, len(train)), dim=1)
+    votes = torch.zeros(len(test), num_classes)
+    return votes.scatter_add_(1, labels[near.indices], (near.values / 0.07).exp())
 
 
 ALPHAS = (10.0, 100.0, 1e3, 1e4, 1e5)  # candidate strengths of the ridge regularisation of ``linear_probe``

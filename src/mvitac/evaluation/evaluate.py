@@ -177,19 +177,27 @@ def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
 
 
 def _probe_models(
-    each: Sequence[Probed],
-    pack: Pack,
-    tasks: Sequence[AnyTask],
-    modalities: Sequence[str],
-    session: ProbeConfig,
+    each: Sequence[Probed], pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str], session: ProbeConfig
 ) -> tuple[Records, Records]:
     """Probe and retrieval records of runs, given as folder, model, name and what it learned from."""
     if not each:
         return [], []
     rows = Scored(pack)
+
+    def probed(one: Probed) -> tuple[Records, Records]:
+        path, model, source, learned = one
+        own = {"source": source, "seed": model.run.seed, "run": str(path)}
+        found = probe_model(model, pack, tasks, modalities, session.probes, session.standardise)
+        leaks = {task.name: rows.leak(learned, split_rows(pack, task).test) for task in tasks}
+        records = [{**own, **record, "leak": leaks[record["task"]]} for record in found]
+        for record in records:
+            record["source"] += END_TO_END if record["probe"] == "own" else ""
+        ranked = cross_modal(model, pack)
+        return records, [{**own, **r, "leak": rows.leak(learned, retrieved_rows(pack))} for r in ranked]
+
     num = len(each) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
     with work("fitting probes", num, "probes"):
-        scored = in_threads(lambda one: _probe_run(*one, rows, tasks, modalities, session), list(each))
+        scored = in_threads(probed, list(each))
     return [r for own, _ in scored for r in own], [r for _, found in scored for r in found]
 
 
@@ -271,27 +279,6 @@ def _check_weights(runs: Sequence[Run], session: ProbeConfig) -> None:
     """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
     for weights in start_weights(runs, session.imagenet) if session.controls else ():
         build_trunk(replace(runs[0].encoder, weights=weights), 3)
-
-
-def _probe_run(
-    path: Path,
-    model: Model,
-    source: str,
-    learned: Sequence[Source] | None,
-    scored: Scored,
-    tasks: Sequence[AnyTask],
-    modalities: Sequence[str],
-    session: ProbeConfig,
-) -> tuple[Records, Records]:
-    """Probe and retrieval records of one run."""
-    own, pack = {"source": source, "seed": model.run.seed, "run": str(path)}, scored.pack
-    records = [{**own, **r} for r in probe_model(model, pack, tasks, modalities, session.probes, session.standardise)]
-    leaks = {task.name: scored.leak(learned, split_rows(pack, task).test) for task in tasks}
-    for record in records:
-        record["source"] += END_TO_END if record["probe"] == "own" else ""
-        record["leak"] = leaks[record["task"]]
-    found = [{**own, **r, "leak": scored.leak(learned, retrieved_rows(pack))} for r in cross_modal(model, pack)]
-    return records, found
 
 
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:

@@ -43,14 +43,11 @@ def probe_encoders(
         num = (2 if random else 1) * len(modalities) * sum(len(probes_of(task, probes)) for task in tasks)
         with work(f"probing {model.title}", num, "probes"):
             for each, own in ((model, {"encoder": model.text}), *(((random, {}),) if random else ())):
-                known = {"source": each.title, "seed": each.seed, **own, "leak": _leak(each)}
+                # Where nothing says what the encoder was trained on, leaks cannot be excluded.
+                leak = UNKNOWN if UNKNOWN in each.trained_on else ""
+                known = {"source": each.title, "seed": each.seed, **own, "leak": leak}
                 records += [{**known, **record} for record in probe_model(each, pack, tasks, modalities, probes)]
     return records
-
-
-def _leak(model: ExternalModel) -> str:
-    """That leaks cannot be excluded, where nothing says what the encoder was trained on."""
-    return UNKNOWN if UNKNOWN in model.trained_on else ""
 
 
 def about_lines(described: Sequence[dict[str, Any]]) -> list[str]:

@@ -147,12 +147,11 @@ def leak_mark(leak: str) -> str:
 
 def leaks_of(records: Sequence[dict[str, Any]]) -> list[str]:
     """One line for each source of ``records`` with a leak, or of which it is not known."""
-    lines: dict[str, None] = {}
+    unknown = "what it or its start weights were trained on is unknown, so leaks cannot be excluded"
+    lines = []
     for record in records:
         if record.get("leak") == UNKNOWN:
-            lines[
-                f"{record['source']}: what it or its start weights were trained on is unknown, so leaks cannot be excluded"
-            ] = None
+            lines.append(f"{record['source']}: {unknown}")
         elif record.get("leak"):
-            lines[f"{record['source']}, {record.get('task') or 'retrieval'}: {record['leak']}"] = None
-    return list(lines)
+            lines.append(f"{record['source']}, {record.get('task') or 'retrieval'}: {record['leak']}")
+    return list(dict.fromkeys(lines))

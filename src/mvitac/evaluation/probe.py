@@ -87,12 +87,12 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
     return ProbeSplit(train, val, test)
 
 
-def scorable(pack: Pack) -> list[AnyTask]:
-    """The tasks of ``pack`` that have labelled rows in train and test."""
+def scorable(pack: Pack, modality: str = "none") -> list[AnyTask]:
+    """The tasks of ``pack`` that have labelled rows with ``modality`` in train and test."""
     found = []
     for task in pack.spec.all_tasks:
         try:
-            split_rows(pack, task)
+            split_rows(pack, task, modality)
         except ValueError:
             continue
         found.append(task)

@@ -4,7 +4,7 @@ A task's summary is modality -> method or control -> cell (``scores.summarise``)
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from mvitac.evaluation.leaks import leak_mark
@@ -15,6 +15,12 @@ MODALITY_ORDER = ("none", "touch", "vision", "both")
 def percent(value: float) -> str:
     """A score in 0 .. 1 as text in percent, with one decimal. Every page, table, figure and card uses this."""
     return f"{100 * value:.1f}"
+
+
+def pipes(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -> list[str]:
+    """Lines of a Markdown table. The first ``words`` columns are left-aligned, the others right-aligned."""
+    rule = "|---" * words + "|---:" * (len(heads) - words) + "|"
+    return [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(row)} |" for row in rows), ""]
 
 
 def with_interval(mean: float, low: float | None, high: float, leak: str = "") -> str:

@@ -70,30 +70,30 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     for parts in found.values():
         if len(parts) < len(folds):
             continue
-        if "group_sums" in parts[0]:
-            whole = pool_values(parts)
-            if leaks := leaks_in(parts):
-                whole["leak"] = leaks
-            pooled.append({**{key: parts[0][key] for key in keys}, **whole})
-            continue
-        sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
-        means = {}
-        for key in ("balanced_accuracy", "macro_f1", "auroc"):
-            values = [part[key] for part in parts if part[key] is not None]
-            means[key] = float(np.mean(values)) if values else None
-        whole = {
-            "accuracy": sum(correct) / sum(sizes),
-            "confusion": np.sum([part["confusion"] for part in parts], axis=0).tolist(),
-            "num_test": sum(part["num_test"] for part in parts),
-            "group_sizes": sizes,
-            "group_correct": correct,
-        }
+        whole = pool_values(parts) if "group_sums" in parts[0] else _pool_classes(parts)
         if leaks := leaks_in(parts):
             whole["leak"] = leaks
         if all("event" in part for part in parts):
             whole["event"] = pool_events([part["event"] for part in parts])
-        pooled.append({**{key: parts[0][key] for key in keys}, **means, **whole})
+        pooled.append({**{key: parts[0][key] for key in keys}, **whole})
     return pooled
+
+
+def _pool_classes(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The scores of all groups together, of one task with classes."""
+    sizes, correct = ([n for part in parts for n in part[key]] for key in ("group_sizes", "group_correct"))
+    means = {}
+    for key in ("balanced_accuracy", "macro_f1", "auroc"):
+        values = [part[key] for part in parts if part[key] is not None]
+        means[key] = float(np.mean(values)) if values else None
+    return {
+        **means,
+        "accuracy": sum(correct) / sum(sizes),
+        "confusion": np.sum([part["confusion"] for part in parts], axis=0).tolist(),
+        "num_test": sum(part["num_test"] for part in parts),
+        "group_sizes": sizes,
+        "group_correct": correct,
+    }
 
 
 def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:

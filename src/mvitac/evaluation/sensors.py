@@ -19,6 +19,7 @@ from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
+from mvitac.nn.finetuning import renew_norms
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, learn_colours, recolour
 from mvitac.transforms.preprocess import encoder_input
 
@@ -86,7 +87,6 @@ def touch_features(
     return np.concatenate(parts)[np.argsort(order)]
 
 
-@torch.no_grad()
 def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     """A copy of ``model`` whose touch encoder has the BatchNorm statistics of the touch images of ``rows``.
 
@@ -101,13 +101,14 @@ def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     if not norms:
         raise ValueError(f"trunk {model.run.encoder.trunk} has no BatchNorm: leave --standardise batch-norm out")
     for layer in norms:
-        layer.reset_running_stats()
-        layer.momentum = None  # the plain mean over batches
         layer.train()
     device = next(trunk.parameters()).device
-    for chunk in np.array_split(rows, max(1, len(rows) // 64)):
+
+    def see(chunk: np.ndarray) -> None:
         images = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][chunk])).permute(0, 3, 1, 2).to(device)
         trunk(encoder_input(images, model.run.augment.eval_size))
+
+    renew_norms(trunk, (partial(see, chunk) for chunk in np.array_split(rows, max(1, len(rows) // 64))))
     return made.eval()
 
 

@@ -4,13 +4,13 @@ import csv
 import io
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mvitac.evaluation.external_encoders import about_lines
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.score_text import covered, error_text, percent, with_interval
+from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
 from mvitac.evaluation.scores import by_cell, least_p, num_groups_of
 from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Cell, Line, lines_of, stresses_of, target_lines
@@ -53,12 +53,6 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     return "\n".join(text).rstrip() + "\n"
 
 
-def _pipes(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -> list[str]:
-    """A Markdown table. The first ``words`` columns are left-aligned, the others right-aligned."""
-    rule = "|---" * words + "|---:" * (len(heads) - words) + "|"
-    return [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(row)} |" for row in rows), ""]
-
-
 def _first_cells(line: Line) -> list[str]:
     """The row's name and modality; controls are in italics."""
     return [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
@@ -81,7 +75,7 @@ def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
             error = [error_text(cell.target) if cell and cell.target else ""] if known[task].target else []
             row += [score, *error, *([_printed(cell)] if shown else []), _gap(cell)]
         rows.append(row)
-    return _pipes(heads, rows)
+    return pipes(heads, rows)
 
 
 def _columns(lines: Sequence[Line]) -> dict[str, Cell]:
@@ -200,12 +194,12 @@ def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[st
         return []
     tasks = list(dict.fromkeys(task for row in found.values() for task in row))
     rows = [[*first, *(row.get(task, "") for task in tasks)] for first, row in found.items()]
-    return _pipes(["AUROC %", "modality", *tasks], rows)
+    return pipes(["AUROC %", "modality", *tasks], rows)
 
 
 def _retrieval(result: dict[str, Any]) -> list[str]:
     rows = retrieval_rows(result["retrieval"])
-    return _pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows) if rows else []
+    return pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows) if rows else []
 
 
 def _cost(result: dict[str, Any]) -> list[str]:

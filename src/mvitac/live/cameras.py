@@ -9,6 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,27 @@ class Source(ABC):
         pass
 
 
-class Camera(Source):
+class _Capture(Source):
+    """Frames that OpenCV reads; ``open`` makes ``capture``."""
+
+    capture: Any
+
+    def read(self) -> np.ndarray:
+        good, image = self.capture.read()
+        if not good:
+            raise self.ended()
+        return np.ascontiguousarray(image[..., ::-1])  # OpenCV's frames are BGR
+
+    @abstractmethod
+    def ended(self) -> Exception:
+        """The error if there is no frame."""
+
+    def close(self) -> None:
+        if hasattr(self, "capture"):
+            self.capture.release()
+
+
+class Camera(_Capture):
     """A UVC camera by index, device path or USB serial number; DIGIT and GelSight Mini are such cameras."""
 
     def __init__(self, which: str, size: tuple[int, int] | None = None, fps: float | None = None) -> None:
@@ -75,18 +96,11 @@ class Camera(Source):
             )
         self.fps = given[2] or 30.0
 
-    def read(self) -> np.ndarray:
-        good, image = self.capture.read()
-        if not good:
-            raise OSError(f"camera {self.which} gives no frames")
-        return np.ascontiguousarray(image[..., ::-1])  # OpenCV's frames are BGR
-
-    def close(self) -> None:
-        if hasattr(self, "capture"):
-            self.capture.release()
+    def ended(self) -> Exception:
+        return OSError(f"camera {self.which} gives no frames")
 
 
-class Video(Source):
+class Video(_Capture):
     """A video file, at its own frame rate."""
 
     paced = False
@@ -102,15 +116,8 @@ class Video(Source):
             raise OSError(f"{self.path} cannot be read as a video")
         self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
 
-    def read(self) -> np.ndarray:
-        good, image = self.capture.read()
-        if not good:
-            raise Ended
-        return np.ascontiguousarray(image[..., ::-1])
-
-    def close(self) -> None:
-        if hasattr(self, "capture"):
-            self.capture.release()
+    def ended(self) -> Exception:
+        return Ended()
 
 
 class Folder(Source):

@@ -16,6 +16,9 @@ from mvitac.data.images import fit
 from mvitac.live.cameras import Ended, Source
 from mvitac.system.files import brief
 
+FROZEN_AFTER, RETRY_EVERY = 1.0, 1.0
+"""Seconds: how long pictures may be identical to the last byte, and between two tries to open a lost device."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -47,16 +50,13 @@ class Stream:
         clock: Callable[[], float] = time.monotonic,
         tell: Callable[[Event], None] = lambda event: None,
         stale_after: float = 0.5,
-        frozen_after: float = 1.0,
-        retry_every: float = 1.0,
     ) -> None:
-        """``tell`` is called with every event, in the thread that noticed it. Times are in seconds.
+        """``tell`` is called with every event, in the thread that noticed it.
 
-        A frame older than ``stale_after`` is no longer used, pictures may be identical to the last byte for
-        ``frozen_after``, and a lost device is tried again ``retry_every``.
+        A frame older than ``stale_after`` seconds is no longer used.
         """
         self.name, self.origin, self.clock, self.tell = name, origin, clock, tell
-        self.stale_after, self.frozen_after, self.retry_every = stale_after, frozen_after, retry_every
+        self.stale_after = stale_after
         self.fault: str | None = None
         self.ended = False
         self.num_frames = self.num_dropped = self.num_damaged = 0
@@ -165,7 +165,7 @@ class Stream:
             if self.fault == "frozen":
                 self._say("moving again", f"moves again after {now - self._moved_at:.1f} s")
             self._moved_at = now
-        elif self.fault != "frozen" and now - self._moved_at >= self.frozen_after:
+        elif self.fault != "frozen" and now - self._moved_at >= FROZEN_AFTER:
             self._say("frozen", f"shows the same picture since {now - self._moved_at:.1f} s")
         self.num_frames += 1
         self._arrivals.append(now)
@@ -182,11 +182,11 @@ class Stream:
     def _lost(self, error: Exception) -> None:
         self.origin.close()
         self._open, self._stalled = False, False
-        self._retry_at = self.clock() + self.retry_every
+        self._retry_at = self.clock() + RETRY_EVERY
         if self.fault != "unplugged":
             self._lost_at = self.clock()
             self._arrivals.clear()
-            self._say("unplugged", f"is gone ({brief(error)}): trying again every {self.retry_every:g} s")
+            self._say("unplugged", f"is gone ({brief(error)}): trying again every {RETRY_EVERY:g} s")
 
     def _say(self, what: str, text: str) -> None:
         self.events[what] += 1
@@ -215,7 +215,7 @@ class CaptureThread(threading.Thread):
             self.wake()
             wait = 0.0
             if self.stream.fault == "unplugged":
-                wait = min(0.1, self.stream.retry_every)
+                wait = min(0.1, RETRY_EVERY)
             elif not self.stream.origin.paced:
                 due = max(due + 1 / self.stream.origin.fps, time.monotonic() - 0.1)
                 wait = due - time.monotonic()

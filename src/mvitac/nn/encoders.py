@@ -35,10 +35,7 @@ _ANY_SIZE = {"dynamic_img_size": True, "dynamic_img_pad": True}
 @register_model
 def mvitac_tiny(pretrained: bool = False, **kwargs: Any) -> ResNet:
     """A ResNet with one narrow block per stage (64 features, 78 k parameters), for tests and the smoke recipe."""
-    if pretrained:
-        raise ValueError("mvitac_tiny has no ImageNet weights: use --encoder.weights scratch")
-    for key in ("pretrained_cfg", "pretrained_cfg_overlay", "cache_dir"):
-        kwargs.pop(key, None)
+    _from_scratch("mvitac_tiny", pretrained, kwargs)
     shape: dict[str, Any] = {"block": BasicBlock, "layers": (1, 1, 1, 1), "channels": (8, 16, 32, 64)}
     return ResNet(**shape, stem_width=8, stem_type="deep", **kwargs)
 
@@ -55,12 +52,17 @@ def mvitac_tiny_vit(pretrained: bool = False, **kwargs: Any) -> VisionTransforme
     return _small_vit("mvitac_tiny_vit", pretrained, {"embed_dim": 64, "depth": 2, "num_heads": 2}, kwargs)
 
 
-def _small_vit(name: str, pretrained: bool, shape: dict[str, Any], kwargs: dict[str, Any]) -> VisionTransformer:
-    """A ViT for 64 px without a class token; its learned positions start as sines and cosines."""
+def _from_scratch(name: str, pretrained: bool, kwargs: dict[str, Any]) -> None:
+    """Refuse pretrained weights, and drop what timm says of them from ``kwargs``."""
     if pretrained:
         raise ValueError(f"{name} has no ImageNet weights: use --encoder.weights scratch")
     for key in ("pretrained_cfg", "pretrained_cfg_overlay", "cache_dir"):
         kwargs.pop(key, None)
+
+
+def _small_vit(name: str, pretrained: bool, shape: dict[str, Any], kwargs: dict[str, Any]) -> VisionTransformer:
+    """A ViT for 64 px without a class token; its learned positions start as sines and cosines."""
+    _from_scratch(name, pretrained, kwargs)
     usual: dict[str, Any] = {"class_token": False, "global_pool": "avg", "fc_norm": False} | _ANY_SIZE
     vit = VisionTransformer(**{"img_size": 64, "patch_size": 8, **usual, **shape, **kwargs})
     assert vit.pos_embed is not None

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mvitac.nn.encoders import PerFrame, stem_names
 from mvitac.nn.finetuning import AttentivePool
-from mvitac.nn.weights import read_safetensors, safetensors_digest
+from mvitac.nn.weights import misfit, read_safetensors, safetensors_digest
 
 MODEL = "model.safetensors"  # the file with the weights in the folder of a run or an artifact
 
@@ -132,5 +132,4 @@ def adapt_stem(weight: Float[Tensor, "O C h w"], channels: int) -> Float[Tensor,
 
 def fits(module: nn.Module, state: dict[str, Tensor]) -> bool:
     """Whether ``state`` has the names and shapes of the module's state dict."""
-    shapes = {name: value.shape for name, value in module.state_dict().items()}
-    return shapes == {name: value.shape for name, value in state.items()}
+    return not misfit(module.state_dict(), state)

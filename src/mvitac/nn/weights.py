@@ -54,10 +54,15 @@ def safetensors_digest(tensors: dict[str, Tensor]) -> str:
 
 def check_tensors(file: Path, expected: dict[str, Tensor], found: dict[str, Any]) -> None:
     """Raise ValueError if the tensors ``found`` in ``file`` do not have the ``expected`` names and shapes."""
+    if why := misfit(expected, found):
+        raise ValueError(f"{file} holds other weights than its run describes: {why}")
+
+
+def misfit(expected: dict[str, Tensor], found: dict[str, Any]) -> str:
+    """Say in which name or shape tensors differ from the ``expected`` ones; "" if in none."""
     for name in sorted(expected.keys() ^ found.keys()):
-        where = "is missing" if name in expected else "does not belong"
-        raise ValueError(f"{file} holds other weights than its run describes: tensor {name!r} {where}")
+        return f"tensor {name!r} {'is missing' if name in expected else 'does not belong'}"
     for name, tensor in expected.items():
         if tensor.shape != found[name].shape:
-            shapes = f"{tuple(found[name].shape)}, expected {tuple(tensor.shape)}"
-            raise ValueError(f"{file} holds other weights than its run describes: {name!r} is {shapes}")
+            return f"{name!r} is {tuple(found[name].shape)}, expected {tuple(tensor.shape)}"
+    return ""

@@ -14,7 +14,7 @@ from mvitac import __version__
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
-from mvitac.evaluation.probe import split_rows
+from mvitac.evaluation.probe import scorable
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import covered, percent, score_name, with_interval
@@ -100,15 +100,8 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
-    usable = []
-    for task in pack.spec.all_tasks:
-        try:
-            split_rows(pack, task, "none" if pack.parts else "both")
-        except ValueError:  # no labelled rows to fit or to score
-            continue
-        usable.append(task.name)
-    if usable:
-        return probe_runs([r.path for r in runs], ProbeConfig(tasks=tuple(usable)), pack)
+    if usable := tuple(task.name for task in scorable(pack, "none" if pack.parts else "both")):
+        return probe_runs([r.path for r in runs], ProbeConfig(tasks=usable), pack)
     own = [{"source": r.source, "seed": r.run.seed, "run": str(r.path)} for r in runs]
     found = [{**o, **f} for o, r in zip(own, runs, strict=True) for f in cross_modal(r.model, pack)]
     shared: dict[str, Any] = {"records": [], "retrieval": found, "summary": {}, "classes": {}}

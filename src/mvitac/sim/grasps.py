@@ -146,12 +146,11 @@ def _record(
         touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
         row: dict[str, Any] = {"phase": moment.phase, **known}
         for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
-            imprint = _imprint(bench, patch, moment.data, side, touch.normal_n, size)
+            imprint, contacts = _pressed(bench, patch, moment, side, max(GRID, size), measured)
             row[f"touch_{name}"] = gels.render(side, imprint, touch, touch_rng, size)
             row[f"contact_{name}"] = float(imprint.mean())
             row[f"normal_{name}_n"] = touch.normal_n
-            if measured:
-                row |= _measured(bench, patch, moment.data, side, touch, size)
+            row |= {side_name(known_as, name): value for known_as, value in contacts.items()}
         row["vision"] = camera.photograph(bench.model, moment.data, thing, view, view_rng, size=size)
         rows.append(row)
     assert moment is not None, "there are three phases"
@@ -199,16 +198,25 @@ def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dic
     }
 
 
-def _imprint(
-    bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, normal_n: float, size: int
-) -> np.ndarray:
-    """Return the imprint [grid, grid] in mm of the object in one gel, seen from behind the gel; row 0 is up."""
-    grid = max(GRID, size)
-    relief = _relief(bench, patch, data, side, grid) if normal_n > 0 else None
-    if relief is None:
-        return np.zeros((grid, grid), np.float32)
-    imprint = gel.press(relief, force_n=normal_n, **_physics(bench, grid))
-    return np.minimum(imprint, np.float32(2.5))  # thickness of the gel; only corners at the rim come near it
+def _pressed(
+    bench: physics.Bench, patch: skin.Patch, moment: physics.Moment, side: int, grid: int, measured: bool
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Return the imprint [grid, grid] in mm of the object in one gel, seen from behind the gel; row 0 is up.
+
+    If ``measured``, also return what physics knows of the contact: depth_mm, shear_x_n, ...
+    """
+    touch = (moment.left, moment.right)[side]
+    relief = _relief(bench, patch, moment.data, side, grid) if touch.normal_n > 0 else None
+    spring = {"stiffness": bench.thing.stiffness, "pixel_mm": FIELD_MM / grid, "dome_radius_mm": objects.DOME_RADIUS_MM}
+    imprint, force = np.zeros((grid, grid), np.float32), 0.0
+    if relief is not None:
+        force = touch.normal_n
+        # Thickness of the gel; only corners at the rim come near it.
+        imprint = np.minimum(gel.press(relief, force_n=force, **spring), np.float32(2.5))
+    if not measured:
+        return imprint, {}
+    found = contact(imprint if relief is None else relief, force_n=force, **spring)
+    return imprint, {**found, "shear_x_n": touch.shear_n[0], "shear_y_n": touch.shear_n[1]}
 
 
 def _relief(bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, grid: int) -> np.ndarray | None:
@@ -228,24 +236,6 @@ def _relief(bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: 
     relief = np.full(grid * grid, -np.inf, np.float32)
     relief[hit] = 1000 * (BEHIND_M - distance[hit]) + patch.relief_mm(1000 * local[hit])
     return relief.reshape(grid, grid) if hit.any() else None
-
-
-def _physics(bench: physics.Bench, grid: int) -> dict[str, float]:
-    stiffness, dome = bench.thing.stiffness, objects.DOME_RADIUS_MM
-    return {"stiffness": stiffness, "pixel_mm": FIELD_MM / grid, "dome_radius_mm": dome}
-
-
-def _measured(
-    bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, touch: physics.Touch, size: int
-) -> dict[str, float]:
-    """Return what physics knows of the contact of one gel, named after its side: depth_left_mm, shear_x_left_n, ..."""
-    grid = max(GRID, size)
-    relief = _relief(bench, patch, data, side, grid) if touch.normal_n > 0 else None
-    force = touch.normal_n if relief is not None else 0.0
-    relief = np.zeros((grid, grid), np.float32) if relief is None else relief
-    found = contact(relief, force_n=force, **_physics(bench, grid))
-    found |= {"shear_x_n": touch.shear_n[0], "shear_y_n": touch.shear_n[1]}
-    return {side_name(name, ("left", "right")[side]): value for name, value in found.items()}
 
 
 def side_name(name: str, side: str) -> str:

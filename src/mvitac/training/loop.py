@@ -25,7 +25,6 @@ from mvitac.training.log import EARLY, Log, Logger
 from mvitac.training.sampler import mix
 from mvitac.training.setup import Setup, check_out, check_still_there, set_up
 from mvitac.training.validation import Validation
-from mvitac.training.views import load_chunks
 
 MIN_BETWEEN_CHECKPOINTS = 10
 """Steps between checkpoints at least, unless ``checkpoint_every`` says otherwise: in short runs they took half the time."""
@@ -93,7 +92,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
     start, num_steps = setup.start, setup.num_steps
     steps_per_epoch = run.steps_per_epoch(len(setup.rows))
     save_every = run.checkpoint_every or max(MIN_BETWEEN_CHECKPOINTS, num_steps // 10)
-    batches = load_chunks(run, pack, setup.rows, method.views, setup.device, world, start, num_steps, setup.mirror)
+    batches = setup.chunks(start, num_steps)
 
     # Only rank 0 logs and evaluates; on the other processes ``log`` is None.
     log_or_none = Log(out, start, num_steps, run.batch_size, quiet=quiet, loggers=loggers) if world.writes else None

@@ -1,6 +1,7 @@
 """Set-up of pre-training: everything that happens before the first step, and every check that can be made there."""
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from mvitac.training.heads import fit_heads
 from mvitac.training.sampler import check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
-from mvitac.training.step import Step
+from mvitac.training.step import Chunk, Step
 from mvitac.training.views import gel_mirror, load_chunks, values_of
 from mvitac.transforms.gel_flip import GelMirror
 
@@ -53,6 +54,11 @@ class Setup:
     start: int  # number of steps that are already done
     num_steps: int
     kept: dict[str, Any]  # state of validation (``Validation``)
+
+    def chunks(self, start: int, num_steps: int) -> Iterator[list[Chunk]]:
+        """The chunks of each step from ``start`` to ``num_steps`` (``load_chunks``)."""
+        how = self.method.views, self.device, self.world, start, num_steps, self.mirror
+        return load_chunks(self.run, self.pack, self.rows, *how)
 
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
@@ -84,8 +90,9 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     num_steps = run.num_steps(len(rows))
     kept: dict[str, Any] = {}
     start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
+    setup = Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept)
     if start == 0:
-        _before_first_step(run, method, pack, rows, device, world, mirror)
+        _before_first_step(setup)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
     if not resumed and world.writes:
@@ -101,7 +108,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     if world.writes and not (out / FILE).exists():
         own = source_of(pack, rows)
         write_sources(out, with_ancestors(own, start_weights.sources if start_weights else []))
-    return Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept)
+    return setup
 
 
 def check_out(out: Path, resume: bool) -> None:
@@ -204,27 +211,20 @@ def _build_method(
     return method, taken
 
 
-def _before_first_step(
-    run: Run,
-    method: Method,
-    pack: Pack,
-    rows: np.ndarray,
-    device: torch.device,
-    world: World,
-    mirror: GelMirror | None,
-) -> None:
+def _before_first_step(setup: Setup) -> None:
     """Estimate statistics of BatchNorm and fit heads, if the run asks for it. Their rows are a function of the seed."""
+    run, method = setup.run, setup.method
     if run.renew_norms:
-        if world.size > 1:
+        if setup.world.size > 1:
             raise ValueError("renew_norms works on one process only: leave it out, or start without torchrun")
-        steps = load_chunks(run, pack, rows, method.views, device, world, 0, run.renew_norms, mirror)
+        steps = setup.chunks(0, run.renew_norms)
         renew_norms(method.train(), (partial(method, chunk()) for chunks in steps for chunk in chunks))
         for module in method.modules():
             if isinstance(module, Momentum):
                 module.restart()
     if isinstance(run.method, SupervisedConfig) and run.method.heads_from == "probe":
         assert isinstance(method, Supervised)
-        fit_heads(method, run, pack, rows)
+        fit_heads(method, run, setup.pack, setup.rows)
 
 
 @torch.no_grad()

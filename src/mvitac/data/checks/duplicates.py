@@ -50,7 +50,6 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     frames without contact.
     """
     sides = sides_of(pack.column("split").astype(str))
-    sensors = pack.column("sensor").astype(str) if "sensor" in pack.table.column_names else np.full(pack.num, "")
     groups = pack.column("group").astype(str)
     notes, rows, suspicious, compared = [], [], False, False
     for name, one in looks.items():
@@ -58,7 +57,7 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         if not held_out.any() or not (one.has & ~held_out).any():
             notes.append(f"{name}: all in one split")
             continue
-        unit, clear = residuals(one, sensors)
+        unit, clear = residuals(one, pack.sensors)
         asked = _some(np.flatnonzero(clear & (sides != "train")), MAX_ASKED)
         bank = _some(np.flatnonzero(clear & (sides == "train")), MAX_SEARCHED)
         if not len(asked) or not len(bank):

@@ -129,8 +129,7 @@ def examine_source(
     """
     thumbnails = ThumbnailSource(source, num)
     with tempfile.TemporaryDirectory(prefix="mvitac-check-") as folder:
-        options: dict[str, Any] = {"size": size, "workers": workers, "quiet": quiet}
-        pack = build(thumbnails, Path(folder) / "pack", max_damaged=1.0, **options)
+        pack = build(thumbnails, Path(folder) / "pack", size=size, workers=workers, max_damaged=1.0, quiet=quiet)
         partly = len(thumbnails.items()) < len(source.items())
         findings = examine(pack, thumbnails.expected(), part=partly, window=window)
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"

@@ -77,10 +77,9 @@ def class_balance(pack: Pack) -> list[Finding]:
     """Find classes that are missing in train or test, and the accuracy of a constant answer, per task."""
     findings = []
     for task in pack.spec.tasks:
-        labels = pack.column(f"label_{task.name}").astype(int)
         counts = {}
         for side, splits in (("train", ("train", "val")), ("test", ("test",))):
-            found = labels[pack.rows(*splits, only=task.only, by=task.split)]
+            found = pack.labels(task.name, *splits)
             counts[side] = np.bincount(found[found >= 0], minlength=len(task.classes))
         item = f"classes of {task.name}"
         if not counts["train"].sum() or not counts["test"].sum():
@@ -179,7 +178,12 @@ def mixture(pack: Pack) -> Finding:
         if alone := sorted(on["test"] - on["train"]):
             verdict = "look"
             notes.append(f"{column} {some(alone)} only in test")
-        if told := _predicted_tasks(pack, column, values):
+        told = []
+        for task in pack.spec.tasks:
+            labels = pack.labels(task.name, "train", "val", "test")
+            counted = (labels >= 0) & (values != "None")
+            told += _predicts(f"{column} alone", task.name, values[counted], labels[counted])
+        if told:
             verdict = "look"
             notes += told
     if not columns:
@@ -192,27 +196,15 @@ def mixture(pack: Pack) -> Finding:
     return Finding("sensors and resolutions", verdict, "; ".join(notes), advice)
 
 
-def _predicted_tasks(pack: Pack, column: str, values: np.ndarray) -> list[str]:
-    """Return a note for each task that the values of ``column`` predict better than the majority class."""
-    notes = []
-    for task in pack.spec.tasks:
-        rows = pack.rows("train", "val", "test", only=task.only, by=task.split)
-        labels = pack.column(f"label_{task.name}").astype(int)[rows]
-        counted = (labels >= 0) & (values[rows] != "None")
-        mine, labels = values[rows][counted], labels[counted]
-        if not len(labels):
-            continue
-        majority, told = np.bincount(labels).max() / len(labels), _accuracy(mine, labels)
-        if told > majority + 0.1:
-            notes.append(
-                f"{column} alone predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
-            )
-    return notes
-
-
-def _accuracy(values: np.ndarray, labels: np.ndarray) -> float:
-    """Return the accuracy of answering the most frequent label of each value."""
-    return sum(np.bincount(labels[values == one]).max() for one in np.unique(values)) / len(labels)
+def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> list[str]:
+    """Return a note if answering the most frequent label of each value is better than the majority class."""
+    if not len(labels):
+        return []
+    majority = np.bincount(labels).max() / len(labels)
+    told = sum(np.bincount(labels[values == one]).max() for one in np.unique(values)) / len(labels)
+    if told <= majority + 0.1:
+        return []
+    return [f"{what} predicts {task} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"]
 
 
 def numbers(pack: Pack) -> Finding:
@@ -255,12 +247,10 @@ def give_aways(pack: Pack) -> Finding:
     notes = []
     known = {column for columns in pack.spec.controls.values() for column in columns}
     for task in pack.spec.tasks:
-        rows = pack.rows("train", "val", only=task.only, by=task.split)
-        labels = pack.column(f"label_{task.name}").astype(int)[rows]
-        rows, labels = rows[labels >= 0], labels[labels >= 0]
+        labels = pack.labels(task.name, "train", "val")
+        rows, labels = np.flatnonzero(labels >= 0), labels[labels >= 0]
         if len(rows) < 64:
             continue
-        majority = np.bincount(labels).max() / len(labels)
         for name, values in numeric_columns(pack):
             if name in known:
                 continue
@@ -268,11 +258,7 @@ def give_aways(pack: Pack) -> Finding:
             if not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
                 continue
             part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
-            told = _accuracy(part, labels)
-            if told > majority + 0.1:
-                notes.append(
-                    f"{name} predicts {task.name} with {100 * told:.0f} % accuracy (majority {100 * majority:.0f} %)"
-                )
+            notes += _predicts(name, task.name, part, labels)
     advice = "report them with every score as a control (--data.controls name=column)" if notes else ""
     evidence = "; ".join(notes) or "no column of numbers does"
     return Finding("columns that give a label away", "look" if notes else "ok", evidence, advice)

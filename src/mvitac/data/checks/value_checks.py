@@ -73,7 +73,7 @@ def _recordings(pack: Pack, window: Window) -> list[np.ndarray]:
 
 def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
     """The column's name says another unit, angles in rad are too large, or one group has another scale."""
-    notes, rows = [], []
+    notes = []
     ending = re.search(r"_([A-Za-z]+)$", target.name)
     named = next((unit for unit in UNITS if ending and unit.lower() == ending[1].lower()), None)
     if named and target.unit in UNITS and target.unit.lower() != named.lower():
@@ -91,7 +91,7 @@ def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
     ):
         times = sizes[np.isin(names, odd)][0] / usual
         notes.append(f"values of {some(odd.tolist())} are about {times:.2g} times those of other groups")
-    return "; ".join(notes), rows
+    return "; ".join(notes), []
 
 
 def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:

@@ -97,16 +97,10 @@ def backgrounds_from_rows(
 
 
 def check_present(
-    manifest: Manifest,
-    refs: Refs,
-    vision: str | None,
-    touch: Sequence[str],
-    numbers: Sequence[int],
-    allow_missing: bool,
+    manifest: Manifest, refs: Refs, by_modality: dict[str, Sequence[str]], numbers: Sequence[int], allow_missing: bool
 ) -> dict[str, list[bool]]:
     """Return, for each modality that some rows lack, which rows lack it; ValueError unless ``allow_missing``."""
     missing: dict[str, list[bool]] = {}
-    by_modality = {"vision": [vision] if vision else [], "touch": touch}
     for modality, columns in by_modality.items():
         gaps = [[refs[c][i] is None for c in columns] for i in range(len(numbers))]
         for number, gap in zip(numbers, gaps, strict=True):

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from mvitac.data.source import Lost, Sample, Source, one_stamp
-from mvitac.data.spec import DataSpec, Task, ValueTask
+from mvitac.data.spec import DataSpec
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.table.columns import (
     Grouping,
@@ -191,8 +191,8 @@ class Rows(Source):
         _check_columns(config, manifest, [*label_columns, *targets, self._group, self._split, self._sensor])
 
         selected = self._select(manifest)
-        columns = (self._vision, self._touch, selected.numbers)
-        missing = check_present(manifest, selected.refs, *columns, config.allow_missing)
+        asked = {"vision": [self._vision] if self._vision else [], "touch": self._touch}
+        missing = check_present(manifest, selected.refs, asked, selected.numbers, config.allow_missing)
         self._sizes, stamps = check_files(manifest, selected.refs, selected.backgrounds, selected.numbers)
 
         grouping = self._grouping(selected)
@@ -215,29 +215,18 @@ class Rows(Source):
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
         used = [[ref for i in item for ref in self._rows[i].refs()] for item in self._items]
         self._stamps = [one_stamp((*stamps[ref.path], *ref.within()) for ref in refs) for refs in used]
-        tasks_with_classes = tuple(task for task, _ in read)
-        self._spec = self._describe(tasks_with_classes, tuple(value_tasks), grouping.group_by, controls)
-
-    def _describe(
-        self,
-        tasks: tuple[Task, ...],
-        values: tuple[ValueTask, ...],
-        group_by: str,
-        controls: dict[str, tuple[str, ...]],
-    ) -> DataSpec:
-        by_video = group_by == "video"
-        return DataSpec(
+        self._spec = DataSpec(
             name=self._title,
             vision_channels=3 if self._vision else 0,
             touch_channels=3 * len(self._touch),
-            tasks=tasks,
-            values=values,
-            group_by=group_by,
+            tasks=tuple(task for task, _ in read),
+            values=tuple(value_tasks),
+            group_by=grouping.group_by,
             controls=controls,
-            licence=self._config.licence,
-            source=self._config.source_url or "not given",
-            notes=("no column says the groups, so frames of one video are one group",) if by_video else (),
-            difference=self._config.difference,
+            licence=config.licence,
+            source=config.source_url or "not given",
+            notes=("no column says the groups, so frames of one video are one group",) * (grouping.group_by == "video"),
+            difference=config.difference,
         )
 
     def _select(self, manifest: Manifest) -> Selection:

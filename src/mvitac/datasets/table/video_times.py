@@ -1,23 +1,10 @@
-"""Frame counts and times of a video, read without decoding it."""
+"""Times of a video's frames, read without decoding it."""
 
 from pathlib import Path
 
 import av
 import av.error
 import numpy as np
-from av.packet import Packet
-
-
-def num_frames(path: Path) -> int:
-    """Return the number of displayed frames; ValueError if ``path`` is not a video or has none."""
-    try:
-        with av.open(str(path)) as container:
-            num = sum(map(_is_shown, container.demux(video=0)))
-    except (av.error.FFmpegError, IndexError, OSError) as error:
-        raise ValueError(f"{path} cannot be read as a video ({error}): fetch it again") from None
-    if not num:
-        raise ValueError(f"{path} holds no frames: fetch it again")
-    return num
 
 
 def spread(num: int, length: int, start: float = 0.0, end: float = 1.0) -> list[int]:
@@ -31,15 +18,11 @@ def timestamps(path: Path) -> np.ndarray:
     try:
         with av.open(str(path)) as container:
             base = float(container.streams.video[0].time_base or 0)
-            times = [packet.pts for packet in container.demux(video=0) if _is_shown(packet) and packet.pts is not None]
+            # Frames cut off by an edit list are left out: neither a player nor ``mvitac.data.video`` counts them.
+            packets = [p for p in container.demux(video=0) if p.size and not p.is_discard and p.pts is not None]
     except (av.error.FFmpegError, IndexError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a video ({error}): fetch it again") from None
-    return np.sort(np.array(times, float)) * base
-
-
-def _is_shown(packet: Packet) -> bool:
-    """Return False for frames cut off by an edit list: neither a player nor ``mvitac.data.video`` counts them."""
-    return packet.size > 0 and not packet.is_discard
+    return np.sort(np.array([packet.pts for packet in packets], float)) * base
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

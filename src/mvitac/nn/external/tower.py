@@ -18,7 +18,7 @@ from timm.models.vision_transformer import Block
 from torch import Tensor, nn
 
 from mvitac.nn.external.base import Adapter
-from mvitac.nn.weights import read_safetensors
+from mvitac.nn.weights import misfit, read_safetensors
 from mvitac.system.files import brief
 
 Tensors = dict[str, Tensor]
@@ -64,12 +64,8 @@ def shape(adapter: Adapter, tensors: Tensors, name: str, dims: int) -> tuple[int
 
 def fill(adapter: Adapter, network: nn.Module, tensors: Tensors) -> nn.Module:
     """``network`` with exactly ``tensors`` as its weights; refused if names or shapes differ."""
-    expected = network.state_dict()
-    for name in sorted(expected.keys() ^ tensors.keys()):
-        raise adapter.refuse(f"tensor {name!r} {'is missing' if name in expected else 'does not belong'}")
-    for name, tensor in expected.items():
-        if tensor.shape != tensors[name].shape:
-            raise adapter.refuse(f"{name!r} is {list(tensors[name].shape)}, expected {list(tensor.shape)}")
+    if why := misfit(network.state_dict(), tensors):
+        raise adapter.refuse(why)
     network.load_state_dict(tensors)
     return network
 
