@@ -118,6 +118,8 @@ def test_runs_without_a_list_are_compared_by_their_pack_or_unknown(
     result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False), turned)
     assert {r["leak"] for r in result["records"]} == {"unknown"} and "unknown" in result["leaks"][0]
     assert with_interval(0.5, 0.4, 0.6, "unknown") == "50.0 [40.0, 60.0] LEAK?"
+    assert with_interval(-0.2, None, 0.9) == "-20.0 [-inf, 90.0]"  # R2 that is not known to any lower end
+    assert with_interval(0.5, None, 1.0) == "50.0"  # one test group: no interval
 
 
 def test_a_damaged_list_is_told(run: Path, pack: Pack, capsys: pytest.CaptureFixture[str]) -> None:

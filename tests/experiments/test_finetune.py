@@ -169,7 +169,7 @@ def refuse(capsys: pytest.CaptureFixture[str], command: list[str], *words: str) 
 
 
 def test_bad_input_is_refused_before_anything_is_written(
-    ancestor: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ancestor: Path, pack: Pack, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, run = tmp_path / "out", str(ancestor)
 
@@ -180,6 +180,7 @@ def test_bad_input_is_refused_before_anything_is_written(
     refuse(capsys, command(pack.path)[:1] + command(pack.path)[2:], "name the model")
     refuse(capsys, command(pack.path, "--labels", "x"), "unknown task 'x': choose from pattern, bright")
     refuse(capsys, command(pack.path, "--values", "force"), "unknown task 'force'")
+    refuse(capsys, command(bare.path, "--labels", "x"), "has no labels and no values", "--data.labels")
     refuse(capsys, command(pack.path, "--lr", "1e-3", "1e-3"), "at least one number, and none twice")
     refuse(capsys, command(pack.path, "--fractions", "0"), "in percent, above 0")
     refuse(capsys, command(pack.path, "--rank", "0"), "rank 0: give 1 to 65536")
@@ -284,12 +285,13 @@ def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tm
 def test_unlabelled_data_is_scored_by_retrieval(
     ancestor: Path, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 0 --batches 2 --quiet".split()
+    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 0 --batches 2".split()
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     records = json.loads((tmp_path / "out" / "adapted.json").read_text())["records"]
     assert {(r["data"], r["task"]) for r in records if r["data"] == NEW} == {(NEW, "R@5")}
     assert {r["data"] for r in records} == {NEW, OLD}
     said = capsys.readouterr().out
+    assert "scoring before and after: 4 parts" in said
     assert "new data: test instances" in said and "R@5, vision" in said and "pattern, both" in said
 
 
@@ -302,7 +304,7 @@ def test_bad_input_of_adapt(ancestor: Path, pack: Pack, tmp_path: Path, capsys: 
     six = toy_pack(tmp_path / "six", touch_channels=6)
     refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
     single = toy_pack(tmp_path / "single", vision_channels=0)
-    refuse(capsys, command(single.path), "cannot embed this data's vision (0 channels)")
+    refuse(capsys, command(single.path), "the data has no vision", "--init.modalities touch --renew-norms 16`")
     refuse(capsys, command(pack.path, "--steps", "0", "--batches", "0"), "steps 0: give at least 1")
     refuse(capsys, command(pack.path, "--lr", "0"), "optim lr 0")
     refuse(capsys, command(pack.path, "--old", str(tmp_path / "none")), "no pack at")

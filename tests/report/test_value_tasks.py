@@ -142,6 +142,7 @@ def test_one_test_group_of_values_alone(tmp_path: Path) -> None:
     best = result["summary"]["light"]["touch"]["mvitac"]["mean"]
     assert f"Touch reaches R2 {100 * best:.1f} % on light" in page
     assert "balanced accuracy" not in page and "Confusion" not in page
+    assert re.search(r"\d test rows by level; features of run", page)
     rows = csv.reader(io.StringIO(table_formats.comma(compared(stored))))
     assert not any(value in ("inf", "-inf", "nan") for row in rows for value in row)
     table_formats.figure(compared(stored), lines_of(compared(stored)))

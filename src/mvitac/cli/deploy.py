@@ -94,7 +94,7 @@ def export(argv: list[str]) -> None:
     given = {name: getattr(options, name) for name in names}
     config = exports.ExportConfig(**given, modalities=None if options.modality == "both" else (options.modality,))
     model = load(options.model)
-    pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
+    pack = Pack(options.on) if options.on else own_data(model, "check the export on a pack, --on PACK")
     pack = as_trained(model, pack)
     with shown(Console(stderr=True)):
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None

@@ -152,6 +152,8 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
 
 def own_data(model: Model, instead: str) -> Pack:
     """The data ``model`` was trained on; the ValueError where it is missing ends with ``instead``, what to do."""
+    if model.foreign and model.run.data.names_a_place:
+        raise ValueError(f"the data of an artifact is not opened, as the artifact may be a stranger's: {instead}")
     try:
         return model.open_data()
     except ValueError as error:
@@ -193,7 +195,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
     with new_folder(out) as partial:
         model = load(run)
         _, record = load_run(run)
-        pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on another pack, --on PACK")
+        pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on a pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         _write_weights(model, partial)
         write_json(partial / "run.json", record, sealed=True)

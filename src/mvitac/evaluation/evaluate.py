@@ -302,7 +302,10 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
             raise unknown("task with classes", name, [task.name for task in pack.spec.tasks])
         known[name] = with_event(task, session.event_of(happens))
     if not known:
-        raise ValueError(f"dataset {pack.spec.name!r} has no labels and no values: nothing to probe")
+        raise ValueError(
+            f"dataset {pack.spec.name!r} has no labels and no values: name columns with --labels or --values of `mvitac"
+            " data pack`, or with --data.labels or --data.values"
+        )
     for name in session.tasks:
         if name not in known:
             raise unknown("task", name, known)
