@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import json
 from dataclasses import replace
@@ -19,7 +20,7 @@ from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import interval, paired_difference, pool
@@ -222,6 +223,13 @@ def test_a_cached_pack_from_before_values_gets_them_from_its_reader(
     (force,) = new.spec.values
     assert force.targets == NEWTON
     assert np.array_equal(new.values(force)[:, 0], old.column("force_n"))
+
+
+def test_data_without_labels_and_values_says_where_they_are_named(measured: Pack) -> None:
+    bare = copy.copy(measured)
+    bare.spec = replace(measured.spec, tasks=(), values=())
+    with pytest.raises(ValueError, match=r"no labels and no values: .* with --data\.labels or --data\.values"):
+        chosen(bare, ProbeConfig())
 
 
 def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:

@@ -169,7 +169,7 @@ def refuse(capsys: pytest.CaptureFixture[str], command: list[str], *words: str) 
 
 
 def test_bad_input_is_refused_before_anything_is_written(
-    ancestor: Path, pack: Pack, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ancestor: Path, pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, run = tmp_path / "out", str(ancestor)
 
@@ -180,7 +180,6 @@ def test_bad_input_is_refused_before_anything_is_written(
     refuse(capsys, command(pack.path)[:1] + command(pack.path)[2:], "name the model")
     refuse(capsys, command(pack.path, "--labels", "x"), "unknown task 'x': choose from pattern, bright")
     refuse(capsys, command(pack.path, "--values", "force"), "unknown task 'force'")
-    refuse(capsys, command(bare.path, "--labels", "x"), "has no labels and no values", "--data.labels")
     refuse(capsys, command(pack.path, "--lr", "1e-3", "1e-3"), "at least one number, and none twice")
     refuse(capsys, command(pack.path, "--fractions", "0"), "in percent, above 0")
     refuse(capsys, command(pack.path, "--rank", "0"), "rank 0: give 1 to 65536")

@@ -9,6 +9,7 @@ from typing import Any
 
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import number_hint
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
@@ -260,8 +261,9 @@ def check_unseen(
         refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
+                hint = next(filter(None, (number_hint(source.name, pack) for source in refused)), "")
                 raise ValueError(
-                    f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}; give a pack whose test"
+                    f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}{hint}; give a pack whose test"
                     " groups it was not trained on, or --allow-leak to score it with LEAK beside every score"
                 )
     return sources
