@@ -244,7 +244,7 @@ def test_a_probe_scores_the_event_of_runs_and_controls(grips: Pack, scored: tupl
 
 def test_the_report_draws_scores_over_time(grips: Pack, scored: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     out, _ = scored
-    probe_runs([out], ProbeConfig(event=("slip=slips",), fps=25, controls=False))  # the report probes again, with controls
+    probe_runs([out], ProbeConfig(event=("slip=slips",), fps=25, controls=False))  # so the report probes again
     page = write_report([out], tmp_path, quiet=True).read_text()
     assert "Events over time" in page and "slip: slips as an event (3 recordings with it, 3 without)" in page
     assert (tmp_path / "figures" / "event-slip.png").stat().st_size > 5000

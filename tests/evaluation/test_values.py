@@ -200,7 +200,7 @@ def test_a_column_that_never_changes_cannot_be_predicted(tmp_path: Path) -> None
 def test_a_name_is_one_task_and_a_column_has_one_unit() -> None:
     kept = {"name": "d", "vision_channels": 0, "touch_channels": 3, "group_by": "g", "licence": "", "source": ""}
     task = Task(name="force_n", classes=("a", "b"))
-    with pytest.raises(ValueError, match="'force_n' occurs twice.*--values NAME=column:unit"):
+    with pytest.raises(ValueError, match=r"'force_n' occurs twice.*--values NAME=column:unit"):
         FolderConfig(labels=("force_n",), values=("force_n:N",))  # before a split is looked for that suits its classes
     with pytest.raises(ValueError, match="'force_n' occurs twice"):
         DataSpec(tasks=(task,), values=(ValueTask(name="force_n", targets=NEWTON),), **kept)

@@ -303,7 +303,12 @@ def test_bad_input_of_adapt(ancestor: Path, pack: Pack, tmp_path: Path, capsys: 
     six = toy_pack(tmp_path / "six", touch_channels=6)
     refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
     single = toy_pack(tmp_path / "single", vision_channels=0)
-    refuse(capsys, command(single.path), "the data has no vision", "--init.modalities touch --renew-norms 16`")
+    refuse(
+        capsys,
+        command(single.path),
+        "trained with vision, which the data lacks",
+        "--init.modalities touch --renew-norms 16`",
+    )
     refuse(capsys, command(pack.path, "--steps", "0", "--batches", "0"), "steps 0: give at least 1")
     refuse(capsys, command(pack.path, "--lr", "0"), "optim lr 0")
     refuse(capsys, command(pack.path, "--old", str(tmp_path / "none")), "no pack at")

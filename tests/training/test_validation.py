@@ -130,7 +130,8 @@ def test_better_level_or_worse_is_a_paired_t_interval_over_groups() -> None:
         assert said.startswith(f"compared with the start, the features are {word}: {gain:+.1f} points")
         assert f"[{100 * low:+.1f}, {100 * high:+.1f}] (linear probe on 6 objects of val, mean of touch/a)" in said
     assert verdict({}, {}, "object").startswith("no labels of two classes, and no values, in split val")
-    assert verdict(*[{"touch/linear a": cell([5])}] * 2, "object").startswith("one labelled object in split val: nothing says")
+    one = {"touch/linear a": cell([5])}
+    assert verdict(one, one, "object").startswith("one labelled object in split val: nothing says")
 
 
 def test_values_have_r2(measured: Pack) -> None:

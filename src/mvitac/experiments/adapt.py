@@ -71,8 +71,8 @@ def adapt(
     check_out(out, resume)
     model, pack = load(ancestor), data.open(quiet=quiet)
     if lacking := [m for m in model.encoders if m not in pack.spec.modalities]:
-        one = f"--init {ancestor} --init.modalities {' '.join(pack.spec.modalities)} --renew-norms 16"
-        raise ValueError(f"the data has no {lacking[0]}, {ancestor} was trained with it: `mvitac pretrain {one}` instead")
+        one = f"mvitac pretrain --init {ancestor} --init.modalities {' '.join(pack.spec.modalities)} --renew-norms 16"
+        raise ValueError(f"{ancestor} was trained with {lacking[0]}, which the data lacks: use `{one}` instead")
     check_channels(ancestor, model, pack, tuple(model.encoders))
     packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
     sources = {  # refuses leaks before anything is trained

@@ -184,7 +184,7 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     advice = []
     apart = np.median(place[index[whole, 0]] - place[index[whole, min(1, window.frames - 1)]])
     if apart > 1.25 * window.stride:
-        evidence.append(f"two frames of a window are {apart:.3g} apart (median), as the newest that is old enough is shown")
+        evidence.append(f"frames of a window are {apart:.3g} apart (median): the newest that is old enough is shown")
         advice.append("give a stride slightly below the distance that you mean")
     if gaps:
         with_gaps = sum((step > 2.5 * rate).any() for step, rate in zip(steps, rates, strict=True))
