@@ -12,9 +12,10 @@ from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
 from mvitac.deploy.artifact import load, read_manifest
-from mvitac.deploy.publish import as_trained, own_data, with_probes
+from mvitac.deploy.publish import own_data, with_probes
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
+from mvitac.evaluation.evaluate import as_trained
 from mvitac.report.tables import print_summary
 from mvitac.system.console import Console
 from mvitac.system.progress import shown

@@ -7,10 +7,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import number_hint
 from mvitac.data.spec import AnyTask, Task, ValueTask
+from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
 from mvitac.evaluation.events import check_event, with_event
@@ -167,10 +169,16 @@ def _describe_data(pack: Pack, tasks: Sequence[AnyTask]) -> dict[str, Any]:
     }
 
 
+def as_trained(model: Model, pack: Pack) -> Pack:
+    """``pack`` with the windows that ``model`` was trained on, if it shows single frames and is not joined."""
+    known = pack.spec.window.active or isinstance(pack, JoinedPack)
+    return pack if known else windowed(pack, model.spec.window)
+
+
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
     """``pack``, or the data that all of ``models`` were trained on."""
     if pack:
-        return pack
+        return as_trained(models[0], pack) if models else pack
     packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError("these runs were trained on different data: probe them one by one, or on one pack with --on")
