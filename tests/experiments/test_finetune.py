@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from rich.console import Console
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -18,6 +20,7 @@ from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import NEW, OLD, TRANSFER, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
 from mvitac.model_files import load
+from mvitac.report.tables import print_finetuning
 from mvitac.run import load_run
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
@@ -83,6 +86,17 @@ def test_the_command_continues_a_finished_one_and_prints_one_table(
     assert "40 % of instances" in said and "100 % of instances" in said and f"mvitac publish {tuned / 'seed0'}" in said
     numbers = {name: float(cells[1].split()[0]) for name, cells in rows.items()}
     assert numbers[gains[0]] == pytest.approx(numbers["fine-tuned, all"] - numbers[SCRATCH], abs=0.11)
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_loss_against_the_frozen_probe_is_said_with_what_to_do(lost: bool) -> None:
+    known = {"seed": 0, "fraction": 100.0, "task": "t", "modality": "touch", "group_sizes": [9] * 6}
+    low, high = {**known, "group_correct": [2, 3, 2, 1, 2, 3]}, {**known, "group_correct": [8, 7, 8, 9, 8, 7]}
+    ours, frozen = (low, high) if lost else (high, low)
+    records = [{**ours, "source": "fine-tuned, all"}, {**frozen, "source": FROZEN}]
+    result = {"data": "d", "group_by": "object", "ancestor": "runs/a", "records": records, "notes": [], "leaks": []}
+    print_finetuning(result, Console(file=(file := io.StringIO()), width=120, markup=False))
+    assert ("use the frozen probe of runs/a instead, with `mvitac publish --on PACK`" in file.getvalue()) == lost
 
 
 def tried_in(folder: Path) -> dict[str, float]:
