@@ -153,11 +153,12 @@ def test_every_owners_checkpoint_gives_features_of_a_pack(
     assert len(model.notes) == (wanted.frames > 1 and not wanted.still) + (wanted.offset is not None)
 
 
-def onnx_mean(path: Path, side: int | str = 16) -> Path:
+def onnx_mean(path: Path, side: int | str = 16, batch: int | str = "n", channels: int = 3) -> Path:
     """A network that gives the mean of each channel."""
     value = helper.make_tensor_value_info
     nodes = [helper.make_node("GlobalAveragePool", ["x"], ["y"]), helper.make_node("Flatten", ["y"], ["z"])]
-    ends = [value("x", TensorProto.FLOAT, ["n", 3, side, side])], [value("z", TensorProto.FLOAT, ["n", 3])]
+    ends: Any = [value("x", TensorProto.FLOAT, [batch, channels, side, side])]
+    ends = ends, [value("z", TensorProto.FLOAT, [batch, channels])]
     made = helper.make_model(helper.make_graph(nodes, "mean", *ends), opset_imports=[helper.make_opsetid("", 13)])
     made.ir_version = 8
     onnx.save(made, path)
@@ -180,7 +181,7 @@ class Net(nn.Module):
         return self.conv(x)
 
 def good():
-    return Net(), {"size": (16, 16), "licence": "MIT", "title": "net", "trained_on": "ours"}
+    return Net(), {"size": 16, "licence": "MIT", "title": "net", "trained_on": "ours"}
 
 def nan():
     net = Net()
@@ -207,6 +208,11 @@ def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypat
     found = load_external("external:mean.onnx,mean=none,std=none").on(pack)[0]
     torch.testing.assert_close(found.features("touch", images), plain.mean((2, 3)))
     assert found.parts["touch"].encoder.preprocessing.size == (32, 32) and found.untrained() is None
+    onnx_mean(tmp_path / "one.onnx", 32, batch=1)
+    single = load_external("external:one.onnx,mean=none,std=none").on(pack)[0]
+    torch.testing.assert_close(single.features("touch", images), plain.mean((2, 3)))
+    with pytest.raises(ValueError, match="it takes 1 channels, the images have 3"):
+        load_external(f"external:{onnx_mean(tmp_path / 'gray.onnx', 32, channels=1).name}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch.jit is deprecated
         torch.jit.script(Means()).save("mean.ts")

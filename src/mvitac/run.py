@@ -218,6 +218,11 @@ class Run:
             raise ValueError(
                 "independent_sensors would move the frames of a window apart: leave it out, or give frames 1"
             )
+        if self.encoder.temporal != "stack" and spec.window.frames == 1:
+            raise ValueError(
+                f"encoder.temporal {self.encoder.temporal} has no effect on single images: give --data.num-frames 2 or"
+                " more, or leave it out"
+            )
         if self.method.needs_vit:
             check_vit(self.encoder, self.method.name, self.augment.size)
         if self.precision == "bf16" and self.device.startswith("mps"):

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from mvitac.bench import score, suite
-from mvitac.bench.board import gather, order_of, write_board
+from mvitac.bench.board import _page, gather, order_of, write_board
 from mvitac.bench.encoder import About, describe, run_bench
 from mvitac.bench.result import FORMAT, VOLATILE, problems, read_result, records_of, write_result
 from mvitac.bench.score import Reader, misfit
@@ -199,7 +199,9 @@ def test_folds_test_every_group_once(root: Path, results: list[Path]) -> None:
         open_set(replace(find_suite(str(root / "toys.toml")).sets[1], folds=61), root)
 
 
-def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(results: list[Path], tmp_path: Path) -> None:
+def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(
+    results: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The run learned from the train split, whose groups the folds test."""
     read = {r["encoder"]["name"]: r for r in map(read_result, results)}
     blocks = next(iter(read.values()))["blocks"]
@@ -210,6 +212,8 @@ def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(results: lis
     assert text["folded: pattern (copy)"].endswith(f"not ordered because of LEAK: {leaked}")
     assert leaked in text["stripes: light"] and "LEAK" not in text["stripes: light"]
     page = write_board(results, tmp_path / "board.html").read_text()
+    monkeypatch.setattr("mvitac.bench.board._by_labels", lambda board: iter(()))
+    assert "Score against labels" in page and "Score against labels" not in _page(board)  # no empty section
     assert "LEAK: 72 of 120 test rows" in page and " LEAK</td>" in page.replace("&nbsp;", " ")
     assert "none found" in page and clean in page
 

@@ -295,6 +295,11 @@ VALUES: list[tuple[str, str, list[str]]] = [
     ("too-long", WINDOWS + "9 --data.order seq", ["frames 9 at stride 1", "longer than every touch", "fewer frames"]),
     ("two-rates", WINDOWS + "2 --data.order time", ["stride 1 is shorter", "'slow', 4", "longest distance"]),
     ("same-moment", WINDOWS + "2 --data.order still", ["two rows of touch", "have still 1", "--touch-group"]),
+    (
+        "temporal-of-one",
+        PRETRAIN + "--encoder.temporal mean",
+        ["encoder.temporal mean has no effect", "--data.num-frames"],
+    ),
     ("endless-stride", WINDOWS + "2 --data.stride inf", ["stride inf", "positive number"]),
 ]
 

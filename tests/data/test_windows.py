@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
@@ -147,6 +148,13 @@ def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, tempo
     assert model.spec.frames("touch") == 2 and model.spec.frames("vision") == 1
     result = probe_runs([out], ProbeConfig(controls=False))
     assert {record["modality"] for record in result["records"]} == {"touch", "vision", "both"}
+    on = probe_runs(
+        [out], ProbeConfig(controls=False), Pack(presses.path), allow_leak=True
+    )  # as --on: windows of the run
+    assert on["pack"] == result["pack"] and on["records"] == result["records"]
+    embedded = tmp_path / "touch.npz"
+    assert main(["embed", str(presses.path), "--model", str(out), "--out", str(embedded)]) == 0
+    assert np.load(embedded)["touch"].shape == (presses.num, model.encoders["touch"].num_features)
     assert not isinstance(model.encoders["vision"], PerFrame)
     assert isinstance(model.encoders["touch"], PerFrame) == (temporal != "stack")
 

@@ -15,6 +15,7 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import number_hint
 from mvitac.data.source import Sample
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
@@ -57,6 +58,7 @@ def test_scores_of_rows_that_were_trained_on_are_refused(
     assert main(["probe", str(run), "--on", str(turned.path), "--json", str(tmp_path / "x.json")]) == 2
     error = capsys.readouterr().err
     assert ALL in error and "--allow-leak" in error and "'pattern'" in error and error.count("\n") == 1
+    assert "compared by number: if these are other data than 'toy', pack with another --title" in error
     assert not (run / "probe.json").exists() and not (tmp_path / "x.json").exists()
     assert main(["publish", str(run), str(tmp_path / "art"), "--on", str(turned.path)]) == 2
     assert ALL in capsys.readouterr().err and not (tmp_path / "art").exists()
@@ -119,6 +121,8 @@ def test_runs_without_a_list_are_compared_by_their_pack_or_unknown(
     result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False), turned)
     assert {r["leak"] for r in result["records"]} == {"unknown"} and "unknown" in result["leaks"][0]
     assert with_interval(0.5, 0.4, 0.6, "unknown") == "50.0 [40.0, 60.0] LEAK?"
+    assert with_interval(-0.2, None, 0.9) == "-20.0 [-inf, 90.0]"  # R2 that is not known to any lower end
+    assert with_interval(0.5, None, 1.0) == "50.0"  # one test group: no interval
 
 
 def test_a_damaged_list_is_told(run: Path, pack: Pack, capsys: pytest.CaptureFixture[str]) -> None:
@@ -153,6 +157,7 @@ def test_numbers_mean_nothing_outside_their_dataset(pack: Pack) -> None:
     elsewhere.spec = replace(pack.spec, name="other")
     leak = Scored(elsewhere).leak([source_of(pack, pack.rows("train"))], pack.rows("train"))
     assert leak.startswith(f"0 of {len(pack.rows('train'))} test rows and ")
+    assert number_hint("toy", pack) and not number_hint("toy", elsewhere)
     again = Pack(pack.path)
     again.spec = replace(pack.spec, name="toy (another split)")
     assert Scored(again).leak([source_of(pack, pack.rows("train"))], pack.rows("train")).startswith("72 of 72 test")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import json
 from dataclasses import replace
@@ -19,7 +20,7 @@ from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
 from mvitac.evaluation.scores import interval, paired_difference, pool
@@ -199,6 +200,8 @@ def test_a_column_that_never_changes_cannot_be_predicted(tmp_path: Path) -> None
 def test_a_name_is_one_task_and_a_column_has_one_unit() -> None:
     kept = {"name": "d", "vision_channels": 0, "touch_channels": 3, "group_by": "g", "licence": "", "source": ""}
     task = Task(name="force_n", classes=("a", "b"))
+    with pytest.raises(ValueError, match=r"'force_n' occurs twice.*--values NAME=column:unit"):
+        FolderConfig(labels=("force_n",), values=("force_n:N",))  # before a split is looked for that suits its classes
     with pytest.raises(ValueError, match="'force_n' occurs twice"):
         DataSpec(tasks=(task,), values=(ValueTask(name="force_n", targets=NEWTON),), **kept)
     other = ValueTask(name="weight", targets=(Target(name="force_n", unit="mN"),))
@@ -220,6 +223,13 @@ def test_a_cached_pack_from_before_values_gets_them_from_its_reader(
     (force,) = new.spec.values
     assert force.targets == NEWTON
     assert np.array_equal(new.values(force)[:, 0], old.column("force_n"))
+
+
+def test_data_without_labels_and_values_says_where_they_are_named(measured: Pack) -> None:
+    bare = copy.copy(measured)
+    bare.spec = replace(measured.spec, tasks=(), values=())
+    with pytest.raises(ValueError, match=r"no labels and no values: .* with --data\.labels or --data\.values"):
+        chosen(bare, ProbeConfig())
 
 
 def test_packs_with_other_units_cannot_be_joined(measured: Pack) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from rich.console import Console
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -18,6 +20,7 @@ from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import NEW, OLD, TRANSFER, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
 from mvitac.model_files import load
+from mvitac.report.tables import print_finetuning
 from mvitac.run import load_run
 from mvitac.system.files import read_json
 from mvitac.training.loop import train
@@ -83,6 +86,17 @@ def test_the_command_continues_a_finished_one_and_prints_one_table(
     assert "40 % of instances" in said and "100 % of instances" in said and f"mvitac publish {tuned / 'seed0'}" in said
     numbers = {name: float(cells[1].split()[0]) for name, cells in rows.items()}
     assert numbers[gains[0]] == pytest.approx(numbers["fine-tuned, all"] - numbers[SCRATCH], abs=0.11)
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_loss_against_the_frozen_probe_is_said_with_what_to_do(lost: bool) -> None:
+    known = {"seed": 0, "fraction": 100.0, "task": "t", "modality": "touch", "group_sizes": [9] * 6}
+    low, high = {**known, "group_correct": [2, 3, 2, 1, 2, 3]}, {**known, "group_correct": [8, 7, 8, 9, 8, 7]}
+    ours, frozen = (low, high) if lost else (high, low)
+    records = [{**ours, "source": "fine-tuned, all"}, {**frozen, "source": FROZEN}]
+    result = {"data": "d", "group_by": "object", "ancestor": "runs/a", "records": records, "notes": [], "leaks": []}
+    print_finetuning(result, Console(file=(file := io.StringIO()), width=120, markup=False))
+    assert ("use the frozen probe of runs/a instead, with `mvitac publish --on PACK`" in file.getvalue()) == lost
 
 
 def tried_in(folder: Path) -> dict[str, float]:
@@ -284,12 +298,13 @@ def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tm
 def test_unlabelled_data_is_scored_by_retrieval(
     ancestor: Path, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 0 --batches 2 --quiet".split()
+    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 0 --batches 2".split()
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     records = json.loads((tmp_path / "out" / "adapted.json").read_text())["records"]
     assert {(r["data"], r["task"]) for r in records if r["data"] == NEW} == {(NEW, "R@5")}
     assert {r["data"] for r in records} == {NEW, OLD}
     said = capsys.readouterr().out
+    assert "scoring before and after: 4 parts" in said
     assert "new data: test instances" in said and "R@5, vision" in said and "pattern, both" in said
 
 
@@ -302,7 +317,12 @@ def test_bad_input_of_adapt(ancestor: Path, pack: Pack, tmp_path: Path, capsys: 
     six = toy_pack(tmp_path / "six", touch_channels=6)
     refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
     single = toy_pack(tmp_path / "single", vision_channels=0)
-    refuse(capsys, command(single.path), "cannot embed this data's vision (0 channels)")
+    refuse(
+        capsys,
+        command(single.path),
+        "trained with vision, which the data lacks",
+        "--init.modalities touch --renew-norms 16`",
+    )
     refuse(capsys, command(pack.path, "--steps", "0", "--batches", "0"), "steps 0: give at least 1")
     refuse(capsys, command(pack.path, "--lr", "0"), "optim lr 0")
     refuse(capsys, command(pack.path, "--old", str(tmp_path / "none")), "no pack at")

@@ -310,6 +310,8 @@ def test_sources_by_name(tmp_path: Path) -> None:
     for text in ("nothing", "sim:x", f"{tmp_path}@fast"):
         with pytest.raises(ValueError, match="source"):
             source(text, "touch")
+    with pytest.raises(ValueError, match=r"'gone@10': there is no gone here; give a camera number"):
+        source("gone@10", "touch")
     missing = Stream("touch", source("97", "touch"), clock=Clock())
     missing.pump()
     assert missing.fault == "unplugged"

@@ -28,7 +28,7 @@ from mvitac.nn.initial import Init, adapt_stem, load_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.run import Run, load_run
 from mvitac.training.loop import train
-from mvitac.training.start import load_start, read_start
+from mvitac.training.start import describe, load_start, read_start
 from support.toy import Toy, toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
 
@@ -96,6 +96,9 @@ def test_a_bare_file_and_one_modality(pack: Pack, smoke_run: Path, tmp_path: Pat
         assert_equal_states(encoder, trunk)
     safetensors.torch.save_file({f"encoders.touch.{k}": v for k, v in trunk.state_dict().items()}, named)
     assert started(pack, Init(path=named))[2] == {"touch": ["trunk"]}
+    run = smoke(pack, init=Init(path=named).resolved())
+    found = load_start(read_start(run.init, pack), run.method.build(pack.spec, run.encoder))  # type: ignore[arg-type]
+    assert describe(found).endswith(": touch trunk, not vision (it has touch only)")
     safetensors.torch.save_file(state, bare)
     with pytest.raises(ValueError, match=r"'vision\.weight' has no place in this trunk"):
         started(pack, Init(path=bare))

@@ -129,7 +129,9 @@ def test_better_level_or_worse_is_a_paired_t_interval_over_groups() -> None:
         gain = 100 * (change[0] - change[1]).mean()
         assert said.startswith(f"compared with the start, the features are {word}: {gain:+.1f} points")
         assert f"[{100 * low:+.1f}, {100 * high:+.1f}] (linear probe on 6 objects of val, mean of touch/a)" in said
-    assert "nothing says" in verdict({}, {}, "object")
+    assert verdict({}, {}, "object").startswith("no labels of two classes, and no values, in split val")
+    one = {"touch/linear a": cell([5])}
+    assert verdict(one, one, "object").startswith("one labelled object in split val: nothing says")
 
 
 def test_values_have_r2(measured: Pack) -> None:

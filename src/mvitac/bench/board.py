@@ -170,12 +170,15 @@ def _page(board: Board) -> str:
         f"<ul class='chips'>{''.join(f'<li>{escape(k)} <b>{escape(v)}</b></li>' for k, v in chips)}</ul>"
     )
     orders = [[f"{row.task}, {row.modality}", order_of(row, board.encoders)] for row in board.rows]
+    drawn = (
+        ("parameters", "Score against parameters", [*_by_parameters(board)]),
+        ("labels", "Score against labels", [*_by_labels(board)]),
+    )
     sections = [
         ("scores", "Scores", _scores(board)),
         ("order", "Order", _text_table(ORDER, ["", "from best to worst"], orders)),
         ("encoders", "Encoders and leaks", _encoders(board)),
-        ("parameters", "Score against parameters", page.grid(_by_parameters(board))),
-        ("labels", "Score against labels", page.grid(_by_labels(board))),
+        *((name, title, page.grid(figures)) for name, title, figures in drawn if figures),
         ("data", "Data", _data(board)),
     ]
     return page.html_page(f"mvitac bench: {suite.name}", head, sections, FOOT)

@@ -12,9 +12,10 @@ from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
 from mvitac.deploy.artifact import load, read_manifest
-from mvitac.deploy.publish import as_trained, own_data, with_probes
+from mvitac.deploy.publish import own_data, with_probes
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
+from mvitac.evaluation.evaluate import as_trained
 from mvitac.report.tables import print_summary
 from mvitac.system.console import Console
 from mvitac.system.progress import shown
@@ -94,7 +95,7 @@ def export(argv: list[str]) -> None:
     given = {name: getattr(options, name) for name in names}
     config = exports.ExportConfig(**given, modalities=None if options.modality == "both" else (options.modality,))
     model = load(options.model)
-    pack = Pack(options.on) if options.on else own_data(model, "check the export on another pack, --on PACK")
+    pack = Pack(options.on) if options.on else own_data(model, "check the export on a pack, --on PACK")
     pack = as_trained(model, pack)
     with shown(Console(stderr=True)):
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, chosen, probe_runs
+from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, as_trained, chosen, probe_runs
 from mvitac.evaluation.external_encoders import about_lines
 from mvitac.evaluation.robustness import STRESSES, stress
 from mvitac.evaluation.scores import summarise, summarise_again
@@ -89,7 +89,7 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
         what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
         with shown(Console(stderr=True)), work(what):
             model = load(path, options.weights)
-            data = pack or model.open_data()
+            data = as_trained(model, pack) if pack else model.open_data()
             own = {"source": names.get(str(path), ""), "seed": model.seed, "run": str(path)}
             leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
             records += [

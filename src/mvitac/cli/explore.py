@@ -57,11 +57,13 @@ def _page(options: _Options) -> "gradio.Blocks":
     """The page, after the features of every run were computed."""
     from mvitac.deploy.artifact import load
     from mvitac.deploy.publish import own_data
+    from mvitac.evaluation.evaluate import as_trained
     from mvitac.report.explorer import page
     from mvitac.report.explorer_data import ExplorerData
 
     models = [load(run) for run in options.runs]
-    pack = Pack(options.on) if options.on else own_data(models[0], "show another pack, --on PACK")
+    given = as_trained(models[0], Pack(options.on)) if options.on else None
+    pack = given or own_data(models[0], "show another pack, --on PACK")
     runs = {}
     for name, model in zip(_names(options.runs), models, strict=True):
         print(f"{name}: features of up to {min(options.rows, pack.num)} pairs, and its probes", flush=True)

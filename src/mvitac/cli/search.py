@@ -53,12 +53,13 @@ def embed(argv: list[str]) -> None:
     options = parse(_EmbedOptions, argv, "embed")
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import check_pack, describe, embeddings
+    from mvitac.evaluation.evaluate import as_trained
 
     if options.out.suffix not in (".npz", ".parquet"):
         raise ValueError(f"--out {options.out}: give a name that ends in .npz or .parquet")
     check_place(options.out)
-    model, pack = load(options.model), Pack(options.pack)
-    found = {}
+    model = load(options.model)
+    pack, found = as_trained(model, Pack(options.pack)), {}
     for m in check_pack(model, pack):
         rows = np.flatnonzero(pack.has(m))
         with shown(Console(stderr=True)):
@@ -95,9 +96,11 @@ def index(argv: list[str]) -> None:
     options = parse(_IndexOptions, argv, "index")
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import build
+    from mvitac.evaluation.evaluate import as_trained
 
     with shown(Console(stderr=True)):
-        made = build(load(options.model), Pack(options.pack), options.out, options.splits)
+        model = load(options.model)
+        made = build(model, as_trained(model, Pack(options.pack)), options.out, options.splits)
     shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
     print(f"{options.out}: {shapes}, space: {made.meta['space']}")
 

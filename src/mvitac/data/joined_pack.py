@@ -66,7 +66,7 @@ class JoinedPack(Pack):
 def _check_shapes(learn: Pack, score: Pack) -> None:
     for modality in ("vision", "touch"):
         shapes = [(pack.size, pack.spec.channels(modality)) for pack in (learn, score)]
-        if shapes[0] != shapes[1]:
+        if any(num for _, num in shapes) and shapes[0] != shapes[1]:
             raise ValueError(
                 f"{modality} has {shapes[0][1]} channels at {shapes[0][0]} px in {learn.path} and {shapes[1][1]} at"
                 f" {shapes[1][0]} px in {score.path}: pack both with the same shape (--data.size)"

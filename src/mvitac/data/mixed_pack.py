@@ -17,7 +17,7 @@ from mvitac.data.images import fit
 from mvitac.data.jpeg import Lazy
 from mvitac.data.mixed_table import MixedTasks, mixed_spec, mixed_table, renamed_columns
 from mvitac.data.pack import Images, Pack, has_difference
-from mvitac.data.row_hashes import row_hashes
+from mvitac.data.row_hashes import number_hint, row_hashes
 from mvitac.data.spec import MODALITIES
 from mvitac.system.files import digest
 
@@ -201,7 +201,8 @@ def _shared(parts: Mapping[str, Pack]) -> str:
             if len(both):
                 what, num = other.column(column)[both[0]], len(np.unique(theirs[both]))
                 by = other.spec.group_by if column == "group" else "row"
-                return f"{by} {str(what)!r} is in train of part {a} and in test of part {b}, one of {num}"
+                hint = number_hint(one.spec.name, other) if column == "id" else ""
+                return f"{by} {str(what)!r} is in train of part {a} and in test of part {b}, one of {num}{hint}"
         for modality in MODALITIES:
             if same := _same_image(one, other, modality, learned, scored):
                 i, j, num = same

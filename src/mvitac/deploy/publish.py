@@ -10,12 +10,11 @@ import safetensors.torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
-from mvitac.data.windows import windowed
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.deploy.card import card
 from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.controls import Records, controls_of
-from mvitac.evaluation.evaluate import check_unseen, stored_result
+from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
 from mvitac.evaluation.probe import ProbeSplit, scorable, score_predictions, score_rows, split_rows
@@ -152,15 +151,12 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
 
 def own_data(model: Model, instead: str) -> Pack:
     """The data ``model`` was trained on; the ValueError where it is missing ends with ``instead``, what to do."""
+    if model.foreign and model.run.data.names_a_place:
+        raise ValueError(f"the data of an artifact is not opened, as the artifact may be a stranger's: {instead}")
     try:
         return model.open_data()
     except ValueError as error:
         raise ValueError(f"the data this model was trained on is not here ({brief(error)}): {instead}") from None
-
-
-def as_trained(model: Model, pack: Pack) -> Pack:
-    """``pack`` with the windows that ``model`` was trained on, if it shows single frames."""
-    return pack if pack.spec.window.active else windowed(pack, model.spec.window)
 
 
 def with_probes(model: Model, pack: Pack | None = None) -> Model:
@@ -193,7 +189,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
     with new_folder(out) as partial:
         model = load(run)
         _, record = load_run(run)
-        pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on another pack, --on PACK")
+        pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on a pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
         _write_weights(model, partial)
         write_json(partial / "run.json", record, sealed=True)

@@ -7,9 +7,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
+from mvitac.data.row_hashes import number_hint
 from mvitac.data.spec import AnyTask, Task, ValueTask
+from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
 from mvitac.evaluation.events import check_event, with_event
@@ -166,10 +169,16 @@ def _describe_data(pack: Pack, tasks: Sequence[AnyTask]) -> dict[str, Any]:
     }
 
 
+def as_trained(model: Model, pack: Pack) -> Pack:
+    """``pack`` with the windows that ``model`` was trained on, if it shows single frames and is not joined."""
+    known = pack.spec.window.active or isinstance(pack, JoinedPack)
+    return pack if known else windowed(pack, model.spec.window)
+
+
 def _common_pack(models: Sequence[Model], pack: Pack | None) -> Pack:
     """``pack``, or the data that all of ``models`` were trained on."""
     if pack:
-        return pack
+        return as_trained(models[0], pack) if models else pack
     packs = [model.open_data() for model in models]
     if len({p.digest for p in packs}) > 1:
         raise ValueError("these runs were trained on different data: probe them one by one, or on one pack with --on")
@@ -268,8 +277,9 @@ def check_unseen(
         refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):
+                hint = next(filter(None, (number_hint(source.name, pack) for source in refused)), "")
                 raise ValueError(
-                    f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}; give a pack whose test"
+                    f"{path} has seen what {pack.path} would score, task {task.name!r}: {leak}{hint}; give a pack whose test"
                     " groups it was not trained on, or --allow-leak to score it with LEAK beside every score"
                 )
     return sources
@@ -289,7 +299,10 @@ def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
             raise unknown("task with classes", name, [task.name for task in pack.spec.tasks])
         known[name] = with_event(task, session.event_of(happens))
     if not known:
-        raise ValueError(f"dataset {pack.spec.name!r} has no labels and no values: nothing to probe")
+        raise ValueError(
+            f"dataset {pack.spec.name!r} has no labels and no values: name columns with --labels or --values of `mvitac"
+            " data pack`, or with --data.labels or --data.values"
+        )
     for name in session.tasks:
         if name not in known:
             raise unknown("task", name, known)

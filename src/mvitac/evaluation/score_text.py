@@ -26,9 +26,10 @@ def pipes(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -
 def with_interval(mean: float, low: float | None, high: float, leak: str = "") -> str:
     """A score and its 95 % interval, such as '57.6 [55.1, 60.2]', with LEAK if there is one (``evaluation.leaks``).
 
-    Without a lower end it is the score alone.
+    Without any interval (one test group) it is the score alone.
     """
-    ends = "" if low is None or not math.isfinite(low) else f" [{percent(low)}, {percent(high)}]"
+    least = "-inf" if low is None or not math.isfinite(low) else percent(low)
+    ends = "" if least == "-inf" and high >= 1 else f" [{least}, {percent(high)}]"
     return f"{percent(mean)}{ends}{leak_mark(leak)}"
 
 

@@ -22,6 +22,7 @@ from mvitac.model_files import load
 from mvitac.nn.initial import Init
 from mvitac.run import Run
 from mvitac.system.files import brief, write_json
+from mvitac.system.progress import shown, work
 from mvitac.training.loop import train
 from mvitac.training.setup import check_out
 
@@ -69,6 +70,9 @@ def adapt(
     """
     check_out(out, resume)
     model, pack = load(ancestor), data.open(quiet=quiet)
+    if lacking := [m for m in model.encoders if m not in pack.spec.modalities]:
+        one = f"mvitac pretrain --init {ancestor} --init.modalities {' '.join(pack.spec.modalities)} --renew-norms 16"
+        raise ValueError(f"{ancestor} was trained with {lacking[0]}, which the data lacks: use `{one}` instead")
     check_channels(ancestor, model, pack, tuple(model.encoders))
     packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
     sources = {  # refuses leaks before anything is trained
@@ -77,11 +81,13 @@ def adapt(
     }
     train(_run_of(model, ancestor, data, pack, asked), out, resume=resume, quiet=quiet, pack=pack)
     records, after = [], load(out)
-    for name, one in packs.items():
-        learned = read_sources(out, after.run, pack.digest, one)
-        for source, scored, known in (("before", model, sources[name]), ("after", after, learned)):
-            found = _scores(scored, one, known, retrieval=name != TRANSFER)
-            records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
+    with shown(quiet=quiet), work("scoring before and after", 2 * len(packs), "parts") as advance:
+        for name, one in packs.items():
+            learned = read_sources(out, after.run, pack.digest, one)
+            for source, scored, known in (("before", model, sources[name]), ("after", after, learned)):
+                found = _scores(scored, one, known, retrieval=name != TRANSFER)
+                records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
+                advance()
     result = {"ancestor": str(ancestor), "group_by": pack.spec.group_by, "records": records}
     write_json(out / "adapted.json", result, sealed=True)
     return result

@@ -211,8 +211,9 @@ def source(text: str, modality: str) -> Source:
     if path.is_file() and path.suffix.lower() in VIDEOS:
         _need_opencv(text)
         return _readable(Video(path), text)
+    what = "" if path.exists() else f"there is no {path} here; "
     raise ValueError(
-        f"source {text!r}: give a camera number, /dev/videoN, serial:NAME, a video file ({', '.join(VIDEOS)}),"
+        f"source {text!r}: {what}give a camera number, /dev/videoN, serial:NAME, a video file ({', '.join(VIDEOS)}),"
         " a folder of pictures[@fps], or sim"
     )
 

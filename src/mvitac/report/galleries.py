@@ -5,6 +5,7 @@ Shapes: features [N, D] of the rows shown; L2-normalised embeddings in the space
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from mvitac.report import figures, html
 from mvitac.report.sections import Study
 
 NUM_MAP, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
+NUM_RANGES = 5  # of values, in the map
 
 
 @dataclass(frozen=True)
@@ -78,19 +80,31 @@ def feature_maps(study: Study) -> str:
     rows = sample(rows, NUM_MAP)
     if len(rows) < 8:
         return ""
-    task = study.pack.spec.tasks[0] if study.pack.spec.tasks else None
+    labels, names, by = _labels(study, rows)
     drawn = []
     for modality in study.pack.spec.modalities:
         points = embed_2d(features(study.runs[0].model, study.pack, modality, rows))
-        drawing = figures.feature_map(modality, points, study.labels(rows), task.classes if task else ())
-        alt = f"t-SNE of the {modality} features of {len(rows)} {split} rows" + (f" by {task.name}" if task else "")
+        drawing = figures.feature_map(modality, points, labels, names)
+        alt = f"t-SNE of the {modality} features of {len(rows)} {split} rows{by}"
         drawn.append(study.figure(f"map {modality}", drawing, alt))
-    by = f", by {task.name}" if task else ""
     intro = (
         f"{len(rows)} {split} rows{by}; features of {study.runs[0].path.name}, by PCA to 50 dimensions and t-SNE."
         " Near points are similar; distances between far clusters mean nothing."
     )
     return html.paragraph(intro) + html.grid(drawn, "grid large")
+
+
+def _labels(study: Study, rows: np.ndarray) -> tuple[np.ndarray, Sequence[str], str]:
+    """Labels of ``rows`` (-1 = none), their names, and what they are of: the first task, or ranges of the first value."""
+    spec = study.pack.spec
+    if spec.tasks:
+        return study.labels(rows), spec.tasks[0].classes, f" by {spec.tasks[0].name}"
+    if not spec.values or np.isnan(values := study.pack.values(spec.values[0])[rows, 0]).all():
+        return np.full(len(rows), -1), (), ""
+    target, edges = spec.values[0].targets[0], np.nanquantile(values, np.linspace(0, 1, NUM_RANGES + 1))
+    ranges = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, NUM_RANGES - 1)
+    names = [f"{low:.3g} to {high:.3g} {target.unit}" for low, high in pairwise(edges)]
+    return np.where(np.isnan(values), -1, ranges), names, f" by {target.name}"
 
 
 _SHOWN = {

@@ -78,13 +78,15 @@ def table(
             body.append(f'<tr class="part"><th colspan="{len(columns)}">{escape(name)}</th></tr>')
             continue
         look = ' class="muted"' if name in muted else ""
-        # On a phone a cell wraps, but not within an interval.
-        inner = "".join(
-            f"<td>{escape(cell) if words else escape(cell).replace(', ', ',&nbsp;')}</td>" for cell in cells
-        )
+        inner = "".join(f"<td>{escape(cell) if words else _unbroken(cell)}</td>" for cell in cells)
         body.append(f'<tr{look}><th scope="row">{escape(name)}</th>{inner}</tr>')
     box = f'<div class="scroll{" words" * words}" tabindex="0" role="region" aria-label="{escape(label)}">'
     return f"{box}<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+
+
+def _unbroken(cell: str) -> str:
+    """A score as HTML: on a phone it wraps, but not within its interval."""
+    return escape(cell).replace(", ", ",&nbsp;").replace("-inf", "&#8209;inf")
 
 
 def picture(image: np.ndarray, alt: str, side: int = 112) -> str:

@@ -20,14 +20,14 @@ from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import covered, percent, score_name, with_interval
 from mvitac.evaluation.scores import summarise
 from mvitac.model_files import load
-from mvitac.registry import to_json
+from mvitac.registry import from_json, to_json
 from mvitac.report import galleries, score_sections, tables
 from mvitac.report import html as page
 from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
 from mvitac.run import load_run, precision_of
 from mvitac.system.console import Console
-from mvitac.system.files import parse_json, write_atomic
+from mvitac.system.files import parse_json, read_json, write_atomic
 from mvitac.system.progress import duration, shown, work
 
 
@@ -99,9 +99,20 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     return lines
 
 
+def _events(run: Path, tasks: Sequence[str]) -> ProbeConfig:
+    """The usual probe, with the events of ``tasks`` that the last `mvitac probe` of this run was asked for."""
+    try:
+        asked = from_json(ProbeConfig, read_json(run / "probe.json", "a probe result")["asked"], "asked")
+    except (ValueError, KeyError, TypeError):
+        return ProbeConfig()
+    event = tuple(name for name in asked.event if name.partition("=")[0] in tasks)
+    given = {"fps": asked.fps, "clock": asked.clock, "false_alarms": asked.false_alarms}
+    return ProbeConfig(event=event, **given) if event else ProbeConfig()
+
+
 def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     if usable := tuple(task.name for task in scorable(pack, "none" if pack.parts else "both")):
-        return probe_runs([r.path for r in runs], ProbeConfig(tasks=usable), pack)
+        return probe_runs([r.path for r in runs], replace(_events(runs[0].path, usable), tasks=usable), pack)
     own = [{"source": r.source, "seed": r.run.seed, "run": str(r.path)} for r in runs]
     found = [{**o, **f} for o, r in zip(own, runs, strict=True) for f in cross_modal(r.model, pack)]
     shared: dict[str, Any] = {"records": [], "retrieval": found, "summary": {}, "classes": {}}

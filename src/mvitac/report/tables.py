@@ -175,6 +175,10 @@ def print_finetuning(result: dict[str, Any], console: Console) -> None:
         for source, found in others:
             table.add_row(f"gain over {source}", *(_gain_text(ours[f], found[f]) for f in ours))
         console.print(table)
+        last = [*ours][-1]  # the models that are published
+        if any(s.startswith("frozen") and paired_difference(ours[last], found[last])[2] < 0 for s, found in others):
+            advice = f"use the frozen probe of {result['ancestor']} instead, with `mvitac publish --on PACK`"
+            console.print(f"{task}: fine-tuning lost against the frozen probe; {advice}", soft_wrap=True)
     console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
     for note in [*(f"note: {note}" for note in result["notes"]), *(f"LEAK: {leak}" for leak in result["leaks"])]:
         console.print(note, markup=False, highlight=False)

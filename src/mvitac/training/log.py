@@ -84,7 +84,8 @@ class Log:
                 beside = step and name in self.first and not name.startswith("chance")
                 gain = f" ({value - self.first[name]:+.3f})" if beside else ""
                 shown.append(f"{name} {value:.3f}{gain}")
-        self.say(f"{'start (baseline)' if step == 0 else f'step {step}'}: {', '.join(shown)}")
+        if shown:
+            self.say(f"{'start (baseline)' if step == 0 else f'step {step}'}: {', '.join(shown)}")
         if verdict:
             self.say(verdict)
 

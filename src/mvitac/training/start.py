@@ -64,8 +64,8 @@ def _learned(file: Path, pack: Pack) -> list[Source]:
 def load_start(start: Start, method: Method) -> dict[str, Any]:
     """Load start weights into a new method, by modality, and into its momentum copies.
 
-    Returns what was taken, for the record: name, digest, modality -> parts, and names of what the weights were trained
-    on. ValueError if nothing fits, or a modality that was asked for does not.
+    Returns what was taken, for the record: name, digest, modality -> parts, names of what the weights were trained on,
+    and why a modality was not taken. ValueError if nothing fits, or a modality that was asked for does not.
     """
     init, taken, reasons = start.init, {}, {}
     trunks, heads = method.encoders(), method.projectors()
@@ -90,7 +90,8 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
             module.restart()
     names = list(dict.fromkeys(source.name for source in start.sources))
     assert init.path
-    return {"name": init.path.name, "digest": init.digest, "taken": taken, "trained_on": names}
+    found = {"name": init.path.name, "digest": init.digest, "taken": taken, "trained_on": names}
+    return {**found, **({"not_taken": reasons} if reasons else {})}
 
 
 def _load_encoder(start: Start, trunks: dict[str, Any], modality: str) -> None:
@@ -108,6 +109,7 @@ def _load_encoder(start: Start, trunks: dict[str, Any], modality: str) -> None:
 def describe(record: dict[str, Any]) -> str:
     """One line about the record of ``load_start``."""
     parts = [f"{modality} {' and '.join(names)}" for modality, names in record["taken"].items()]
+    parts += [f"not {modality} ({reason})" for modality, reason in record.get("not_taken", {}).items()]
     return f"starts from {record['name']} (sha256 {record['digest'][:12]}): {', '.join(parts)}"
 
 

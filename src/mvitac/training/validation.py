@@ -216,7 +216,8 @@ def verdict(start: Cells, end: Cells, by: str) -> str:
     names = [name for name in same if _groups(end[name]).sum() > 1]
     every = torch.stack([_groups(end[name]) for name in names]).any(0).nonzero()[:, 0] if names else torch.empty(0)
     if (num := len(every)) < 2:
-        return "no labelled groups of split val: nothing says whether the features are better than at the start"
+        found = f"one labelled {by}" if same else "no labels of two classes, and no values,"
+        return f"{found} in split val: nothing says whether the features are better than at the start"
 
     def gain(keep: Tensor) -> float:
         before, after = ({name: cells[name][:, keep] for name in names} for cells in (start, end))

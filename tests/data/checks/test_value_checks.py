@@ -92,6 +92,8 @@ def test_healthy_values_and_windows(healthy: Pack) -> None:
     assert all(finding.verdict == "ok" for finding in values), values
     assert "640 rows, 0.1" in values[0].evidence and " N, median" in values[0].evidence
     assert "608 of 640 (95.0 %) rows have all frames before them, by column seq" in values[2].evidence
+    late = value_checks.windows(healthy, Window(frames=3, stride=1.1))
+    assert late.verdict == "look" and "frames of a window are 2 apart (median)" in late.evidence
 
 
 @pytest.mark.parametrize(

@@ -174,7 +174,7 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
         return Finding(item, "not checkable", "a part of the items has gaps: examine all of them")
     try:
         name, place = places(pack, window)
-        _, whole = frames_of(pack, window)
+        index, whole = frames_of(pack, window)
     except ValueError as error:
         return Finding(item, "broken", str(error), "training refuses these windows, too")
     steps = [np.diff(place[rows]) for rows in _recordings(pack, window) if len(rows) > 2]
@@ -182,6 +182,10 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     gaps = sum(int((step > 2.5 * rate).sum()) for step, rate in zip(steps, rates, strict=True))
     evidence = [f"{share(int(whole.sum()), pack.num)} rows have all frames before them, by column {name}"]
     advice = []
+    apart = np.median(place[index[whole, 0]] - place[index[whole, min(1, window.frames - 1)]])
+    if apart > 1.25 * window.stride:
+        evidence.append(f"frames of a window are {apart:.3g} apart (median): the newest that is old enough is shown")
+        advice.append("give a stride slightly below the distance that you mean")
     if gaps:
         with_gaps = sum((step > 2.5 * rate).any() for step, rate in zip(steps, rates, strict=True))
         longest = max(step.max() / rate for step, rate in zip(steps, rates, strict=True))

@@ -123,8 +123,9 @@ class RowsConfig(DatasetConfig, ABC):
             raise ValueError("a background is only used with subtract-background: add that option, or leave this out")
         for text in (*self.only, *self.label_only, *self.no_contact):
             Condition.parse(text)
-        for text in self.values:
-            value_task(text)
+        names = Counter([*self.labels, *(value_task(text).name for text in self.values)])
+        if twice := [name for name, times in names.items() if times > 1]:
+            raise ValueError(f"task {twice[0]!r} occurs twice: give each task its own name, --values NAME=column:unit")
 
     def _check_columns(self) -> None:
         if len(self.touch) > 2:

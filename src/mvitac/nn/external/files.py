@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -67,9 +68,14 @@ class OnnxNetwork(nn.Module):
         options.log_severity_level = 3
         self.session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
         self.input: Any = self.session.get_inputs()[0]
-        sides = self.input.shape[-2:]
+        self.one_by_one, sides = self.input.shape[0] == 1, self.input.shape[-2:]
+        channels = self.input.shape[1] if len(self.input.shape) == 4 else 3
+        if isinstance(channels, int) and channels % 3:
+            raise ValueError(f"it takes {channels} channels, the images have 3 for each frame")
         self.size = tuple(sides) if all(isinstance(side, int) for side in sides) else None
 
     def forward(self, images: Tensor) -> Tensor:
-        found = self.session.run(None, {self.input.name: images.cpu().numpy()})[0]
+        array = images.cpu().numpy()
+        parts = array[:, None] if self.one_by_one else [array]  # some files have a fixed batch of one
+        found = np.concatenate([self.session.run(None, {self.input.name: part})[0] for part in parts])
         return torch.from_numpy(found).to(images.device)

@@ -49,6 +49,8 @@ class Python(Adapter):
         network, given = made[0], dict(made[1])
         about = {name: str(given.pop(name)) for name in ABOUT if name in given}
         prefix = int(given.pop("prefix", 0))
+        if isinstance(size := given.get("size"), int):
+            given["size"] = (size, size)
         made = from_json(Preprocessing, to_json(given), f"{self.place}()")
         if not (hasattr(network, "forward_features") and hasattr(network, "num_features")):
             network = Plain(network, prefix)
