@@ -69,7 +69,7 @@ data = {{ name = "pack" }}
 BOARD = Path(__file__).parents[2] / "benchmarks" / "board"
 GOLDEN = {
     "calandra-v1": "b9de4eee4353",
-    "real-small-v1": "2f37d58dc5b5",
+    "real-small-v1": "d00897c10ac0",
     "sim-v1": "12dcfc5478c1",
     "tag-v1": "9d8e494c2c50",
 }

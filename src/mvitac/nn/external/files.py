@@ -77,5 +77,5 @@ class OnnxNetwork(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         array = images.cpu().numpy()
         parts = array[:, None] if self.one_by_one else [array]  # some files have a fixed batch of one
-        found = np.concatenate([self.session.run(None, {self.input.name: part})[0] for part in parts])
-        return torch.from_numpy(found).to(images.device)
+        outputs: Any = [self.session.run(None, {self.input.name: part})[0] for part in parts]
+        return torch.from_numpy(np.concatenate(outputs)).to(images.device)
