@@ -3,6 +3,7 @@
     python -m benchmarks.faults kills --points 25      # at most 25 kills per command, evenly spread; 0 = all
     python -m benchmarks.faults kills --commands pretrain publish
     python -m benchmarks.faults flips --num 100
+    python -m benchmarks.faults kills flips            # both, on inputs that are made once
 
 Kills. An audit hook (PEP 578) counts what a command does to the disk: files opened for writing, renames, deletions, new
 folders. The process gets SIGKILL right before the n-th of these, and before the rename of a temporary file also with half
@@ -298,23 +299,22 @@ def flips(base: Path, num: int) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", choices=("kills", "flips"))
+    parser.add_argument("kinds", choices=("kills", "flips"), nargs="+", metavar="kills|flips")
     parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS), metavar="COMMAND")
     parser.add_argument("--points", type=int, default=0, help="kills per command; 0 = before every change of the disk")
     parser.add_argument("--num", type=int, default=100, help="flips per kind of file")
     options = parser.parse_args(argv)
     sys.modules["mvitac.transforms.numba_views"] = None  # type: ignore[assignment] # compiled in every process: seconds
-    if options.kind == "kills":
+    if "kills" in options.kinds:
         for name in (*(f"mvitac.cli.{ALL[command].split(':')[0]}" for command in options.commands), *SLOW):
             importlib.import_module(name)
     with tempfile.TemporaryDirectory(prefix="mvitac-faults-") as folder:
         base = Path(folder)
         if child(lambda: prepare(base), base / "said"):  # this process computes nothing, so that it can be forked
             raise RuntimeError((base / "said").read_text())
-        if options.kind == "flips":
-            result = flips(base, options.num)
-        else:
-            result = {name: kills(base, name, options.points) for name in options.commands}
+        result = {name: kills(base, name, options.points) for name in options.commands if "kills" in options.kinds}
+        if "flips" in options.kinds:  # last: this process reads files from here on
+            result |= flips(base, options.num)
     print(json.dumps(result, indent=1))
     return int(any("SILENT" in one or "LOST" in one for one in result.values()))
 

@@ -47,6 +47,8 @@ def test_a_rehearsal_measures_all_and_goes_on_elsewhere(commands, tmp_path, monk
         gpu.main(["--smoke", "--device", "cpu", *folders, *more])
         return json.loads((tmp_path / out / "gpu.json").read_text())
 
+    whole = gpu.plan
+    monkeypatch.setattr(gpu, "plan", lambda size: {**whole(size), "tasks": ["soft"], "modalities": ["touch"]})
     first = call("first", "first-work", "--minutes", "0.5")  # too short for anything but data
     assert first["data"]["num"] in gpu.SMOKE.pairs and not commands
     first = call("first", "first-work", "--minutes", "10")

@@ -29,13 +29,20 @@ def cells(file: Path) -> list[tuple[str, str]]:
     return [(cell.cell_type, cell.source) for cell in jupytext.read(file).cells]
 
 
-def run(page: Path, folder: Path) -> None:
-    """Run the code cells of ``page`` in ``folder``. Its commands run in this process: each would import torch."""
+def run(page: Path, folder: Path, names: dict[str, Any] | None = None) -> None:
+    """Run the code cells of ``page`` in ``folder``. Its commands run in this process: each would import torch.
+
+    Cells define their ``names`` in ``__main__`` by default, as those of a notebook do.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(os, "cpu_count", lambda: 1)  # new processes take longer to start than these small packs
+        run_cells(page, vars(sys.modules["__main__"]) if names is None else names)
+
+
+def run_cells(page: Path, names: dict[str, Any]) -> None:
     from mvitac.cli.main import main
 
-    os.chdir(folder)
-    os.cpu_count = lambda: 1  # its share of the machine: new processes take longer to start than these small packs
-    names = vars(sys.modules["__main__"])  # where a notebook's cells define their names, too
     for kind, source in cells(page):
         if kind != "code":
             continue
@@ -50,9 +57,12 @@ def run(page: Path, folder: Path) -> None:
 
 @pytest.mark.parametrize("page", [*PAGES, DOCS / "add_a_dataset.md"], ids=lambda p: p.stem)
 def test_every_cell_runs(page: Path, tmp_path: Path) -> None:
-    """In a process of its own: a tutorial may register a method that the other tests must not see."""
+    """Pages that register a method or a dataset, which the other tests must not see, in a process of their own."""
     (folder := tmp_path / "folder").mkdir()
-    finish(begin(run, page, folder, output=tmp_path / "output"), tmp_path / "output")
+    if "\nclass " in page.read_text():
+        finish(begin(run, page, folder, output=tmp_path / "output"), tmp_path / "output")
+    else:
+        run(page, folder, {})
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)

@@ -386,7 +386,8 @@ def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leakin
     for ask in (("during",), ("after",)):
         pack = leaking_pack(leaking, tmp_path / ask[0], ask=ask)
         run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=2, eval_every=1)
-        result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], ProbeConfig(probes=("linear", "knn")))
+        session = ProbeConfig(probes=("linear", "knn"), modalities=("touch",))
+        result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], session)
         console = Console(record=True, width=120, file=(tmp_path / "out.txt").open("w"))
         print_summary(result, console)
         tables = console.export_text()

@@ -229,12 +229,24 @@ def serving(folder: Path, port: int, work: Callable[..., int | None], *given: An
 
 
 @pytest.fixture(scope="module")
-def explored(artifact: Path, smoke_run: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """The port of `mvitac explore` with two models on the striped pairs."""
-    port = free_port()
+def ports(
+    artifact: Path, smoke_run: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[int, int]]:
+    """Of `mvitac explore` with two models on the striped pairs, and of the page of ``serve_many``, in one process."""
+    port, of_many = free_port(), free_port()
     command = ["explore", str(artifact), str(smoke_run), "--on", str(pack.path), "--port", str(port)]
-    with serving(tmp_path_factory.mktemp("explored"), port, main, command):
-        yield port
+    with serving(tmp_path_factory.mktemp("explored"), port, serve_both, command, of_many, artifact, pack.path):
+        yield port, of_many
+
+
+@pytest.fixture(scope="module")
+def explored(ports: tuple[int, int]) -> int:
+    return ports[0]
+
+
+def serve_both(command: list[str], of_many: int, artifact: Path, pack: Path) -> int:
+    serve_many(of_many, artifact, pack)
+    return main(command)
 
 
 def serve_many(port: int, artifact: Path, pack: Path) -> None:
@@ -248,7 +260,7 @@ def serve_many(port: int, artifact: Path, pack: Path) -> None:
     land.x = {m: x[i] + noise for m, x in land.x.items()}
     land.labels = {t: x[i] for t, x in land.labels.items()}
     land.guess = dict(land.labels)
-    serve(page({"run": land}), port=port)
+    serve(page({"run": land}), port=port, wait=False)
 
 
 def listeners(port: int) -> set[str]:
@@ -430,25 +442,23 @@ def test_labels_are_text_in_markdown() -> None:
         assert html.unescape(re.sub("<[^>]*>", "", text)).strip() == label
 
 
-def test_a_page_of_very_many_and_of_none(browser: Browser, artifact: Path, pack: Pack, tmp_path: Path) -> None:
+def test_a_page_of_very_many_and_of_none(browser: Browser, ports: tuple[int, int]) -> None:
     """100,000 rows, in which every answer is right: filtered to its mistakes, there is nothing to show."""
-    port = free_port()
-    with serving(tmp_path, port, serve_many, port, artifact, pack.path):
-        browser.resize(1200, 900)
-        browser.open(f"http://127.0.0.1:{port}")
-        browser.wait(f"{POINTS} == 100000")
-        middle = browser.run(
-            "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
-            " return [b.left + b.width / 2, b.top + b.height / 2] })()"
-        )
+    browser.resize(1200, 900)
+    browser.open(f"http://127.0.0.1:{ports[1]}")
+    browser.wait(f"{POINTS} == 100000")
+    middle = browser.run(
+        "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
+        " return [b.left + b.width / 2, b.top + b.height / 2] })()"
+    )
 
-        def hover() -> None:
-            browser.mouse("mouseMoved", 1, 1)
-            browser.mouse("mouseMoved", *middle)
+    def hover() -> None:
+        browser.mouse("mouseMoved", 1, 1)
+        browser.mouse("mouseMoved", *middle)
 
-        browser.until("document.querySelectorAll('.tip img').length == 2", hover)
-        browser.until("document.querySelectorAll('.found img').length == 12", lambda: browser.click(*middle))
-        browser.run(CLICK_BOX)
-        browser.wait(f"{POINTS} == 0")
-        assert "nothing to show" in browser.run("document.querySelector('.count').textContent")
-        assert browser.problems == []
+    browser.until("document.querySelectorAll('.tip img').length == 2", hover)
+    browser.until("document.querySelectorAll('.found img').length == 12", lambda: browser.click(*middle))
+    browser.run(CLICK_BOX)
+    browser.wait(f"{POINTS} == 0")
+    assert "nothing to show" in browser.run("document.querySelector('.count').textContent")
+    assert browser.problems == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import torch
 
 import mvitac.experiments.jobs
@@ -10,3 +12,4 @@ from mvitac.transforms.random_views import ViewAugment, random_view
 
 torch.set_num_threads(1)
 random_view(torch.zeros(1, 3, 32, 32, dtype=torch.uint8), ViewAugment(), 32, torch.Generator())  # loads numba's code
+gc.freeze()  # a collection in a forked process would copy every page that it looks at

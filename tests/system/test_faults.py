@@ -15,18 +15,13 @@ from mvitac.system.files import read_json, write_json
 from support.processes import begin, finish
 
 
-@pytest.mark.parametrize(
-    ("argv", "counts"),
-    [
-        (["kills", "--commands", "pretrain", "--points", "2"], {"finished": 2}),
-        (["flips", "--num", "5"], {"refused": 5, "made again": 5}),
-    ],
-)
-def test_nothing_is_lost_or_goes_unnoticed(argv: list[str], counts: dict[str, int], tmp_path: Path) -> None:
+def test_nothing_is_lost_or_goes_unnoticed(tmp_path: Path) -> None:
+    argv = ["kills", "flips", "--commands", "pretrain", "--points", "2", "--num", "5"]
     finish(begin(main, argv, output=tmp_path / "said"), tmp_path / "said")
-    for name, found in json.loads((tmp_path / "said").read_text()).items():
-        kinds = {kind: num for kind, num in found.items() if kind not in ("failed", "changes of the disk")}
-        assert sum(kinds.values()) == int(argv[-1]) and kinds.items() <= counts.items(), (name, found)
+    found = json.loads((tmp_path / "said").read_text())
+    killed = found.pop("pretrain")
+    assert killed.pop("changes of the disk") > 2 and killed == {"finished": 2, "failed": []}
+    assert len(found) == 5 and all(each in ({"refused": 5}, {"made again": 5}) for each in found.values()), found
 
 
 def test_any_change_of_a_sealed_file_is_told(tmp_path: Path) -> None:

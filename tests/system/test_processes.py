@@ -71,7 +71,7 @@ def test_probes_do_not_depend_on_it(
         model.run = replace(model.run, seed=1)
         other = shutil.copytree(smoke_run, tmp_path / f"run{threads}")
         model.save(other / "model.safetensors")
-        return probe_runs([smoke_run, other], ProbeConfig(tasks=("bright",)), pack)["summary"]
+        return probe_runs([smoke_run, other], ProbeConfig(tasks=("bright",), modalities=("both",)), pack)["summary"]
 
     assert scores(2) == scores(1)
 
