@@ -32,7 +32,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Packs and features of the tests live and die with them."""
     import torch
 
@@ -40,7 +40,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     os.environ["MVITAC_CACHE"] = str(path)
     torch.set_num_threads(1)
     gc.freeze()  # what was imported stays: the garbage collector need not look at it again and again
-    return path
+    yield path
+    gc.unfreeze()  # else libraries report what is left at exit, after pytest's summary
 
 
 @pytest.fixture(scope="session")

@@ -139,7 +139,7 @@ def test_shows_every_score_of_the_probe(materials: Path, result: dict[str, Any])
         task = ""
         for row in filter(None, (re.findall(r">([^<]*)</t[hd]>", row) for row in body.split("</tr>"))):
             task = row[0].split(" (")[0] if len(row) == 1 else task  # category (24 test instances)
-            shown[task, row[0]] = [unescape(value).replace("\xa0", " ") for value in row[1:]]
+            shown[task, row[0]] = [unescape(value).replace("\xa0", " ").replace("\u2011", "-") for value in row[1:]]
     assert set(result["summary"]) == {"category", "soft", "rough", "force"}
     for task, found in result["summary"].items():
         sources = {source for cells in found.values() for source in cells}
