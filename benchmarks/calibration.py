@@ -1,4 +1,4 @@
-"""False positives of ``scores.paired_difference`` at p < .05, and misses of ``scores.interval``: accuracy, then R2.
+"""False positives of ``intervals.paired_difference`` at p < .05, and misses of ``intervals.interval``: accuracy, then R2.
 
 Two simulated methods have the same expected accuracy, several seeds each, and test groups that differ in difficulty and,
 if they are unequal, in size. With one seed there is no p, and an interval covers other groups for this seed. Settings
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from mvitac.evaluation.scores import interval, paired_difference
+from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.value_scores import SUMS, r_squared
 from mvitac.system.files import write_json
 from mvitac.system.provenance import provenance

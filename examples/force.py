@@ -20,9 +20,10 @@ from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
 from mvitac.evaluation.controls import borders, thumbnails
 from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import percent, with_interval
-from mvitac.evaluation.scores import interval, pool
+from mvitac.evaluation.scores import pool
 from mvitac.model_files import fresh
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe

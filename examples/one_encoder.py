@@ -27,9 +27,10 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import thumbnails
 from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import percent, with_interval
-from mvitac.evaluation.scores import interval, paired_difference, pool
+from mvitac.evaluation.scores import pool
 from mvitac.model import Model
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe

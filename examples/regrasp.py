@@ -32,8 +32,8 @@ import mvitac
 from mvitac.data.pack import Pack
 from mvitac.deploy.policy import ObservationEncoder
 from mvitac.evaluation.classifiers import fit_linear
+from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import ProbeSplit, split_rows
-from mvitac.evaluation.scores import interval, paired_difference
 from mvitac.model import Model
 from mvitac.model_files import fresh
 from mvitac.nn.encoders import SCRATCH
@@ -113,7 +113,7 @@ def predict(x: np.ndarray, y: np.ndarray, rows: ProbeSplit) -> np.ndarray:
 def play(p: np.ndarray, y: np.ndarray, objects: np.ndarray, hands: np.ndarray, threshold: float) -> dict[str, Any]:
     """Play all episodes. Return episodes and successes per object and the mean number of tried grasps.
 
-    The result is a record for ``mvitac.evaluation.scores.interval``.
+    The result is a record for ``mvitac.evaluation.intervals.interval``.
     """
     lifted, tried = decide(p[hands], threshold)
     thing, held = objects[hands[:, 0]], y[hands[np.arange(len(hands)), lifted]]

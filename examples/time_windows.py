@@ -25,9 +25,10 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.evaluation.controls import thumbnails
 from mvitac.evaluation.events import with_event
 from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import lead_text, percent, with_interval
-from mvitac.evaluation.scores import event_of, interval, paired_difference, pool
+from mvitac.evaluation.scores import event_of, pool
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from mvitac.system.files import read_json, write_json

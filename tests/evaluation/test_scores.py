@@ -8,7 +8,8 @@ from benchmarks.calibration import rates_of_error, value_rates_of_error
 from scipy.stats import t as student
 from sklearn.metrics import confusion_matrix, f1_score
 
-from mvitac.evaluation.scores import interval, least_p, paired_difference, score
+from mvitac.evaluation.intervals import interval, least_p, paired_difference
+from mvitac.evaluation.scores import score
 
 
 def record(correct: list[int], seed: int | None, sizes: int = 10) -> dict:

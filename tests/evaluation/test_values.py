@@ -21,9 +21,10 @@ from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Materials, MaterialsConfig
 from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
+from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import split_rows
 from mvitac.evaluation.regressors import fit_curve, fit_ridge
-from mvitac.evaluation.scores import interval, paired_difference, pool
+from mvitac.evaluation.scores import pool
 from mvitac.evaluation.value_scores import r2_without_each_group, score_values
 from mvitac.recipes import recipe
 from mvitac.training.loop import train

@@ -15,9 +15,12 @@ from mvitac.training.loop import train
 
 @pytest.mark.parametrize("images", ["enough", "too few"])
 def test_a_new_sensor_stands_beside_the_known_ones(tmp_path: Path, images: str) -> None:
-    data = MaterialsConfig(num=280, touches=1, makes=("mini",), size=32, workers=1)
+    data = MaterialsConfig(num=160, touches=1, makes=("mini",), size=32, workers=1)
     other = data.on_new_sensor()
     assert other and other.on_new_sensor() is None and GraspsConfig().on_new_sensor() is None
+    assert (
+        few := MaterialsConfig(num=300).on_new_sensor()
+    ) and few.num == 60  # as many instances, or no test instance would be left
     if images == "too few":
         other = replace(other, num=60)
     known, new = data.open(quiet=True), other.open(quiet=True)

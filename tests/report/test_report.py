@@ -27,8 +27,9 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
+from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.score_text import cell_text, columns_of
-from mvitac.evaluation.scores import interval, summarise
+from mvitac.evaluation.scores import summarise
 from mvitac.experiments.plan import Plan, Row
 from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import latex, markdown

@@ -11,9 +11,10 @@ from typing import Any
 from mvitac.bench.charts import against_labels, against_parameters
 from mvitac.bench.result import problems, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
+from mvitac.evaluation.intervals import paired_difference
 from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
-from mvitac.evaluation.scores import by_cell, paired_difference, summarise
+from mvitac.evaluation.scores import by_cell, summarise
 from mvitac.report import html as page
 from mvitac.report.figures import to_svg
 from mvitac.report.tables import probe_name

@@ -103,7 +103,7 @@ def pool_events(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def shares(events: Sequence[dict[str, Any]], *, with_it: bool) -> list[dict[str, Any]]:
-    """Recordings and alarms per group, of recordings with the event or without it, as ``scores.interval`` takes them."""
+    """Recordings and alarms per group, of recordings with the event or without it, as ``intervals.interval`` takes them."""
     names = sorted({recording["group"] for event in events for recording in event["recordings"]})
     found = []
     for event in events:

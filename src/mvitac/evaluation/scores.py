@@ -1,25 +1,19 @@
-"""Scores of predictions, their confidence intervals, and differences between methods.
+"""Scores of predictions: of one probe, pooled over folds, and summarised over seeds.
 
 A record is one probe of one source on one task. ``score`` counts correct rows per test group, ``score_values`` sums errors.
-Every interval is over these groups and, if there are several, the seeds: rows within a group are near-copies, groups are
-independent.
-
-Both levels' variances are added, and Student's t has the degrees of freedom of the sum (Satterthwaite 1946). This is too
-narrow when a few seeds happen to agree, so an interval is never narrower than that over seeds alone. Intervals then hold
-their level with few groups, few seeds and groups of unequal size (benchmarks/calibration.py), which a bootstrap does not.
+``intervals`` says how sure they are.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import expit, logit, stdtr, stdtrit
-from sklearn.metrics import roc_auc_score
+from sklearn.metrics import confusion_matrix, precision_recall_fscore_support, roc_auc_score
 
 from mvitac.evaluation.events import lead_of, pool_events, shares
-from mvitac.evaluation.value_scores import one_target, pool_values, r2_without_each_group
+from mvitac.evaluation.intervals import interval, num_groups_of
+from mvitac.evaluation.value_scores import one_target, pool_values
 
 
 def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_classes: int) -> dict[str, Any]:
@@ -35,19 +29,19 @@ def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_clas
         Accuracy, balanced accuracy, macro F1, AUROC (two classes only), the confusion matrix and counts per group.
     """
     guess = probabilities.argmax(1)
+    present = np.unique(y)
     num_groups = int(groups.max()) + 1
-    confusion = np.bincount(y * num_classes + guess, minlength=num_classes**2).reshape(num_classes, num_classes)
-    true, predicted = confusion.sum(1), confusion.sum(0)
-    right, present = confusion.diagonal(), true > 0
     auroc = None
-    if num_classes == 2 and present.all():
+    no_division: dict[str, Any] = {"zero_division": 0}  # a class that is never predicted has precision 0
+    _, recall, f1, _ = precision_recall_fscore_support(y, guess, labels=present, average="macro", **no_division)
+    if num_classes == 2 and len(present) == 2:
         auroc = float(roc_auc_score(y, probabilities[:, 1]))
     return {
         "accuracy": float((guess == y).mean()),
-        "balanced_accuracy": float((right[present] / true[present]).mean()),
-        "macro_f1": float((2 * right[present] / (true + predicted)[present]).mean()),
+        "balanced_accuracy": float(recall),
+        "macro_f1": float(f1),
         "auroc": auroc,
-        "confusion": confusion.tolist(),
+        "confusion": confusion_matrix(y, guess, labels=range(num_classes)).tolist(),
         "num_test": len(y),
         "group_sizes": np.bincount(groups, minlength=num_groups).tolist(),
         "group_correct": np.bincount(groups, weights=guess == y, minlength=num_groups).astype(int).tolist(),
@@ -94,190 +88,6 @@ def _pool_classes(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "group_sizes": sizes,
         "group_correct": correct,
     }
-
-
-def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
-    """Mean accuracy (R2 of values) over runs and its 95 % interval.
-
-    With several records it covers other groups and other seeds; with one record, other groups for this one trained model.
-    With a single group the interval is that of all possible scores.
-
-    The interval of an accuracy is computed on the logit scale, which keeps it within 0 and 1, around
-    (correct + 1) / (rows + 2). Its variance is at least that of independent rows: a few groups that are all right say
-    little. That of R2 is computed on the scale of log(1 - R2), and is longer below than above R2, because the groups with
-    the largest errors may not be among those tested. Its lower end is -inf if it is below 1 - 1000 (1 - R2).
-
-    Args:
-        records: One record per seed, all on the same test groups.
-
-    Returns:
-        Mean, lower end and upper end.
-    """
-    sizes, correct = _counts(records)
-    rows = sizes.sum()
-    mean = float(correct.sum(1).mean() / rows)
-    if len(sizes) < 2:
-        return mean, least_of(records[0]), 1.0
-    groups, seeds = _over_groups(correct.mean(0), sizes), _over_seeds(correct, sizes)
-    if "group_sums" in records[0]:
-        error = max(1 - mean, 1e-12)
-        margin = _margin(_heavy_tailed(groups, correct.mean(0), sizes), seeds) / error
-        below = margin + _skewness_term(groups, correct.mean(0), sizes) / error
-        low = 1 - error * math.exp(below) if below < math.log(1000) else -math.inf
-        return mean, low, 1 - error * math.exp(-margin)
-    centre = (mean * rows + 1) / (rows + 2)
-    per_point = centre * (1 - centre)  # derivative of a probability by its logit
-    margin = _margin(_Variance(max(groups.value, per_point / rows), groups.freedom), seeds)
-    low, high = expit(logit(centre) + np.array([-1, 1]) * margin / per_point)
-    return mean, min(mean, float(low)), max(mean, float(high))
-
-
-def least_of(record: dict[str, Any]) -> float:
-    """The lowest possible score of the record's kind."""
-    return -math.inf if "group_sums" in record else 0.0
-
-
-def paired_difference(
-    ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]
-) -> tuple[float, float, float, float | None]:
-    """Difference in accuracy (R2 of values) between two methods on the same test groups.
-
-    Groups are paired. Seeds are paired if both methods have the same seeds, which share batches and views.
-
-    Args:
-        ours: Records of one method, one per seed.
-        theirs: Records of the method to subtract.
-
-    Returns:
-        Mean difference, lower and upper end of its 95 % interval, and the two-sided p, at least ``least_p``. p is None if
-        either method was trained with one seed: the variation between seeds is then unknown, and the interval leaves it
-        out. With a single group p is 1.
-    """
-    ours, theirs = _by_seed(ours), _by_seed(theirs)
-    assert len({str(_sizes(r).tolist()) for r in (*ours, *theirs)}) == 1, "scored on different test rows"
-    (sizes, a), (_, b) = _counts(ours), _counts(theirs)
-    mean = float((a.sum(1).mean() - b.sum(1).mean()) / sizes.sum())
-    most = 1.0 - least_of(ours[0])
-    one_seed = any(len(records) == 1 and records[0]["seed"] is not None for records in (ours, theirs))
-    if len(sizes) < 2:
-        return mean, -most, most, None if one_seed else 1.0
-    paired = [r["seed"] for r in ours] == [r["seed"] for r in theirs]
-    seeds = _over_seeds(a - b, sizes) if paired else _over_seeds(a, sizes) + _over_seeds(b, sizes)
-    groups = _over_groups(a.mean(0) - b.mean(0), sizes)
-    margin = _margin(groups, seeds)
-    p = None if one_seed else max(_p(mean, groups + seeds), _p(mean, seeds) if seeds.value else 0, least_p(len(sizes)))
-    return mean, max(-most, mean - margin), min(most, mean + margin), p
-
-
-def least_p(num_groups: int) -> float:
-    """Smallest p of ``paired_difference``: that of a sign test over the groups."""
-    return 2.0 ** (1 - num_groups)
-
-
-def num_groups_of(record: dict[str, Any]) -> int:
-    """Number of test groups that a record scored."""
-    return int(np.count_nonzero(_sizes(record)))
-
-
-def _by_seed(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """``records`` ordered by seed, because equal seeds are paired."""
-    return sorted(records, key=lambda record: -1 if record.get("seed") is None else record["seed"])
-
-
-def _sizes(record: dict[str, Any]) -> np.ndarray:
-    """Rows of each group, [G]; of values, the measured ones of all targets."""
-    return np.array(record["group_sums"]["n"]).sum(0) if "group_sums" in record else np.array(record["group_sizes"])
-
-
-def _counts(records: Sequence[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [G] and correct rows [S, G] of the groups that have any."""
-    sizes = _sizes(records[0]).astype(float)
-    there = sizes > 0
-    correct = [_shares(record, sizes) if "group_sums" in record else record["group_correct"] for record in records]
-    return sizes[there], np.array(correct, float)[:, there]
-
-
-def _shares(record: dict[str, Any], sizes: np.ndarray) -> np.ndarray:
-    """Each group's share in R2, times the number of rows: [G], with sum R2 * rows.
-
-    It comes from R2 without the group (the jackknife). For an accuracy the same formula gives the correct rows.
-    """
-    if np.count_nonzero(sizes) < 2:
-        return record["r2"] * sizes
-    shares = sizes * record["r2"] + (sizes.sum() - sizes) * (record["r2"] - r2_without_each_group(record))
-    return shares - sizes * (shares.sum() / sizes.sum() - record["r2"])
-
-
-@dataclass(frozen=True)
-class _Variance:
-    """An estimated variance of a mean, and its degrees of freedom."""
-
-    value: float
-    freedom: float
-
-    def __add__(self, other: "_Variance") -> "_Variance":
-        """The variance of a sum of independent terms, with Satterthwaite's degrees of freedom."""
-        total, parts = self.value + other.value, [part for part in (self, other) if part.value]
-        return _Variance(total, total**2 / sum(p.value**2 / p.freedom for p in parts) if parts else self.freedom)
-
-
-def _over_groups(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
-    """Variance of sum(correct) / sum(sizes) over groups, from [G] and [G].
-
-    Unbiased, with the degrees of freedom of Bell and McCaffrey (2002), if groups vary alike: G - 1 if they are equally
-    large, fewer if not.
-    """
-    w = sizes / sizes.sum()
-    squares = float(w @ w)
-    share = w * w / np.maximum(1 - 2 * w + squares, 1e-12)
-    residuals = correct / sizes - correct.sum() / sizes.sum()
-    # freedom = trace(B)^2 / trace(B^2) of the quadratic form B of the rates; B is not built, as there may be many groups
-    zero, one, two = (float((share * w**power).sum()) for power in range(3))
-    off = (squares * zero) ** 2 + 2 * zero * two - 4 * squares * zero * one + 2 * one**2
-    trace = off + float((share**2 * (1 + 2 * squares - 4 * w)).sum())
-    return _Variance(float(share @ residuals**2), squares**2 / trace)
-
-
-def _skewness_term(variance: _Variance, shares: np.ndarray, sizes: np.ndarray) -> float:
-    """What is added to the interval's lower half, as squared errors have a long upper tail.
-
-    It is the term of Johnson's (1978) modified t at the normal 97.5 % point z = 1.96, where (1 + 2 z^2) / 6 = 1.45. The
-    skewness is estimated, and at least that of the square of a normal error, the root of 8.
-    """
-    w, num = sizes / sizes.sum(), len(sizes)
-    deviations = sizes * shares.sum() / sizes.sum() - shares
-    cube = float((deviations**2).mean()) ** 1.5
-    skewness = float((deviations**3).mean()) / cube * (num * (num - 1)) ** 0.5 / max(num - 2, 1) if cube else 0.0
-    return 1.45 * max(8**0.5, skewness) * (variance.value * float(w @ w)) ** 0.5
-
-
-def _heavy_tailed(variance: _Variance, shares: np.ndarray, sizes: np.ndarray) -> _Variance:
-    """``variance`` over groups with fewer degrees of freedom, as squared errors have heavier tails than counts.
-
-    The variance of a sample variance grows with the excess kurtosis k by 1 + k (G - 1) / 2G; k is estimated, and at least 1.
-    """
-    deviations = shares - sizes * shares.sum() / sizes.sum()
-    square = float((deviations**2).mean())
-    excess = float((deviations**4).mean()) / square**2 - 3 if square else 0.0
-    return _Variance(variance.value, 1 / (1 / variance.freedom + max(1.0, excess) / (2 * len(sizes))))
-
-
-def _over_seeds(correct: np.ndarray, sizes: np.ndarray) -> _Variance:
-    """Variance of the mean accuracy over seeds, from [S, G] and [G]; 0 for one seed."""
-    means = correct.sum(1) / sizes.sum()
-    return _Variance(float(means.var(ddof=1)) / len(means), len(means) - 1) if len(means) > 1 else _Variance(0.0, 1)
-
-
-def _margin(groups: _Variance, seeds: _Variance) -> float:
-    """Half the width of the 95 % interval."""
-    return max(float(stdtrit(v.freedom, 0.975)) * v.value**0.5 for v in (groups + seeds, seeds))
-
-
-def _p(mean: float, variance: _Variance) -> float:
-    """Two-sided p of a mean by Student's t."""
-    if not variance.value:
-        return float(mean == 0)
-    return 2 * float(stdtr(variance.freedom, -abs(mean) / variance.value**0.5))
 
 
 Cell = tuple[str, str, str]  # (task, modality, source)

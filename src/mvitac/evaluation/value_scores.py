@@ -1,6 +1,6 @@
 """Scores of predicted values: R2, mean absolute error and root mean squared error in the target's unit.
 
-Like accuracy, R2 is computed from sums over each test group, so that intervals can leave groups out (``scores``).
+Like accuracy, R2 is computed from sums over each test group, so that intervals can leave groups out (``intervals``).
 """
 
 from collections.abc import Sequence

@@ -68,8 +68,8 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
         page = write_report(paths, out / "report", result=result, pack=pack)
     print_summary(result, console)
     print_retrieval(result, console)
-    if new := result.get("new sensor"):
-        first = next(iter(new["summary"]))
+    new = result.get("new sensor", {"summary": {}})
+    for first in list(new["summary"])[:1]:
         print_summary(new | {"summary": {first: new["summary"][first]}}, console)
     say(f"figures: {out / 'summary.json'}\nreport: {page}    (open it in a browser)")
     say(f"took {(time.perf_counter() - start) / 60:.1f} minutes")

@@ -5,9 +5,10 @@ from typing import Any
 
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
+from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.robustness import STRESSES
 from mvitac.evaluation.score_text import MODALITY_ORDER
-from mvitac.evaluation.scores import by_cell, interval, leaks_in, paired_difference, targets_of
+from mvitac.evaluation.scores import by_cell, leaks_in, targets_of
 from mvitac.evaluation.value_scores import one_target
 from mvitac.experiments.plan import ONE_ROW, Plan
 from mvitac.registry import from_json

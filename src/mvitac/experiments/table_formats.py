@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from mvitac.evaluation.external_encoders import about_lines
+from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
-from mvitac.evaluation.scores import by_cell, least_p, num_groups_of
+from mvitac.evaluation.scores import by_cell
 from mvitac.experiments.plan import Plan
 from mvitac.experiments.table import Cell, Line, lines_of, stresses_of, target_lines
 from mvitac.registry import from_json

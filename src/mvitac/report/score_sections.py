@@ -58,8 +58,8 @@ def probe(study: Study) -> str:
 
 def new_sensor(study: Study) -> str:
     """Scores on a sensor that was not trained on, of a demo; else ''."""
-    found = study.result.get("new sensor")
-    if not found:
+    found = study.result.get("new sensor", {"summary": {}})
+    if not found["summary"]:
         return ""
     cells = [cell for task in found["summary"].values() for cell in task["touch"].values()]
     intro = (

@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
+from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.retrieval import MIN_GALLERY
 from mvitac.evaluation.score_text import columns_of, sources_of
-from mvitac.evaluation.scores import interval
 from mvitac.model import Model
 from mvitac.report import figures, html, tables
 from mvitac.report.figures import Line

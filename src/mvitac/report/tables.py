@@ -5,6 +5,7 @@ from typing import Any
 
 from rich.table import Table
 
+from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.score_text import (
@@ -19,7 +20,7 @@ from mvitac.evaluation.score_text import (
     tested_on,
     with_interval,
 )
-from mvitac.evaluation.scores import interval, leaks_in, paired_difference
+from mvitac.evaluation.scores import leaks_in
 from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
