@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvitac.datasets.base import DatasetConfig
 from mvitac.methods.base import Method, MethodConfig
@@ -44,7 +44,15 @@ def run_of(method: str) -> Run:
 
 
 def build(method: str = "mvitac") -> Method:
-    return build_from(run_of(method), num_rows=NUM_ROWS)
+    """Smooth throughout: where a ReLU or a maximum switches, a difference of 1e-7 grows to per cents in three steps."""
+    built = build_from(run_of(method), num_rows=NUM_ROWS)
+    for parent in list(built.modules()):
+        for name, layer in parent.named_children():
+            if isinstance(layer, nn.ReLU):
+                setattr(parent, name, nn.GELU())
+            elif isinstance(layer, nn.MaxPool2d):
+                setattr(parent, name, nn.AvgPool2d(layer.kernel_size, layer.stride, layer.padding))
+    return built
 
 
 def loop_run(data: DatasetConfig, method: str) -> Run:
