@@ -182,7 +182,7 @@ class Hdf5Row(ImageRef):
             def image(ref: Any) -> Image.Image:
                 try:
                     pixels = images[ref.index]
-                except (OSError, RuntimeError) as error:
+                except (OSError, RuntimeError, IndexError) as error:
                     raise ValueError(f"{ref} cannot be read ({brief(error)})") from None
                 return Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
 
