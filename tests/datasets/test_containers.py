@@ -350,7 +350,7 @@ def make_tars(root: Path, mode: str = "w") -> Path:
 def test_a_webdataset_is_read_in_place(tmp_path: Path) -> None:
     root = make_tars(tmp_path / "tars")
     options: dict[str, Any] = {"labels": ("material",), "group": "object", "size": 16, "controls": ("force=force",)}
-    with pytest.raises(ValueError, match=r"row 6 has no touch path: .*allow-missing"):
+    with pytest.raises(ValueError, match=r"row 6 \(set/0005\) has no touch path: .*allow-missing"):
         WebDatasetConfig(path=root, **options).source()
     pack = packed(WebDatasetConfig(path=root, allow_missing=True, **options), tmp_path / "pack")
     assert pack.num == 24

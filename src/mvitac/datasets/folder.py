@@ -1,4 +1,4 @@
-"""``--data folder``: your own images, listed in a manifest or arranged in class folders.
+"""``--data folder``: your own images, listed in a manifest, stored in HDF5 files or arranged in class folders.
 
 A **manifest** (.csv, .parquet or .jsonl) has one row per sample; its paths are relative to its own folder, or absolute:
 
@@ -16,6 +16,12 @@ A path may be a **video**; column ``frame`` (or ``touch_frame``, ``vision_frame`
     <root>/left/<class>/...                     <root>/right/<class>/...                 two sensors instead of touch
     <root>/<class>/<name>.jpg                   one modality (see ``pictures``)
 
+An **HDF5 file** (.h5, .hdf5), or a folder of them, holds images and numbers as datasets with one row per frame
+(``mvitac.datasets.table.hdf5``); ``vision`` and ``touch`` name image datasets:
+
+    grips.h5     camera uint8 [N, H, W, 3]    gel uint8 [N, H, W, 3]    force_n [N]    pose [N, 6]    object [N]
+    demos.h5     data/demo_0/obs/camera       data/demo_0/obs/gel       data/demo_0/force             one group each
+
 Class folders are equivalent to a manifest with columns vision, touch (or left, right), label, group and, if there are
 split folders, split. A manifest is checked completely before the first image is decoded. Rows are counted from 1, without
 the header.
@@ -25,23 +31,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from mvitac.datasets.table.hdf5 import find_hdf5, read_hdf5
 from mvitac.datasets.table.manifest import Manifest, find_manifest, list_class_folders, read_manifest
 from mvitac.datasets.table.table import RowsConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class FolderConfig(RowsConfig):
-    """A folder of images, or a manifest with vision path, touch path, labels, group and split."""
+    """A folder of images, a manifest with vision path, touch path, labels, group and split, or HDF5 files."""
 
     name: ClassVar[str] = "folder"
 
     path: Path = Path("data")
-    """A manifest (.csv, .parquet, .jsonl), a folder with a manifest.*, or a folder of class folders."""
+    """A manifest (.csv, .parquet, .jsonl), a folder with a manifest.*, an HDF5 file (.h5, .hdf5) or a folder of them, or
+    a folder of class folders."""
     pictures: Literal["touch", "vision"] = "touch"
     """Modality of plain class folders (<root>/<class>/*.jpg)."""
 
     def manifest(self) -> Manifest:
-        file = find_manifest(self.path)
-        if file:
+        arrays = find_hdf5(self.path)
+        if file := None if self.path in arrays else find_manifest(self.path):
             return read_manifest(file)
+        if arrays:
+            images = [name for name in (self.vision, *self.touch, *self.background) if name]
+            return read_hdf5(self.path, arrays, images, self.vectors())
         return list_class_folders(self.path, pictures=self.pictures, allow_missing=self.allow_missing)

@@ -137,7 +137,7 @@ def read_values(
                 value = number_of(cell)
                 if value is None:
                     raise ValueError(
-                        f"{selected.where} row {selected.numbers[i]}: {target.name} is {cell!r}: give a finite number in"
+                        f"{selected.manifest.at(selected.numbers[i])}: {target.name} is {cell!r}: give a finite number in"
                         f" {target.unit} without the unit, or leave the cell empty"
                     )
                 columns[target.name][i] = value

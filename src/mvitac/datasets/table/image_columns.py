@@ -108,7 +108,7 @@ def check_present(
                 accept = "--data.allow-missing accepts rows without a modality"
                 hint = accept if all(gap) else "stacked sensors need both images"
                 raise ValueError(
-                    f"{manifest.file} row {number} has no {columns[gap.index(True)]} path: fill it, or leave the row out"
+                    f"{manifest.at(number)} has no {columns[gap.index(True)]} path: fill it, or leave the row out"
                     f" (--data.only); {hint}"
                 )
         lacking = [bool(gap) and all(gap) for gap in gaps]
@@ -119,7 +119,7 @@ def check_present(
     present = [m for m, columns in by_modality.items() if columns]
     for i, number in enumerate(numbers):
         if missing and all(m in missing and missing[m][i] for m in present):
-            raise ValueError(f"{manifest.file} row {number} has neither image: leave it out (--data.only)")
+            raise ValueError(f"{manifest.at(number)} has neither image: leave it out (--data.only)")
     return missing
 
 

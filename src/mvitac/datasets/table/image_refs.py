@@ -1,4 +1,4 @@
-"""References to images: in a file, a video, a tar or a cell of a parquet table.
+"""References to images: in a file, a video, a tar, a cell of a parquet table or a dataset of an HDF5 file.
 
 References with the same container (a video, a row group) are read together in one pass.
 """
@@ -7,6 +7,7 @@ import functools
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from mvitac.data import video
 from mvitac.data.images import decode
 from mvitac.system.files import brief
 
+HDF5 = (".h5", ".hdf5")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 
 
@@ -138,6 +140,53 @@ class ParquetCell(ImageRef):
             return decode(io.BytesIO(value), str(ref))
 
         yield from _each(refs, image, lost)
+
+
+CHUNK_BYTES = 64 << 20
+"""Cache for chunks of an HDF5 dataset. h5py's 1 MB is less than a chunk of several images, which each image would read."""
+
+
+@contextmanager
+def open_hdf5(path: str | Path) -> Iterator[Any]:
+    """Open an HDF5 file (h5py.File) for reading; ValueError if it, or something in it, is damaged."""
+    import h5py
+
+    try:
+        with h5py.File(path, rdcc_nbytes=CHUNK_BYTES) as file:
+            yield file
+    except (OSError, KeyError, RuntimeError, TypeError, UnicodeDecodeError) as error:  # h5py raises these
+        raise ValueError(
+            f"{path} cannot be read as HDF5 ({brief(error)}): is it complete, and closed by the program that wrote it?"
+        ) from None
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Hdf5Row(ImageRef):
+    """Row ``index`` (from 0) of a ``dataset`` of an HDF5 file: uint8 [rows, height, width, 1 or 3]."""
+
+    dataset: str
+    index: int
+
+    def __str__(self) -> str:
+        return f"{self.path} {self.dataset} row {self.index}"
+
+    def container(self) -> Hashable:
+        return (self.path, self.dataset)
+
+    @staticmethod
+    def read(refs: Sequence[ImageRef], lost: Damage) -> Iterator[tuple[ImageRef, Image.Image]]:
+        first: Hdf5Row = refs[0]  # type: ignore[assignment]
+        with open_hdf5(first.path) as file:
+            images = file[first.dataset]
+
+            def image(ref: Any) -> Image.Image:
+                try:
+                    pixels = images[ref.index]
+                except (OSError, RuntimeError, IndexError) as error:
+                    raise ValueError(f"{ref} cannot be read ({brief(error)})") from None
+                return Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
+
+            yield from _each(refs, image, lost)
 
 
 def _each(

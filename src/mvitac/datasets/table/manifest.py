@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from mvitac.data.images import IMAGES
 from mvitac.data.pack_table import SPLITS
-from mvitac.datasets.table.image_refs import VIDEOS, File, Frame, ImageRef
+from mvitac.datasets.table.image_refs import HDF5, VIDEOS, File, Frame, ImageRef
 from mvitac.datasets.table.splits import likely_split
 from mvitac.registry import unknown
 from mvitac.system.files import brief, digest, digest_file, parse_json
@@ -46,6 +46,10 @@ class Manifest:
     """Image columns that the reader resolved itself; other image columns hold paths."""
     labels: tuple[str, ...] = ()
     """Default label columns."""
+    group: str | None = None
+    """Default column of the group."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """What the file has and is no column -> why."""
 
     @classmethod
     def of(
@@ -57,7 +61,15 @@ class Manifest:
 
     def check(self, column: str) -> None:
         if column not in self.columns and column not in self.found:
+            for name in (column, column.partition("[")[0]):
+                if name in self.left_out:
+                    raise ValueError(f"{self.file}: {name} {self.left_out[name]}")
             raise ValueError(f"{self.file}: {unknown('column', column, (*self.columns, *self.found))}")
+
+    def at(self, number: int) -> str:
+        """Name row ``number``, for error messages. Nobody counts the rows of a container, so the id is said too."""
+        name = self.rows[number - 1].get("id") if self.found else None
+        return f"{self.file} row {number}" + (f" ({name})" if name else "")
 
     def normalised(self, paths: Collection[str | None]) -> "Manifest":
         """Return this table with the cells in one form (``normal``), except in the columns of ``paths``.
@@ -147,9 +159,14 @@ def find_manifest(path: Path) -> Path | None:
             raise ValueError(f"{path} holds {' and '.join(p.name for p in found)}: give the path of one of them")
         return found[0] if found else None
     if not path.is_file():
-        raise ValueError(f"{path} does not exist: give a manifest ({', '.join(MANIFESTS)}) or a folder as --data.path")
+        raise ValueError(
+            f"{path} does not exist: give a manifest ({', '.join(MANIFESTS)}), an HDF5 file ({', '.join(HDF5)}) or a"
+            " folder as --data.path"
+        )
     if path.suffix.lower() not in MANIFESTS:
-        raise ValueError(f"{path} is not a manifest: its name must end in {', '.join(MANIFESTS)}")
+        raise ValueError(
+            f"{path} is not a manifest or HDF5 file: its name must end in {', '.join((*MANIFESTS, *HDF5))}"
+        )
     return path
 
 
@@ -254,7 +271,7 @@ def _split_rows(root: Path, split: str, pictures: str, allow_missing: bool) -> l
     found = {name: _images_below(base / name) for name in named} or {pictures: _images_below(base)}
     if not named and not any("/" in key for key in found[pictures]):
         raise ValueError(
-            f"{base} has no manifest.csv (.parquet, .jsonl) and no folder vision, touch, left or right"
+            f"{base} has no manifest.csv (.parquet, .jsonl), no HDF5 file and no folder vision, touch, left or right"
             " nor class folders with images: make them, or give another path"
         )
     rows = []

@@ -119,7 +119,7 @@ def check_sides(
     for task, target in zip(tasks, targets, strict=True):
         for side in ("train", "test"):
             if not any(label >= 0 and s == side for label, s in zip(target, splits, strict=True)):
-                more = "give more groups, or another --data.test-share"
+                more = "give more groups (--data.group COLUMN), or another --data.test-share"
                 hint = more if split == BY_GROUP else "a probe needs train and test"
                 raise ValueError(f"{where}: {what} gives label {task.name!r} no labelled rows in {side}: {hint}")
 

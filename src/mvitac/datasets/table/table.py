@@ -182,7 +182,7 @@ class Rows(Source):
         manifest = manifest.normalised({self._vision, *self._touch, *(config.background or ("background",))})
         # Tables that were in this form keep their packs in the cache.
         self._form = {} if manifest.rows == given and not _names_nan(given) else {"cells": "normal"}
-        self._group = config.group or ("group" if "group" in manifest.columns else None)
+        self._group = config.group or ("group" if "group" in manifest.columns else manifest.group)
         self._split = config.split or ("split" if "split" in manifest.columns else BY_GROUP)
         self._sensor = config.sensor or ("sensor" if "sensor" in manifest.columns else None)
         label_columns = config.labels or manifest.labels

@@ -1,0 +1,195 @@
+"""HDF5 files as a table: datasets with one row per frame, in one group or in one group per demonstration.
+
+    grips.h5          camera, gel  uint8 [N, H, W, 3]      force_n [N]      pose [N, 6]      object [N] (text)
+    demos.hdf5        data/demo_0/obs/camera  data/demo_0/obs/gel  data/demo_0/force  data/demo_1/...     (robomimic)
+    episode_0.hdf5    observations/images/camera  observations/images/gel  observations/qpos  action      (ACT)
+
+A demonstration is a group below which an image dataset has the name asked for, e.g. obs/camera. Its datasets are columns,
+named by their path below it. Attributes of the group, and of the groups above it, are columns of one value.
+"""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvitac.datasets.table.image_refs import HDF5, Hdf5Row, ImageRef, open_hdf5
+from mvitac.datasets.table.manifest import Manifest, text_of
+from mvitac.system.files import digest
+
+USUAL = ("vision", "touch", "left", "right", "background")
+"""Names of image datasets that are found without being asked for."""
+MAX_TEXT = 200
+"""Characters of the longest attribute that is a column. robomimic keeps whole simulator files in attributes."""
+Refs = dict[str, list[ImageRef | None]]
+
+
+def find_hdf5(path: Path) -> list[Path]:
+    """Return the HDF5 file ``path``, or those in this folder."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return [file for file in files if file.suffix.lower() in HDF5 and file.is_file()]
+
+
+def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vectors: Collection[str]) -> Manifest:
+    """Return the table of ``files``, which are ``path`` itself or in this folder.
+
+    ``images`` are the names of image datasets, by default ``USUAL``; ``vectors`` those of datasets [N, K] that become
+    columns of lists. Columns demo (the group's path, after the file's name where that is needed), frame (from 0) and id
+    are added if the file has none.
+    """
+    rows: list[dict[str, str]] = []
+    found: Refs = {}
+    left_out: dict[str, str] = {}
+    seen = ""
+    for file in files:
+        with open_hdf5(file) as opened:
+            everything = _datasets(opened)
+            for name in _demonstrations(file, everything, images):
+                demo = "/".join(filter(None, (file.stem if len(files) > 1 or not name else "", name)))
+                datasets = _datasets(opened[name]) if name else everything
+                refs = _images(file, name, datasets, images)
+                num = len(next(iter(refs.values())))
+                cells = _constants(opened, name, vectors, left_out)
+                cells |= _columns(demo, datasets, num, refs, vectors, left_out)
+                for column in {**found, **refs}:
+                    found.setdefault(column, [None] * len(rows)).extend(refs.get(column, [None] * num))
+                for i in range(num):
+                    own = {"id": f"{demo}/{i}", "demo": demo, "frame": str(i)}
+                    rows.append(own | {column: texts[i % len(texts)] for column, texts in cells.items()})
+            seen = _seen(everything)
+    if missing := [name for name in images if name not in found]:
+        raise _no_images(path, missing, seen)
+    if not rows:
+        raise ValueError(f"{path}: the image datasets have no rows: is the recording empty?")
+    columns = tuple(name for name in dict.fromkeys(name for row in rows for name in row) if name not in left_out)
+    rows = [{name: row.get(name, "") for name in columns} for row in rows]
+    root, key = path if path.is_dir() else path.parent, digest([rows, sorted(found)])
+    return Manifest(path, root, columns, rows, key, found, group="demo", left_out=left_out)
+
+
+def _datasets(group: Any) -> dict[str, Any]:
+    """Return the datasets below ``group`` by their path."""
+    found: dict[str, Any] = {}
+    group.visititems(lambda path, item: found.update({path: item} if getattr(item, "shape", None) is not None else {}))
+    return found
+
+
+def _demonstrations(file: Path, datasets: dict[str, Any], images: Collection[str]) -> list[str]:
+    """Return the paths of the groups that hold image datasets ("" = the file itself)."""
+    if not datasets:
+        raise ValueError(f"{file} holds no datasets: is it the right file?")
+    groups: dict[str, str] = {}
+    for path, dataset in datasets.items():
+        for name in images or USUAL:
+            if f"/{path}".endswith(f"/{name}") and (images or dataset.ndim == 4):
+                groups.setdefault(path[: -len(name)].rstrip("/"), path)
+    if not groups:
+        raise _no_images(file, images or USUAL[:2], _seen(datasets))
+    rows = {(path.rpartition("/")[0], *dataset.shape[:1]) for path, dataset in datasets.items()}
+    whole = {group: _topmost(group, datasets[path], rows) for group, path in groups.items()}
+    parts = [group for group, top in whole.items() if top != group]
+    # The length of one demonstration may be that of a list above it by chance.
+    if parts and (len(parts) == len(groups) or any(whole[group] in groups for group in parts)):
+        path, top = groups[parts[0]], whole[parts[0]]
+        raise ValueError(
+            f"{file}: {path} belongs to {top or 'the datasets of the file'}, which has other datasets of this length:"
+            f" name it by its path from there, {path.removeprefix(top).strip('/')}"
+        )
+    return list(groups)
+
+
+def _topmost(group: str, image: Any, rows: set[tuple[Any, ...]]) -> str:
+    """Return the highest group above ``group`` that itself has a dataset as long as ``image``; else ``group``."""
+    parts = group.split("/") if group else []
+    above = ("/".join(parts[:depth]) for depth in range(len(parts)))
+    return next((name for name in above if (name, *image.shape[:1]) in rows), group)
+
+
+def _seen(datasets: dict[str, Any]) -> str:
+    """Describe the datasets that may hold images, one of each name."""
+    longest_first = sorted(datasets, key=lambda path: (len(path), path), reverse=True)
+    named = {path.rpartition("/")[2]: path for path in longest_first if datasets[path].ndim > 2}
+    return ", ".join(f"{path} {list(datasets[path].shape)}" for path in sorted(named.values())[:6])
+
+
+def _no_images(where: Path, names: Collection[str], seen: str) -> ValueError:
+    return ValueError(
+        f"{where} has no image dataset {' or '.join(map(repr, names))} (it has {seen or 'none'}): name images by their"
+        " path below the demonstration, --data.vision obs/camera --data.touch obs/gel"
+    )
+
+
+def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[str]) -> Refs:
+    """Return a reference per row of each image dataset of demonstration ``name``."""
+    shown = {n: d for n, d in datasets.items() if n in images or (n in USUAL and d.ndim == 4)}
+    for data in shown.values():
+        if data.dtype != np.uint8 or data.ndim != 4 or data.shape[3] not in (1, 3) or 0 in data.shape[1:]:
+            raise ValueError(
+                f"{file}: {data.name} is {data.dtype} {list(data.shape)}: images must be uint8 [rows, height, width, 3],"
+                " or 1 for gray"
+            )
+    (first, num), *others = ((data.name, len(data)) for data in shown.values())
+    for other, length in others:
+        if length != num:
+            raise ValueError(f"{file}: {other} has {length} rows, {first} has {num}: images of a row must be there")
+    return {c: [Hdf5Row(str(file), data.name, i) for i in range(num)] for c, data in shown.items()}
+
+
+def _columns(
+    demo: str,
+    datasets: dict[str, Any],
+    num: int,
+    skip: Collection[str],
+    vectors: Collection[str],
+    left_out: dict[str, str],
+) -> dict[str, list[str]]:
+    """Return the texts of the datasets that are columns: one per row, or one for all; others go to ``left_out``."""
+    cells: dict[str, list[str]] = {}
+    for name, data in datasets.items():
+        if name in skip:
+            continue
+        text = _is_text(data)
+        if data.ndim and len(data) != num:
+            left_out.setdefault(name, f"has {len(data)} rows in {demo}, the images have {num}: they must be equal")
+        elif data.ndim > 2 or (data.dtype.kind not in "biuf" and not text):
+            left_out.setdefault(name, f"is {data.dtype} {list(data.shape)}: a column needs a number or a text per row")
+        elif data.ndim == 2 and data.shape[1] != 1 and name not in vectors:
+            left_out.setdefault(name, f"has {data.shape[1]} numbers per row: name one of them, as in {name}[0]")
+        else:
+            try:
+                values = (data.asstr("utf-8") if text else data)[()]
+            except UnicodeDecodeError:
+                left_out.setdefault(name, f"is not UTF-8 text in {demo}: write it again")
+                continue
+            values = np.reshape(values, (-1,)) if data.size in (1, num) else values
+            cells[name] = [text_of(value) for value in values.tolist()]
+    return cells
+
+
+def _is_text(data: Any) -> bool:
+    import h5py
+
+    return h5py.check_string_dtype(data.dtype) is not None
+
+
+def _constants(opened: Any, name: str, vectors: Collection[str], left_out: dict[str, str]) -> dict[str, list[str]]:
+    """Return the attributes of group ``name`` and of those above it; the nearest counts."""
+    cells: dict[str, list[str]] = {}
+    parts = name.split("/") if name else []
+    for depth in range(len(parts) + 1):
+        for column, value in opened["/".join(parts[:depth]) or "/"].attrs.items():
+            plain = np.asarray(value).tolist()
+            plain = plain[0] if isinstance(plain, list) and len(plain) == 1 else plain
+            plain = plain.decode() if isinstance(plain, bytes) else plain
+            if isinstance(plain, str) and len(plain) > MAX_TEXT:
+                left_out.setdefault(
+                    column, f"is an attribute of {len(plain)} characters: a column has at most {MAX_TEXT}"
+                )
+            elif isinstance(plain, list) and column not in vectors:
+                left_out.setdefault(
+                    column, f"is an attribute of {len(plain)} values: name one of them, as in {column}[0]"
+                )
+            elif isinstance(plain, (str, int, float, list)):
+                cells[column] = [text_of(plain)]
+    return cells

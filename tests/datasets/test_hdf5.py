@@ -1,0 +1,285 @@
+"""HDF5 files as people write them: one group or one per demonstration; each pixel and number beside its own row."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.pack import Pack
+from mvitac.datasets.folder import FolderConfig
+
+SHORT = 200  # characters of an attribute
+
+
+def grays(*levels: int, channels: int = 3, side: int = 16) -> np.ndarray:
+    """Images of one gray level each, uint8 [N, side, side + 4, channels]."""
+    return np.broadcast_to(np.array(levels, np.uint8)[:, None, None, None], (len(levels), side, side + 4, channels))
+
+
+def write(path: Path, content: Mapping[str, Any], attributes: Mapping[str, Any] | None = None) -> Path:
+    """An HDF5 file of datasets, and attributes as "group@name"; images are compressed, two to a chunk."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        for name, value in content.items():
+            images = np.ndim(value) == 4 and len(value) > 0
+            chunks: dict[str, Any] = {"chunks": (2, *np.shape(value)[1:]), "compression": "gzip"} if images else {}
+            file.create_dataset(name, data=value, **chunks)
+        for name, value in (attributes or {}).items():
+            group, _, attribute = name.partition("@")
+            file.require_group(group or "/").attrs[attribute] = value
+    return path
+
+
+def flat(**changes: Any) -> dict[str, Any]:
+    """20 rows of 5 objects: camera 0 to 19, gel 100 to 119 (gray, one channel); None removes a dataset."""
+    n = np.arange(20)
+    content: dict[str, Any] = {
+        "camera": grays(*n.tolist()),
+        "gel": grays(*(100 + n).tolist(), channels=1),
+        "force_n": (n / 4).astype(np.float32),
+        "pose": np.stack([n, n * 2.0, np.where(n == 3, np.nan, n / 8)], axis=1),
+        "depth": n[:, None] / 2,
+        "object": [f"objet é{i // 4}" for i in n],
+        "held": n % 3 == 0,
+        "notes": np.zeros((3, 2)),
+    } | changes
+    return {name: value for name, value in content.items() if value is not None}
+
+
+FLAT: dict[str, Any] = {"vision": "camera", "touch": ("gel",), "group": "object", "size": 16}
+LENGTHS = (3, 5, 4, 6)
+
+
+def demos(root: Path, name: str = "demos.hdf5", **changes: Any) -> Path:
+    """robomimic's layout, 4 demonstrations: images of row i of demonstration k are 50 k + i (camera) and 20 + that."""
+    content: dict[str, Any] = {"mask/train": np.array([b"demo_0"])}
+    attributes: dict[str, Any] = {"@robot": "arm", "data@total": 18, "data@env_args": "{}" * SHORT}
+    for k, length in enumerate(LENGTHS):
+        demo, i = f"data/demo_{k}", np.arange(length)
+        for part, plus in (("obs", 0), ("next_obs", 1)):
+            content[f"{demo}/{part}/camera"] = grays(*(50 * k + i + plus).tolist())
+            content[f"{demo}/{part}/gel"] = grays(*(50 * k + 20 + i + plus).tolist())
+        content |= {f"{demo}/force": 10 * k + i, f"{demo}/obs/state": np.stack([i, i + k], axis=1)}
+        attributes |= {f"{demo}@object": np.bytes_(f"cup{k % 2}"), f"{demo}@weight": np.array([k / 2])}
+        attributes[f"{demo}@origin"] = np.array([k, 7.5])
+    attributes["data/demo_2@robot"] = "hand"  # the nearest counts
+    content |= changes
+    return write(root / name, {name: value for name, value in content.items() if value is not None}, attributes)
+
+
+DEMOS: dict[str, Any] = {"vision": "obs/camera", "touch": ("obs/gel",), "size": 16}
+
+
+def packed(config: FolderConfig, out: Path) -> Pack:
+    return build(config.source(), out, size=config.size, quiet=True)
+
+
+def levels(pack: Pack, modality: str) -> list[int]:
+    images = pack.images[modality]
+    assert all((image == image[0, 0, 0]).all() for image in images)
+    return [int(image[0, 0, 0]) for image in images]
+
+
+def test_one_row_per_entry_of_the_first_axis(tmp_path: Path) -> None:
+    values = ("force_n:N", "pose=pose[2]:mm,pose[1]:deg", "depth:mm")
+    config = FolderConfig(path=write(tmp_path / "a.h5", flat()), values=values, labels=("held",), **FLAT)
+    pack = packed(config, tmp_path / "pack")
+    rows = np.array(levels(pack, "vision"))
+    assert sorted(rows) == list(range(20)) and levels(pack, "touch") == (100 + rows).tolist()
+    force, pose, depth = (pack.values(task) for task in pack.spec.values)
+    assert np.allclose(force[:, 0], rows / 4) and np.allclose(depth[:, 0], rows / 2)
+    assert np.allclose(pose, np.stack([np.where(rows == 3, np.nan, rows / 8), rows * 2.0], axis=1), equal_nan=True)
+    assert pack.column("group").tolist() == [f"objet é{i // 4}" for i in rows]
+    assert [pack.spec.tasks[0].classes[i] for i in pack.column("label_held")] == [str(i % 3 == 0) for i in rows]
+    assert pack.column("frame").astype(int).tolist() == rows.tolist() and set(pack.column("demo")) == {"a"}
+
+
+def test_a_group_is_a_demonstration(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"values": ("force:N", "obs/state[1]:mm", "origin[1]:m"), "labels": ("object",)}
+    with pytest.raises(ValueError, match=r"column 'origin\[1\]' has fewer than two different values"):
+        FolderConfig(path=demos(tmp_path), **options, **DEMOS).source()
+    options["values"] = ("force:N", "obs/state[1]:mm", "origin[0]:m")
+    pack = packed(FolderConfig(path=tmp_path / "demos.hdf5", **options, **DEMOS), tmp_path / "pack")
+    expected = {(f"data/demo_{k}", i): 50 * k + i for k, length in enumerate(LENGTHS) for i in range(length)}
+    at = list(zip(pack.column("demo"), pack.column("frame").astype(int), strict=True))
+    assert dict(zip(at, levels(pack, "vision"), strict=True)) == expected and pack.num == len(expected)
+    assert levels(pack, "touch") == [expected[place] + 20 for place in at]
+    number, frame = np.array([(int(demo[-1]), i) for demo, i in at]).T
+    force, state, origin = (pack.values(task)[:, 0] for task in pack.spec.values)
+    assert (force == 10 * number + frame).all() and (state == frame + number).all() and (origin == number).all()
+    assert pack.spec.group_by == "demo" and (pack.column("group") == pack.column("demo")).all()
+    assert pack.column("object").tolist() == [f"cup{k % 2}" for k in number]
+    assert pack.column("robot").tolist() == ["hand" if k == 2 else "arm" for k in number]
+    assert set(pack.column("weight")) == {"0", "0.5", "1", "1.5"} and set(pack.column("total")) == {"18"}
+    assert pack.column("id")[0] == "data/demo_0/0" and "env_args" not in pack.table.column_names
+    touched = packed(
+        FolderConfig(path=tmp_path / "demos.hdf5", touch_group="demo", group="object", **DEMOS), tmp_path / "t"
+    )
+    assert set(touched.column("touch_group")) == {f"data/demo_{k}" for k in range(4)}
+
+
+def test_a_folder_of_files(tmp_path: Path) -> None:
+    for k in range(3):
+        content = {"observations/images/top": grays(k, k), "observations/images/gel": grays(9, 9)}
+        write(tmp_path / f"set/episode_{k}.HDF5", content | {"action": np.zeros((2, 7))}, {"@sim": k == 1})
+    names: dict[str, Any] = {"vision": "observations/images/top", "touch": ("observations/images/gel",), "size": 16}
+    pack = packed(FolderConfig(path=tmp_path / "set", labels=("sim",), test_share=0.4, **names), tmp_path / "pack")
+    assert pack.column("demo").tolist() == [f"episode_{k}" for k in levels(pack, "vision")] and pack.num == 6
+    demos(tmp_path / "two", "a.h5"), demos(tmp_path / "two", "b.h5")
+    table = FolderConfig(path=tmp_path / "two", **DEMOS).manifest()
+    assert len({row["demo"] for row in table.rows}) == 8 and table.rows[-1]["demo"] == "b/data/demo_3"
+
+
+def test_usual_names_need_no_option(tmp_path: Path) -> None:
+    content = {f"{demo}/{name}": grays(1, 2) for demo in ("x", "y") for name in ("vision", "left", "right")}
+    pack = packed(FolderConfig(path=write(tmp_path / "a.h5", content), size=16), tmp_path / "pack")
+    assert (pack.spec.vision_channels, pack.spec.touch_channels) == (3, 6)
+    empty = {"touch": grays(180, 190), "background": grays(100, 110), "left": np.zeros((2, 5))}
+    config = FolderConfig(path=write(tmp_path / "b.h5", empty), size=16, difference=True)
+    assert levels(packed(config, tmp_path / "difference"), "touch") == [168, 168]
+
+
+def test_what_a_demonstration_lacks(tmp_path: Path) -> None:
+    path = demos(tmp_path, **{"data/demo_1/force": None, "data/demo_3/obs/gel": None})
+    with pytest.raises(ValueError, match=r"row 13 \(data/demo_3/0\) has no obs/gel path: .*--data\.allow-missing"):
+        FolderConfig(path=path, **DEMOS).source()
+    config = FolderConfig(path=path, values=("force:N",), allow_missing=True, split_seed=1, **DEMOS)
+    pack = packed(config, tmp_path / "pack")
+    number = np.array([int(demo[-1]) for demo in pack.column("demo")])
+    assert (pack.has("touch") == (number != 3)).all()
+    assert (np.isnan(pack.values(pack.spec.values[0])[:, 0]) == (number == 1)).all()
+
+
+def test_changes_of_the_file_are_noticed(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.h5", flat())
+    config = FolderConfig(path=path, values=("force_n:N",), **FLAT)
+    places, fingerprints = [config.place()], [config.source().fingerprint()]
+    assert config.place() == places[0]
+    for name in ("gel", "force_n"):
+        before = os.stat(path)
+        with h5py.File(path, "r+") as file:
+            dataset: Any = file[name]
+            dataset[4] = 7
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 10**9))
+        places.append(config.place())
+        fingerprints.append(config.source().fingerprint())
+    assert len(set(places)) == 3
+    assert fingerprints[0] != fingerprints[2]  # numbers are in the fingerprint itself; of images, the file's size
+
+
+def test_a_damaged_chunk_costs_its_own_rows(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.h5", flat(gel=np.random.default_rng(0).integers(0, 256, (20, 16, 16, 3), np.uint8)))
+    with h5py.File(path) as file:
+        gel: Any = file["gel"]
+        chunk = gel.id.get_chunk_info(3)  # rows 7 and 8
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    path.write_bytes(data)
+    source = pickle.loads(pickle.dumps(FolderConfig(path=path, **FLAT).source()))  # as a worker gets it
+    with pytest.raises(ValueError, match=r"2 of 20 samples cannot be read, first row 7: .*a\.h5 /gel row 6 cannot be"):
+        build(source, tmp_path / "none", size=16, quiet=True)
+    pack = build(source, tmp_path / "pack", size=16, quiet=True, max_damaged=0.1)
+    assert levels(pack, "vision") == [i for i in range(20) if i not in (6, 7)]
+
+
+def nested(**content: Any) -> dict[str, Any]:
+    return {f"data/demo_{k}/{name.replace('__', '/')}": value for k in range(2) for name, value in content.items()}
+
+
+IMAGES = {"camera": grays(*range(20)), "gel": grays(*range(20))}
+BAD: dict[str, tuple[dict[str, Any], dict[str, str], str]] = {
+    "dataset missing": (flat(gel=None), {}, r"has no image dataset 'gel' \(it has camera \[20, 16, 20, 3\]\)"),
+    "both missing": (flat(gel=None, camera=None), {}, r"no image dataset 'camera' or 'gel' \(it has none\)"),
+    "no name": (flat(), {"vision": "", "touch": ""}, r"no image dataset 'vision' or 'touch' \(it has camera .*, gel "),
+    "lengths of images": (flat(gel=grays(1, 2)), {}, "/gel has 2 rows, /camera has 20"),
+    "length of a number": (flat(force_n=np.arange(9)), {}, "force_n has 9 rows in a, the images have 20"),
+    "length of a vector": (
+        flat(pose=np.ones((9, 3))),
+        {"values": "pose[0]:mm"},
+        "pose has 9 rows in a, the images have",
+    ),
+    "dtype": (
+        flat(gel=np.zeros((20, 16, 16, 3), np.float32)),
+        {},
+        r"/gel is float32 \[20, 16, 16, 3\]: images must be u",
+    ),
+    "axes": (
+        flat(gel=np.zeros((20, 16, 16), np.uint8)),
+        {},
+        r"/gel is uint8 \[20, 16, 16\]: images must be uint8 \[rows",
+    ),
+    "channels first": (
+        flat(gel=np.zeros((20, 3, 16, 16), np.uint8)),
+        {},
+        r"/gel is uint8 \[20, 3, 16, 16\]: images mus",
+    ),
+    "nothing in it": ({}, {}, r"a\.h5 holds no datasets"),
+    "no rows": ({"camera": grays(), "gel": grays()}, {}, "the image datasets have no rows"),
+    "text for a number": (
+        flat(force_n=["1", "2 N"] * 10),
+        {},
+        r"row 2 \(a/1\): force_n is '2 N': give a finite number",
+    ),
+    "infinite": (flat(force_n=np.full(20, np.inf)), {}, "row 1 .*force_n is 'inf': give a finite number"),
+    "complex": (
+        flat(force_n=np.zeros(20, complex)),
+        {},
+        r"force_n is complex128 \[20\]: a column needs a number or a tex",
+    ),
+    "not UTF-8": (flat(force_n=np.array([b"\xff"] * 20)), {}, "force_n is not UTF-8 text in a"),
+    "no such column": (flat(), {"values": "force:N"}, "unknown column 'force': .*did you mean 'force_n'"),
+    "a whole vector": (flat(), {"values": "pose:mm"}, r"pose has 3 numbers per row: name one of them, as in pose\[0\]"),
+    "past the vector": (flat(), {"values": "pose[3]:mm"}, r"pose\[3\] does not exist: pose has 3 numbers"),
+    "one group": (
+        flat(object=None),
+        {"group": "demo"},
+        r"assigning 1 groups .*: give more groups \(--group COLUMN\)",
+    ),
+    "one id twice": (flat(id=np.ones(20, int)), {}, "id '1' occurs in several rows"),
+    "part of a demonstration": (
+        nested(obs__camera=IMAGES["camera"], obs__gel=IMAGES["gel"], force_n=np.arange(20)),
+        {},
+        "data/demo_0/obs/camera belongs to data/demo_0, .*from there, obs/camera",
+    ),
+    "touch in a part": (
+        nested(camera=IMAGES["camera"], obs__gel=IMAGES["gel"]),
+        {},
+        "data/demo_0/obs/gel belongs to data/demo_0, .*from there, obs/gel",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_named_in_one_line(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    content, options, says = BAD[name]
+    write(tmp_path / "a.h5", content)
+    refused(tmp_path / "a.h5", options, says, capsys)
+
+
+@pytest.mark.parametrize("keep", [0, 100, 3000, -1])
+def test_truncated_files(tmp_path: Path, keep: int, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path / "a.h5", flat())
+    path.write_bytes(path.read_bytes()[:keep])
+    refused(path, {}, r"a\.h5 cannot be read as HDF5 \(.*\): is it complete", capsys)
+
+
+def refused(path: Path, options: dict[str, str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Check that packing ends with exit code 2, one line and nothing on disk."""
+    out = path.parent / "out"
+    given = {"vision": "camera", "touch": "gel", "values": "force_n:N", "group": "object"} | options
+    words = [word for name, value in given.items() for word in (f"--{name}", value)]
+    assert main(["data", "pack", "--data", "folder", "--path", str(path), "--out", str(out), *words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("mvitac: error: ") and error.count("\n") == 1
+    assert re.search(says, error), error
+    assert not list(path.parent.glob("out*"))
