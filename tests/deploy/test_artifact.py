@@ -108,15 +108,15 @@ def test_publish_command_and_card(smoke_run: Path, tmp_path: Path, capsys: pytes
 
 def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:
     model, manifest = mvitac.load(artifact), read_manifest(artifact)
-    assert "Encoders and probes: toy, by tests/support/toy.py. Licence: none." in card(model, manifest)
+    assert "Encoders and probes: toy; source: tests/support/toy.py; licence: none." in card(model, manifest)
     assert "pre-trained without labels" in card(model, manifest)
     manifest["data"] = {"name": "other", "licence": "CC-BY", "source": "others"}
     model.tasks = ("pattern",)  # as a supervised method leaves behind
     text = card(model, manifest)
     assert "# mvitac on toy" in text and "with linear probes on other." in text
     assert (
-        "Encoders: toy, by tests/support/toy.py. Licence: none." in text
-        and "Probes: other, by others. Licence: CC-BY." in text
+        "Encoders: toy; source: tests/support/toy.py; licence: none." in text
+        and "Probes: other; source: others; licence: CC-BY." in text
     )
     assert "under: none, and CC-BY" in text and "without labels" not in text
 

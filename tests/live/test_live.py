@@ -18,7 +18,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from mvitac.cli.live import _engine, _print_touch, _run, sources, view
 from mvitac.cli.main import main
@@ -36,6 +35,7 @@ from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.model import Model
 from mvitac.report.value_figures import over_time
+from mvitac.system.console import Console
 from support.faults import Clock, Rig, World, faulty
 
 
@@ -728,6 +728,11 @@ def test_a_value_has_as_many_digits_as_its_spread_allows(spread: float, text: st
     assert str(Reading("force_n", "N", 3.1622, spread, 3.0, 4.0)).startswith(text + " +- ")
 
 
+def test_a_range_whose_ends_print_alike_is_one_number() -> None:
+    ends = [Reading("force_n", "N", 3.1, 2.0, low, 3.2).over_touch() for low in (1.4, 2.9)]
+    assert ends == ["1 to 3 N +- 2", "3 N +- 2"]
+
+
 def test_the_picture_and_the_line_of_a_touch_have_values(measuring: Engine) -> None:
     world = World(measuring)
     assert draw(world.live).shape == (256 + 24 * (4 + 3), 512, 3)  # level, and level and weight
@@ -736,7 +741,7 @@ def test_the_picture_and_the_line_of_a_touch_have_values(measuring: Engine) -> N
     console = Console(width=300, file=io.StringIO())
     assert _print_touch(world.live, console, 0) == 1
     text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert re.search(r"weight: -?[\d.]+ to -?[\d.]+ N \+- [\d.]+", text) and "level: " in text
+    assert re.search(r"weight: -?[\d.]+ (to -?[\d.]+ )?N \+- [\d.]+", text) and "level: " in text
 
 
 def test_predictions_are_written_line_by_line(value_onnx: Path, measured: Pack, tmp_path: Path) -> None:

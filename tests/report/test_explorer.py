@@ -305,6 +305,7 @@ def test_the_page_in_a_browser(browser: Browser, explored: int, land: ExplorerDa
     browser.resize(390, 844, mobile=True)
     browser.wait("document.documentElement.scrollWidth <= 390")
     browser.wait("document.querySelector('.map canvas').clientWidth > 200")
+    browser.wait("[...document.querySelectorAll('.form > *')].every((e) => e.scrollWidth <= e.clientWidth)")
     browser.screenshot(tmp_path / "phone.png")
     with Image.open(tmp_path / "phone.png") as picture:
         assert picture.size == (390, 844)

@@ -18,6 +18,8 @@ import mvitac
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.system.console import Console
+from mvitac.system.progress import shown, work
+from mvitac.system.terminal import plain_output, wrapped
 from support.forged_packs import described
 
 EVIL = "\x1b]0;owned\x07\x1b[2J\x9b1A\rrm"
@@ -37,6 +39,43 @@ def test_consoles_print_escapes_of_labels_as_question_marks() -> None:
     assert "?]0;owned" in text and "\x1b[31m" in text and "\x1b[?25l" in text  # colour and cursor are ours
     assert not SPOILT.search(re.sub(r"\x1b\[(\d+;?)*m|\x1b\[\?25l", "", text))
     assert len({len(line) for line in text.splitlines()[1:6]}) == 1 or "┃" in text  # columns stay aligned
+
+
+def test_bars_keep_their_own_escapes_beside_printed_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rich puts a proxy before ours while bars are shown, and its bars must still reach the terminal itself."""
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with plain_output(), shown(), work("reading", 2, "images") as tick:
+        tick()
+        print(EVIL)
+    text = terminal.getvalue()
+    assert "reading" in text and "\x1b[2K" in text and "?[2K" not in text, text
+    assert "rm" in text and not SPOILT.search(re.sub(r"\x1b\[(\d+;?)*[mA]|\x1b\[(2K|\?25[lh])|\r", "", text))
+
+
+@pytest.mark.parametrize("on_terminal", [True, False])
+def test_long_lines_break_between_words_on_a_terminal_only(on_terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    text, streams = "missing: " + 12 * "column/of/a/table ", [io.StringIO(), io.StringIO()]
+    for name, stream in zip(("stdout", "stderr"), streams, strict=True):
+        monkeypatch.setattr(stream, "isatty", lambda: on_terminal)
+        monkeypatch.setattr(sys, name, stream)
+    monkeypatch.setenv("COLUMNS", "50")
+    monkeypatch.setenv("TERM", "xterm")
+    Console(highlight=False, width=50).print(text.strip(), soft_wrap=True)
+    assert main(["data", "info", text]) == 2
+    for stream in streams:
+        lines = stream.getvalue().splitlines()
+        assert (len(lines) > 4 and max(map(len, lines)) <= 50) if on_terminal else len(lines) == 1, lines
+        assert " ".join(line.strip() for line in lines).count("column/of/a/table") == 12
+
+
+def test_choices_break_after_a_bar() -> None:
+    text = "usage:\n  --data " + "|".join(["calandra", "folder", "physiclear"] * 4)
+    lines = wrapped(text, 40).splitlines()
+    assert lines[1].endswith("|") and max(map(len, lines)) <= 40 and all(line[:2] == "  " for line in lines[1:])
+    assert "".join(wrapped(text, 40).split()) == "".join(text.split())
 
 
 @pytest.mark.parametrize("command", [["data", "info", "{pack}"], ["data", "info", EVIL]])

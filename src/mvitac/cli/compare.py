@@ -75,7 +75,7 @@ _MANUAL = """Many runs into one table: methods x settings x seeds, next to contr
       reference = "MViTac"            # the row the others are tested against
       set = {{ steps = 300 }}           # fields of every run
       data = {{ name = "pack", path = "packs/materials" }}
-      # folds = ["split=fold1", "split=fold2"]  # cross-validation over columns of a folder's manifest
+      # folds = ["split=fold1", "split=fold2"]  # folds in columns of a manifest
       [[rows]]
       label = "MViTac"
       [[rows]]

@@ -117,7 +117,7 @@ def live(argv: list[str]) -> None:
 
         _run(loop, console, window, options.seconds, keep)
     summary = loop.summary()
-    _print_summary(summary)
+    _print_summary(console, summary)
     if options.json:
         write_json(options.json, summary)
     if options.plot:
@@ -288,8 +288,8 @@ def _print_touch(loop: "Live", console: Any, printed: int) -> int:
 
 
 def _say(console: Console, text: str, style: str = "") -> None:
-    """Print above the picture: broken between words on a terminal, in one line in a file."""
-    console.print(text, style=style, soft_wrap=not console.is_terminal, highlight=False, markup=False)
+    """Print above the picture."""
+    console.print(text, style=style, soft_wrap=True, highlight=False, markup=False)
 
 
 def _answer(loop: "Live", task: str, answer: tuple[str, float]) -> str:
@@ -334,12 +334,12 @@ def _stream_table(loop: "Live") -> Table:
     return table
 
 
-def _print_summary(summary: dict[str, Any]) -> None:
+def _print_summary(console: Console, summary: dict[str, Any]) -> None:
     age = summary["age_ms"]
     if age["p50"] is not None:
-        print("end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**age))
-    print("{predictions} predictions in {touches} touches; {stale} frames too old to use".format(**summary))
+        _say(console, "end-to-end age, ms: p50 {p50:.1f}, p99 {p99:.1f}, max {max:.1f}".format(**age))
+    _say(console, "{predictions} predictions in {touches} touches; {stale} frames too old to use".format(**summary))
     for name, s in summary["streams"].items():
-        print(f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged")
+        _say(console, f"{name}: {s['frames']} frames, {s['dropped']} dropped for newer ones, {s['damaged']} damaged")
     if summary["events"]:
-        print("events: " + ", ".join(f"{k} {v}" for k, v in summary["events"].items()))
+        _say(console, "events: " + ", ".join(f"{k} {v}" for k, v in summary["events"].items()))

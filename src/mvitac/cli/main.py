@@ -6,11 +6,12 @@ A mistake of the user ends in one line on stderr and exit code 2, Ctrl-C in 130.
 import importlib
 import os
 import re
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvitac.system.terminal import plain_output
+from mvitac.system.terminal import plain_output, wrapped
 
 HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
 
@@ -66,7 +67,7 @@ def _main(argv: Sequence[str] | None) -> int:
     except BrokenPipeError as error:
         if _reader_left():
             return 141  # the exit code that a shell gives for SIGPIPE
-        print(f"mvitac: error: {one_line(error)}", file=sys.stderr)
+        _complain(f"error: {one_line(error)}")
         return 2
     except KeyboardInterrupt:
         return 130
@@ -74,16 +75,22 @@ def _main(argv: Sequence[str] | None) -> int:
         text = one_line(error)
         if arguments[0] == "data":  # here the options of a dataset are --path, not --data.path as for pretrain
             text = text.replace("--data.", "--")
-        print(f"mvitac: error: {text}", file=sys.stderr)
+        _complain(f"error: {text}")
         return 2
     except Exception as error:
         if type(error).__name__ == "Interrupted":
-            print(f"mvitac: {error}", file=sys.stderr)
+            _complain(str(error))
             return 130
         if isinstance(error, (RuntimeError, ImportError)) and re.search(_NO_MEMORY, str(error)):
-            print(f"mvitac: error: {one_line(MemoryError())}", file=sys.stderr)
+            _complain(f"error: {one_line(MemoryError())}")
             return 2
         raise
+
+
+def _complain(text: str) -> None:
+    """Print ``text`` on stderr: in one line, but broken between words on a terminal."""
+    text = f"mvitac: {text}"
+    print(wrapped(text, shutil.get_terminal_size().columns) if sys.stderr.isatty() else text, file=sys.stderr)
 
 
 def _run(arguments: list[str]) -> int:
@@ -110,7 +117,7 @@ def _run(arguments: list[str]) -> int:
         raise unknown("command", name, COMMANDS)
     text = help_file(name)
     if rest in (["--help"], ["-h"]) and text.exists():
-        print(text.read_text(encoding="utf-8"), end="")
+        print(wrapped(text.read_text(encoding="utf-8")), end="")
         return 0
     module, function = COMMANDS[name].split(":")
     _check_memory()

@@ -27,7 +27,7 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
     end = [
         "## Data",
         "",
-        *(f"{what}: {one['name']}, by {one['source']}. Licence: {one['licence']}." for what, one in sets.items()),
+        *(f"{what}: {one['name']}; source: {one['source']}; licence: {one['licence']}." for what, one in sets.items()),
         *_start(manifest.get("start")),
         "The configuration, library versions and commit are in run.json.",
         "",

@@ -68,8 +68,10 @@ def covered(group_by: str, records: Sequence[dict[str, Any]]) -> str:
 
 def tested_on(task: dict[str, Any], group_by: str) -> str:
     """The test groups of one task's summary, such as '24 test instances'; one group allows no interval."""
-    num = max(cell["groups"] for cells in task.values() for cell in cells.values())
-    return f"{num} test {group_by}s" if num > 1 else f"1 test {group_by}, so no interval"
+    nums = {cell["groups"] for cells in task.values() for cell in cells.values()}
+    if nums == {1}:
+        return f"1 test {group_by}, so no interval"
+    return f"{' to '.join(str(num) for num in sorted({min(nums), max(nums)}))} test {group_by}s"
 
 
 def columns_of(task: dict[str, Any]) -> list[str]:

@@ -40,8 +40,9 @@ class Reading:
         return f"{self._digits(self.value)} {self.unit} +- {self._digits(self.spread)}"
 
     def over_touch(self) -> str:
-        """The range of the touch, such as '0.3 to 3.2 N +- 0.4'."""
-        return f"{self._digits(self.low)} to {self._digits(self.high)} {self.unit} +- {self._digits(self.spread)}"
+        """The range of the touch, such as '0.3 to 3.2 N +- 0.4', or '3 N +- 2' if both ends are the same in print."""
+        ends = dict.fromkeys((self._digits(self.low), self._digits(self.high)))
+        return f"{' to '.join(ends)} {self.unit} +- {self._digits(self.spread)}"
 
     def _digits(self, value: float) -> str:
         """``value`` with the decimals of the first digit of the spread."""

@@ -89,16 +89,16 @@ def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
 
 
 def _controls(land: ExplorerData) -> list[Any]:
-    """The choices above the map: features, colour, task, split, mistakes only."""
+    """The choices above the map: features, colour, task, split, mistakes only. Two are side by side on a phone."""
     tasks, splits = [*land.classes, *land.values], ["all", *sorted(set(land.split))]
     with gr.Row():
         first = "label" if tasks else "split"
         return [
-            gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of", min_width=120),
-            gr.Dropdown(["label", "error", "split"], value=first, label="colour by", min_width=120),
-            gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task", min_width=120),
-            gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split", min_width=120),
-            gr.Checkbox(False, label="mistakes only", min_width=120),
+            gr.Dropdown(list(land.modalities), value=land.modalities[-1], label="features of", min_width=150),
+            gr.Dropdown(["label", "error", "split"], value=first, label="colour by", min_width=150),
+            gr.Dropdown(tasks, value=tasks[0] if tasks else None, label="task", min_width=150),
+            gr.Dropdown(splits, value="test" if "test" in splits else "all", label="split", min_width=150),
+            gr.Checkbox(False, label="mistakes only", container=False),
         ]
 
 

@@ -65,8 +65,8 @@ def new_sensor(study: Study) -> str:
     intro = (
         f"Touches of {min(cell['groups'] for cell in cells)} unseen {found['group_by']}s with another gel, lights and"
         " camera. Neither the encoder nor the probe saw this sensor. In known colours: unlabelled images of it tell how"
-        " it colours slope, so that its touches can be shown as the known sensors would show them, as mvitac probe does"
-        " for standardise = colours features."
+        " it colours slope, so that its touches can be shown as the known sensors would show them, as mvitac probe"
+        " --standardise colours features does."
     )
     notes = "".join(html.paragraph(f"{note}.") for note in found["notes"])
     return html.paragraph(intro) + _scores(study, found["summary"]) + notes

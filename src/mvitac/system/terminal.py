@@ -3,6 +3,7 @@
 import contextlib
 import re
 import sys
+import textwrap
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +14,18 @@ _CONTROL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 def plain(text: str) -> str:
     """``text`` with "?" for every character that a terminal would obey, such as the one that begins an escape sequence."""
     return _CONTROL.sub("?", text)
+
+
+def wrapped(text: str, width: int = 80) -> str:
+    """``text`` with lines longer than ``width`` broken between words or after a "|", and indented as they were."""
+
+    def broken(line: str) -> str:
+        indent = line[: len(line) - len(line.lstrip())]
+        return textwrap.fill(
+            line.replace("|", "| "), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+        ).replace("| ", "|")
+
+    return "\n".join(line if len(line) <= width else broken(line) for line in text.split("\n"))
 
 
 class _PlainStream:
