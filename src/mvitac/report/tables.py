@@ -122,7 +122,7 @@ def print_retrieval(result: dict[str, Any], console: Console) -> None:
 
 
 def print_sensors(result: dict[str, Any], console: Console) -> None:
-    """Print which statistics of touch sensors were used, and what features tell of the sensor, if either was asked for."""
+    """Print which touch sensors are new, which statistics were used, and what features tell of the sensor, if known."""
     for line in result.get("statistics", ()):
         console.print(line, markup=False, highlight=False)
     if not result.get("sensors"):
