@@ -23,7 +23,14 @@ from mvitac.deploy.engine import Engine, about_sensor
 from mvitac.deploy.export import ExportConfig, export
 from mvitac.deploy.publish import with_probes
 from mvitac.evaluation.probe import probe_model
-from mvitac.evaluation.sensors import RecolouredPack, about_new, learn_looks, sensors_of, touch_features, unlabelled_rows
+from mvitac.evaluation.sensors import (
+    RecolouredPack,
+    about_new,
+    learn_looks,
+    sensors_of,
+    touch_features,
+    unlabelled_rows,
+)
 from mvitac.live.cameras import Ended, Source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.predictor import Live
@@ -105,7 +112,7 @@ class Played(Source):
 
 
 def play(engine: Engine, pack: Pack, rows: np.ndarray, **options: Any) -> list[dict[str, np.ndarray]]:
-    """Touch after touch through ``Live``, four frames each, with the free gel between; the mean answers of each touch."""
+    """The answers of ``Live`` on touch after touch, four frames each, with the free gel between."""
     free = materials.touch(0, 0, 0, 0, size=32, sensors=(SENSORS["slim"],), background=True)["background"]
     given: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
     for row in rows:
@@ -122,7 +129,8 @@ def play(engine: Engine, pack: Pack, rows: np.ndarray, **options: Any) -> list[d
         live.tick()
         if live.touch is None and live.last is not None and live.last is not last:
             last = live.last
-            answers.append({task: total / last.num_frames for task, total in last.totals.items()})
+            newest = {task: seen[0] for task, seen in last.values.items()}
+            answers.append({task: total / last.num_frames for task, total in last.totals.items()} | newest)
     return answers
 
 
@@ -130,8 +138,15 @@ def test_live_answers_as_the_probe_in_known_colours(engine: Engine, model: Model
     both = RecolouredPack(old, new)
     rows = both.rows("test")
     expected = by_the_probe(model, both, rows)
-    found = play(engine, new, np.concatenate([new.rows("test"), new.rows("test")[:1]]))[: len(rows)]  # the last never ends
-    assert len(found) == len(rows) == 20 and found[0].keys() == expected.keys() == {"category", "soft", "rough"}
+    found = play(engine, new, np.concatenate([new.rows("test"), new.rows("test")[:1]]))[
+        : len(rows)
+    ]  # the last never ends
+    assert len(found) == len(rows) == 20 and found[0].keys() == expected.keys() == {
+        "category",
+        "soft",
+        "rough",
+        "force",
+    }
     for task, wanted in expected.items():
         np.testing.assert_allclose([answers[task] for answers in found], wanted, atol=2e-3)
     plain = by_the_probe(model, JoinedPack(old, new), rows)  # as it is: another model
@@ -143,7 +158,7 @@ def test_scores_of_the_export_are_those_of_the_probe(engine: Engine, model: Mode
     records = probe_model(model, both, both.spec.tasks, ("both",), ("linear",), ("colours",))
     expected = {record["task"]: 100 * record["accuracy"] for record in records}
     found = {task: scores["export"] for task, scores in engine.meta["report"]["accuracy"].items()}
-    assert found == pytest.approx(expected)
+    assert found == pytest.approx(expected) and len(found) == 3
     shown = {"sensor": "slim", "in_colours_of": ["digit", "mini"], "num_images": 80}
     assert engine.new_sensor is not None and {**engine.new_sensor, "in_colours_of": ["digit", "mini"]} == shown
 
@@ -178,7 +193,11 @@ def test_what_cannot_be_shown_is_refused(model: Model, old: Pack, new: Pack, tmp
     few = Unlabelled(MaterialsConfig(num=30, touches=1, size=32, held_out_sensor=True))
     cases: list[tuple[Pack, ExportConfig, str]] = [
         (old, ExportConfig(), "no sensor but digit, mini"),
-        (build(few, tmp_path / "few", size=32, quiet=True), ExportConfig(), "needs 32 of different presses.*--new-sensor out"),
+        (
+            build(few, tmp_path / "few", size=32, quiet=True),
+            ExportConfig(),
+            "needs 32 of different presses.*--new-sensor out",
+        ),
         (new, ExportConfig(modalities=("vision",)), "about touch"),
     ]
     for pack, config, why in cases:

@@ -106,10 +106,8 @@ def live(argv: list[str]) -> None:
     recorder = None
     if options.record:
         channels = {m: s[2] for m, s in frame_shapes(engine).items()}
-        said_so = lambda text: _say(console, text, "yellow")  # noqa: E731
-        recorder = Recorder(
-            options.record, channels, fps=options.record_fps, form=options.record_as, sensor=sensor, tell=said_so
-        )
+        how: Any = {"fps": options.record_fps, "form": options.record_as, "sensor": sensor}
+        recorder = Recorder(options.record, channels, **how, tell=lambda text: _say(console, text, "yellow"))
     # Faults are printed above the picture, so that they stay in the scrollback and in a log file.
     tell = lambda event: _say(console, event.text, "yellow")  # noqa: E731
     loop = Live(engine, streams, options.live, nearest=nearest, record=recorder, tell=tell)

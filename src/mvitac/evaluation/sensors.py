@@ -64,8 +64,9 @@ def unlabelled_rows(pack: Pack, sensor: int, num: int = NUM_STATISTICS) -> np.nd
     recording of ``mvitac live`` (column contact), it is the middle frame of each touch: its frames are near-copies.
     """
     own = np.flatnonzero(pack.has("touch") & (pack.sensors == sensor))
-    if "contact" in pack.table.column_names and pack.column("contact").dtype == bool:
-        own = own[pack.column("contact")[own]]
+    contact = pack.column("contact").astype(str) if "contact" in pack.table.column_names else np.array([])
+    if len(contact) and set(contact) <= {"True", "False"}:
+        own = own[contact[own] == "True"]
         touches = pack.touch_groups[own]
         own = np.array([rows[len(rows) // 2] for rows in (own[touches == n] for n in np.unique(touches))], np.int64)
     split = pack.column("split").astype(str)[own]
