@@ -116,8 +116,8 @@ def play(engine: Engine, pack: Pack, rows: np.ndarray, **options: Any) -> list[d
     free = materials.touch(0, 0, 0, 0, size=32, sensors=(SENSORS["slim"],), background=True)["background"]
     given: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
     for row in rows:
-        given["touch"] += [free] * 8 + [pack.images["touch"][row]] * 4
-        given["vision"] += [pack.images["vision"][row]] * 12
+        given["touch"] += [free] * 6 + [pack.images["touch"][row]] * 4
+        given["vision"] += [pack.images["vision"][row]] * 10
     clock = Clock()
     streams = {m: [Stream(m, Played(frames), clock=clock)] for m, frames in given.items()}
     live = Live(engine, streams, LiveConfig(calibration=6), clock=clock, **options)
@@ -178,7 +178,7 @@ def test_a_recording_gives_one_image_of_each_touch(engine: Engine, old: Pack, ne
     rows = unlabelled_rows(new, 0, 400)
     recorder = Recorder(tmp_path / "slim", {"vision": 3, "touch": 3}, fps=100.0, sensor="slim")
     play(engine, new, rows, record=recorder)
-    assert recorder.close() == 12 * len(rows)
+    assert recorder.close() == 10 * len(rows)
     recording = Pack(tmp_path / "slim")
     assert recording.sensor_names == ("slim",)
     found, wanted = (learn_looks(old, pack, OPTION) for pack in (recording, new))
