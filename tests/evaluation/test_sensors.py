@@ -100,6 +100,8 @@ def test_models_keep_the_sensors_of_their_training_rows(
     assert about_new(model, pack) == "" and "negative, plain is new to the model, which knows toy" in about_new(
         model, others
     )
+    model.spec = replace(model.spec, sensors=("other",))
+    assert "toy is named by no column sensor and may be new to the model, which knows other" in about_new(model, pack)
     model.spec = replace(model.spec, sensors=())
     assert about_new(model, others) == ""
 

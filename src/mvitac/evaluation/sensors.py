@@ -54,7 +54,9 @@ def about_new(model: Model, pack: Pack, standardise: tuple[Standardise, ...] = (
         return ""
     advice = "`mvitac probe RUN --on PACK --learn-on OLD --standardise colours features` says what helps"
     done = f"--standardise {' '.join(standardise)} is used" if standardise else f"nothing is done about it ({advice})"
-    return f"touch sensor {listed(new)} is new to the model, which knows {listed(known)}: {done}"
+    # Without the column, a pack's name stands for its sensor.
+    found = "is" if "sensor" in pack.table.column_names else "is named by no column sensor and may be"
+    return f"touch sensor {listed(new)} {found} new to the model, which knows {listed(known)}: {done}"
 
 
 def unlabelled_rows(pack: Pack, sensor: int, num: int = NUM_STATISTICS) -> np.ndarray:
