@@ -123,6 +123,7 @@ def _old_packs(model: Model, given: Path | None, new: Pack, say: Callable[[str],
             found |= {name: join(old, new)} if scorable(old) and scorable(new) else {}
         except ValueError as error:
             say(f"{name}: not scored ({error})")
+            break  # nor in other colours
     return found
 
 
