@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
-from mvitac.data.spec import DataSpec, Target
+from mvitac.data.spec import DataSpec, Target, listed
 from mvitac.methods.base import Method
 from mvitac.nn.encoders import last_map, num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
@@ -83,7 +83,9 @@ class Model(nn.Module):
     def __repr__(self) -> str:
         widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())
         method, trunk = self.run.method.name, self.run.encoder.trunk
-        return f"Model({method} of {trunk}, trained on {self.spec.name}: features {widths})"
+        named = self.spec.sensors not in ((), (self.spec.name,))
+        sensors = f" (touch sensors {listed(self.spec.sensors)})" if named else ""
+        return f"Model({method} of {trunk}, trained on {self.spec.name}{sensors}: features {widths})"
 
     def _repr_html_(self) -> str:
         rows = [(modality, num_features(trunk)) for modality, trunk in self.encoders.items()]

@@ -15,22 +15,31 @@ import torch
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
+from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation import sensors as module
 from mvitac.evaluation.features import features
 from mvitac.evaluation.sensors import (
     RecolouredPack,
+    about_new,
     cross_sensor,
     describe_statistics,
     sensor_records,
+    sensors_of,
     touch_features,
     unlabelled_rows,
     with_statistics,
 )
 from mvitac.model import Model
 from mvitac.model_files import load
+from mvitac.nn.initial import Init
+from mvitac.recipes import recipe
+from mvitac.registry import to_json
+from mvitac.run import load_run
+from mvitac.training.loop import train
 from mvitac.transforms.preprocess import encoder_input
 from support.toy import Toy
 
@@ -73,6 +82,35 @@ def test_sensors_are_numbered_by_name(pack: Pack, others: Pack) -> None:
     assert others.sensor_names == ("negative", "plain")
     assert [others.sensor_names[n] for n in others.sensors[:3]] == ["plain", "negative", "plain"]
     assert pack.sensor_names == ("toy",) and not pack.sensors.any()
+
+
+def test_models_keep_the_sensors_of_their_training_rows(
+    smoke_run: Path, pack: Pack, others: Pack, tmp_path: Path
+) -> None:
+    """And those of the weights they start from, if it is touch that they take. Older files name none."""
+    assert load(smoke_run).spec.sensors == ("toy",) and "sensors" not in repr(load(smoke_run))
+    assert load_run(smoke_run)[1]["data"]["sensors"] == ["toy"]
+    for modality, known in (("touch", ("negative", "plain", "toy")), ("vision", ("negative", "plain"))):
+        init = Init(path=smoke_run, modalities=(modality,))
+        run = replace(recipe("smoke", PackConfig(path=others.path)), steps=1, init=init, eval_every=1)
+        started = train(run, tmp_path / modality, quiet=True)
+        assert load(started).spec.sensors == load(started, "best").spec.sensors == known
+    assert pack.spec.sensors == () and "sensors" not in to_json(pack.spec)  # digests of packs and caches stay
+    model = load(smoke_run)
+    assert about_new(model, pack) == "" and "negative, plain is new to the model, which knows toy" in about_new(
+        model, others
+    )
+    model.spec = replace(model.spec, sensors=("other",))
+    assert "toy is named by no column sensor and may be new to the model, which knows other" in about_new(model, pack)
+    model.spec = replace(model.spec, sensors=())
+    assert about_new(model, others) == ""
+
+
+def test_sensors_of_a_mix_have_the_names_of_their_parts(pack: Pack, others: Pack) -> None:
+    both = MixedPack({"a": pack, "b": others}, allow_leak=True)
+    assert both.sensor_names == ("a", "negative", "plain")  # "a" has no column
+    assert sensors_of(both, np.arange(both.num)) == ("negative", "plain", "toy")
+    assert sensors_of(both, np.array([3, 120, 122])) == ("plain", "toy")
 
 
 def test_statistics_never_take_test_images_while_there_are_others(others: Pack) -> None:
@@ -232,6 +270,7 @@ def test_probe_command_says_what_it_used(
     assert main([*arguments, "--standardise", "features", "--sensors"]) == 0
     printed = capsys.readouterr().out
     assert "unlabelled images of sensor toy" in printed
+    assert "sensor negative, plain is new to the model, which knows toy: --standardise features is used" in printed
     result = json.loads(out.read_text())
     assert result["asked"]["standardise"] == ["features"] and "sensor negative" in " ".join(result["statistics"])
     assert main(["probe", str(smoke_run), "--standardise", "colours"]) == 2

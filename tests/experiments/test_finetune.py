@@ -16,8 +16,9 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation import sensors
 from mvitac.evaluation.probe import probe_model
-from mvitac.experiments.adapt import NEW, OLD, TRANSFER, Adaptation, adapt
+from mvitac.experiments.adapt import COLOURED, NEW, OLD, TRANSFER, Adaptation, _old_packs, _scores, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
 from mvitac.model_files import load
 from mvitac.report.tables import print_finetuning
@@ -264,6 +265,34 @@ def test_statistics_alone_change_statistics_alone(
     }
     for record in probe_model(load(ancestor), pack, pack.spec.tasks, ["both"], ["linear"]):
         assert before[record["task"]]["group_correct"] == record["group_correct"]
+
+
+def test_a_new_sensor_is_also_scored_in_known_colours(
+    ancestor: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If its colours can be learned; without a new sensor nothing is said of it."""
+
+    class Other(Toy):
+        def read(self, item: int) -> Any:
+            (sample,) = super().read(item)
+            return [replace(sample, columns={**sample.columns, "sensor": "other"})]
+
+    other = build(Other(), tmp_path / "other", size=32, workers=1, quiet=True)
+    model, said = load(ancestor), []
+    assert _old_packs(model, pack.path, pack, said.append).keys() == {OLD, TRANSFER} and not said
+    assert _old_packs(model, pack.path, other, said.append).keys() == {OLD, TRANSFER}
+    assert len(said) == 1 and said[0].startswith(f"{COLOURED}: not scored (sensor 'other'")
+    monkeypatch.setattr(sensors, "learn_colours", lambda images: None)
+    monkeypatch.setattr(sensors, "recolour", lambda images, source, target: 255 - images)
+    both = _old_packs(model, pack.path, other, said.append)[COLOURED]
+    found = _scores(model, both, None, retrieval=False)
+    expected = probe_model(model, both, both.spec.tasks, ["touch", "both"], ["linear"], ("colours", "features"))
+    plain = probe_model(model, both, both.spec.tasks, ["touch", "both"], ["linear"])
+    correct = [
+        {(r["task"], r["modality"]): r["group_correct"] for r in records if r["modality"] != "vision"}
+        for records in (found, expected, plain)
+    ]
+    assert correct[0] == correct[1] != correct[2]
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from mvitac.data.notebook import measured
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.sharding import write_shards
-from mvitac.data.spec import Task, Window
+from mvitac.data.spec import Task, Window, listed
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.lerobot.writer import write_lerobot
 from mvitac.datasets.mix import open_packs
@@ -204,6 +204,8 @@ def info(argv: list[str]) -> None:
     if lacking := ", ".join(f"{num} rows without {m}" for m, num in found["rows_without"].items()):
         say.print(f"{lacking}; {found['whole_pairs']} whole pairs")
     say.print(_groups(pack))
+    if names := found.get("sensors"):
+        say.print(f"touch sensors: {listed(names)}")
     say.print(f"source {pack.spec.source}; licence {pack.spec.licence}")
     for note in pack.spec.notes:
         say.print(f"note: {note}")
@@ -231,6 +233,7 @@ def _describe(pack: Pack) -> dict[str, Any]:
         "groups": len(np.unique(pack.column("group"))),
         "splits": splits,
         "rows_without": {m: int((~there).sum()) for m, there in has.items() if not there.all()},
+        **({"sensors": list(pack.sensor_names)} if "sensor" in pack.table.column_names else {}),
         "whole_pairs": int(np.logical_and.reduce(list(has.values())).sum()),
         "source": pack.spec.source,
         "licence": pack.spec.licence,

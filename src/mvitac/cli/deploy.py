@@ -74,6 +74,9 @@ class _ExportOptions:
     (default: the data the model was trained on)."""
     calibrate: Path | None = None
     """Pack whose train rows set the ranges of int8 (default: the pack that checks)."""
+    new_sensor: Path | None = None
+    """Pack with 64 to 400 unlabelled images of a touch sensor that the model never met, such as a recording of mvitac
+    live: the export is for that sensor, and shows its images in the colours of the known ones."""
     modality: Literal["both", "vision", "touch"] = "both"
     """Inputs of the export; both = all the model has."""
     min_cosine: float | None = None
@@ -99,12 +102,14 @@ def export(argv: list[str]) -> None:
     pack = as_trained(model, pack)
     with shown(Console(stderr=True)):
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
-        report = exports.export(with_probes(model, pack), pack, options.out, config, calibrate=calibrate)
-    Console(markup=False).print(_table(options.out, report))
+        new = Pack(options.new_sensor) if options.new_sensor else None
+        report = exports.export(with_probes(model, pack), pack, options.out, config, calibrate=calibrate, new=new)
+    Console(markup=False).print(_table(options.out, report, new.path if new else None))
 
 
-def _table(out: Path, report: dict[str, Any]) -> Table:
-    table = Table(title=f"{out}: checked on {report['num_rows']} test rows", title_justify="left")
+def _table(out: Path, report: dict[str, Any], new: Path | None) -> Table:
+    rows = f"rows of {new}" if new else "test rows"
+    table = Table(title=f"{out}: checked on {report['num_rows']} {rows}", title_justify="left")
     for column in ("", "original", "export"):
         table.add_column(column)
     for task, values in report["accuracy"].items():

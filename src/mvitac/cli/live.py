@@ -46,6 +46,8 @@ class _Options:
     """SOURCE of the camera."""
     touch: tuple[str, ...] = ()
     """SOURCE of the touch sensor, or of both of a gripper: left right. Without any source, all are simulated."""
+    sensor: str = ""
+    """Name of the touch sensor, as in column sensor of the training data: live says if the model never met it."""
     index: Path | None = None
     """Show the nearest known touches from this index."""
     record: Path | None = None
@@ -74,7 +76,7 @@ class _Options:
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
-    from mvitac.deploy.engine import frame_shapes
+    from mvitac.deploy.engine import about_sensor, frame_shapes
     from mvitac.live.display import Window
     from mvitac.live.predictor import Live
     from mvitac.live.recorder import Recorder, finish
@@ -98,11 +100,14 @@ def live(argv: list[str]) -> None:
     streams: Any = _streams(options, engine)
     if not (options.vision or options.touch):
         print("no --vision, no --touch: all sensors are simulated")
+    sensor = options.sensor or next((stream.origin.sensor for stream in streams.get("touch", ())), "")
+    if said_first := about_sensor(engine, sensor):
+        print(said_first)
     recorder = None
     if options.record:
         channels = {m: s[2] for m, s in frame_shapes(engine).items()}
-        said_so = lambda text: _say(console, text, "yellow")  # noqa: E731
-        recorder = Recorder(options.record, channels, fps=options.record_fps, form=options.record_as, tell=said_so)
+        how: Any = {"fps": options.record_fps, "form": options.record_as, "sensor": sensor}
+        recorder = Recorder(options.record, channels, **how, tell=lambda text: _say(console, text, "yellow"))
     # Faults are printed above the picture, so that they stay in the scrollback and in a log file.
     tell = lambda event: _say(console, event.text, "yellow")  # noqa: E731
     loop = Live(engine, streams, options.live, nearest=nearest, record=recorder, tell=tell)

@@ -54,6 +54,7 @@ def embed(argv: list[str]) -> None:
     from mvitac.deploy.artifact import load
     from mvitac.deploy.search import check_pack, describe, embeddings
     from mvitac.evaluation.evaluate import as_trained
+    from mvitac.evaluation.sensors import about_new
 
     if options.out.suffix not in (".npz", ".parquet"):
         raise ValueError(f"--out {options.out}: give a name that ends in .npz or .parquet")
@@ -68,6 +69,8 @@ def embed(argv: list[str]) -> None:
         found[m][rows] = x
     _write(options.out, describe(pack, np.arange(pack.num)), found)
     print(f"{options.out}: {', '.join(f'{m} {x.shape}' for m, x in found.items())}")
+    if new := about_new(model, pack):
+        print(new)
 
 
 def _write(out: Path, table: pa.Table, found: dict[str, np.ndarray]) -> None:

@@ -51,6 +51,12 @@ def task_title(name: str, classes: Sequence[str]) -> str:
     return "/".join(classes) if len(classes) == 2 and name in classes else name
 
 
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """``names`` for people; of more than ``most`` the first, and how many are left."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + f" and {rest} more" * (rest > 0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Target:
     """A measured number and its unit, e.g. force_n in N. ``name`` is the column of the table; NaN = not measured."""
@@ -131,6 +137,9 @@ class DataSpec:
     """Tasks whose answer is a number with a unit."""
     window: Window = field(default=Window(), metadata=LATER)
     """The frames that one row shows, stacked on channels."""
+    sensors: tuple[str, ...] = field(default=(), metadata=LATER)
+    """Of a trained model: names of the touch sensors of its training rows. () in packs (``Pack.sensor_names``), and in
+    models from before this field."""
 
     def __post_init__(self) -> None:
         if not (self.vision_channels or self.touch_channels):

@@ -12,6 +12,7 @@ against its digest before it is parsed, and no file with another name is opened.
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +120,7 @@ def pull(repo: str, revision: str | None = None, **options: Any) -> Path:
         ) from None
 
 
-def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]:
+def preprocessing(model: Model) -> dict[str, Any]:
     """Description of the preprocessing from a camera's frame to the encoders' input, JSON-ready."""
     return {
         "input": "uint8 RGB [H, W, C]; OpenCV's frames are BGR: reverse their channels",
@@ -132,7 +133,7 @@ def preprocessing(model: Model, sensors: tuple[str, ...] = ()) -> dict[str, Any]
         "std": list(IMAGENET_STD),
         "difference": model.spec.difference,
         "background": SUBTRACTED if model.spec.difference else AS_GIVEN,
-        "sensors": list(sensors),
+        "sensors": list(model.spec.sensors),
         **({"window": {**to_json(model.spec.window), "layout": LAYOUT}} if model.spec.window.active else {}),
     }
 
@@ -148,6 +149,8 @@ def read(folder: Path) -> PublishedModel:
                 f"{folder}: artifact.json says {name} {given.get(name)}, its model was trained with {asked.get(name)}:"
                 " predictions would be wrong, publish it again"
             )
+    # Those of the probes, too; older artifacts name the sensors only here.
+    model.spec = replace(model.spec, sensors=from_json(tuple[str, ...], given.get("sensors", []), "sensors"))
     model.probes = read_probes(folder, manifest, model)
     return PublishedModel(model, folder).eval()
 

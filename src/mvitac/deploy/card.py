@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+from mvitac.data.spec import listed
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, pipes, score_name, sources_of, tested_on
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ValueInfo
@@ -121,7 +122,7 @@ def _usage(given: dict[str, Any]) -> list[str]:
         "",
         f"{given['input']}. {given['resize']}: stored {given['stored']} px, size {given['size']} px."
         f" Then (x / 255 - {given['mean']}) / {given['std']}. Background: {given['background']}.",
-        f"Sensors seen: {', '.join(given['sensors']) or 'not recorded'}."
+        f"Sensors seen: {listed(given['sensors']) or 'not recorded'}."
         " For another sensor, lamp or gel, check the accuracy before you rely on these predictions.",
         "",
     ]

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
+from mvitac.data.spec import listed
 from mvitac.system.files import brief, digest, digest_file, read_json
 
 FORMAT, FORMAT_VERSION = "mvitac-export", 1
@@ -55,6 +56,10 @@ class Engine:
         """Whether the touch input is (touch - background) / 2 + 128."""
         self.window: dict[str, Any] | None = self.meta["preprocessing"].get("window")
         """For windows: number of frames, stride, its unit (order) and modalities (of), as in export.json."""
+        self.sensors: list[str] = self.meta["preprocessing"].get("sensors", [])
+        """Names of the touch sensors that the model met, as far as its file says."""
+        self.new_sensor: dict[str, Any] | None = self.meta["preprocessing"].get("new_sensor")
+        """For an export for a sensor that the model never met: sensor, in_colours_of (known ones), num_images."""
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})
@@ -91,6 +96,31 @@ class Engine:
                 raise ValueError(f"{name}: expected uint8 [B, {shape}], got {value.dtype} {value.shape}")
         found = self._call([np.ascontiguousarray(images[m]) for m in self.inputs])
         return dict(zip(self.meta["outputs"], found, strict=True))
+
+
+def about_sensor(engine: Any, name: str) -> str:
+    """A sentence on touch sensor ``name`` ("" = not known), if it is new to the model of ``engine``; else ""."""
+    if "touch" not in engine.inputs:
+        return ""
+    known = listed(engine.sensors)
+    if new := engine.new_sensor:
+        if name not in ("", new["sensor"]):
+            return f"this export is for touch sensor {new['sensor']}: export the model again for {name}, --new-sensor"
+        return (
+            f"touch sensor {new['sensor']} is new to the model: it is shown in the colours of"
+            f" {listed(new['in_colours_of'])} ({new['num_images']} unlabelled images)"
+        )
+    if not known:
+        return f"nothing says which touch sensors the model met: {name} may be new to it" if name else ""
+    if not name:
+        return f"the model met the touch sensors {known}: --sensor NAME says if another is used"
+    if name in engine.sensors:
+        return ""
+    return (
+        f"touch sensor {name} is new to the model, which knows {known}: nothing is done about it (`mvitac export MODEL"
+        " --new-sensor RECORDING` shows it in their colours, `mvitac probe RUN --on PACK --learn-on OLD --standardise"
+        " colours` says what that is worth)"
+    )
 
 
 def frames_of(window: Mapping[str, Any] | None, modality: str) -> int:

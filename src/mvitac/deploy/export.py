@@ -26,6 +26,7 @@ from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.parity import latency, parity, reference
 from mvitac.deploy.quantise import Target, quantise, this_machine, to_openvino, write_onnx
 from mvitac.evaluation.features import sample
+from mvitac.evaluation.sensors import learn_looks
 from mvitac.model import Model
 from mvitac.system.device import has_bf16
 from mvitac.system.files import digest, digest_file, write_atomic, write_json
@@ -36,6 +37,7 @@ from mvitac.system.provenance import provenance
 Kind = Literal["torch", "onnx", "openvino"]
 MIN_COSINE = {"fp32": 0.9999, "bf16": 0.99, "int8": 0.95}
 """Lowest cosine of any single embedding with the original, by the arithmetic of an export."""
+NEW_SENSOR = "--new-sensor"  # the option that errors name
 NUM_CALIBRATION, NUM_CHECK = 128, 16
 """Images that set the ranges of int8; images that an export carries for the check on the robot (int8 products saturate
 for some images only)."""
@@ -86,23 +88,36 @@ class ExportConfig:
 
 
 def export(
-    model: Model, pack: Pack, out: Path, config: ExportConfig = ExportConfig(), *, calibrate: Pack | None = None
+    model: Model,
+    pack: Pack,
+    out: Path,
+    config: ExportConfig = ExportConfig(),
+    *,
+    calibrate: Pack | None = None,
+    new: Pack | None = None,
 ) -> dict[str, Any]:
     """Write ``model`` with its probes for another engine into the new folder ``out``, checked on test rows of ``pack``.
 
-    ``calibrate``: data whose train rows set the ranges of int8 (default: ``pack``). Returns the report: cosines,
-    accuracies, errors of values in their units, size in MB, latency in ms. Raises Busy if another process writes
-    ``out``; ValueError if the export is not possible, or differs by more than ``config`` allows.
+    ``calibrate``: data whose train rows set the ranges of int8 (default: ``pack``). ``new``: unlabelled images of a touch
+    sensor that ``pack`` lacks. The export is then for that sensor, whose images it shows in the colours of those of
+    ``pack``, and is checked on ``new`` (all rows, if none is of split test). Returns the report: cosines, accuracies,
+    errors of values in their units, size in MB, latency in ms. Raises Busy if another process writes ``out``; ValueError
+    if the export is not possible, or differs by more than ``config`` allows.
     """
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
         raise ValueError(
             "--precision bf16: this CPU does not compute bf16 itself, so OpenVINO would use fp32 or emulate it, and the"
             " export could not be checked: export it on a CPU with AVX512-BF16 or AMX, or leave --precision out"
         )
-    graph = ExportModule(model, config.modalities)
-    for given, modality in product((pack, calibrate or pack), graph.inputs):
+    asked, known, pack = config.modalities or tuple(model.encoders), pack, new or pack
+    if new and "touch" not in asked:
+        raise ValueError(f"{NEW_SENSOR} is about touch, which this export lacks: leave it out")
+    for given, modality in product((known, pack, calibrate or pack), asked):
         _check_fits(model, given, modality)
-    rows = pack.rows("test", having=graph.modalities)
+    graph = ExportModule(model, asked, learn_looks(known, new, NEW_SENSOR) if new else None)
+    rows = pack.rows("test", having=asked)
+    if new and not len(rows):
+        rows = np.flatnonzero(np.logical_and.reduce([new.has(modality) for modality in asked]))
     if not len(rows):
         raise ValueError(
             f"{pack.path} has no rows in split test: an export is checked on rows that no probe was fitted on"
@@ -120,7 +135,8 @@ def export(
 
 
 def _check_fits(model: Model, pack: Pack, modality: str) -> None:
-    """ValueError if ``pack`` does not hold images of ``modality`` as ``model`` wants them."""
+    """ValueError if ``model`` takes no ``modality``, or ``pack`` does not hold images of it as ``model`` wants them."""
+    model.check_modality(modality)
     channels, difference = model.spec.channels(modality), modality == "touch" and model.spec.difference
     fits = (modality in pack.spec.modalities, pack.spec.channels(modality) == channels, pack.size == model.stored)
     if not all(fits) or (difference and not has_difference(pack)):
@@ -183,7 +199,7 @@ def _write_manifest(
         "outputs": list(graph.outputs),
         "classes": graph.classes,
         **({"values": graph.values} if graph.values else {}),
-        "preprocessing": preprocessing(model),
+        "preprocessing": preprocessing(model) | ({"new_sensor": graph.looks.about()} if graph.looks else {}),
         "weights": model.weights_digest(),
         "tolerance": {"min_cosine": config.min_cosine, "accuracy_loss": config.accuracy_loss} | values,
         "report": report,

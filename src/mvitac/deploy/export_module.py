@@ -3,17 +3,20 @@
 Shapes: B images, S stored side, C channels (3, or 6 for two sensors), D features, E shared space, K classes.
 Inputs: one uint8 [B, S, S, C] RGB per modality, as a pack stores them. Outputs, by ``ExportModule.outputs``:
 embedding_<modality> [B, D], shared_<modality> [B, E] (L2-normalised; absent without a shared space),
-probability_<task> [B, K], value_<task> [B, T] in the units of its T targets.
+probability_<task> [B, K], value_<task> [B, T] in the units of its T targets. With ``looks``, touch is of a new sensor:
+features are the mean over its images in the colours of each known one.
 """
 
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mvitac.model import Model
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
+from mvitac.transforms.gel_colours import Looks
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 
@@ -25,13 +28,17 @@ class ExportModule(nn.Module):
     scale: Tensor
     shift: Tensor
 
-    def __init__(self, model: Model, modalities: tuple[str, ...] | None = None) -> None:
+    lamps: Tensor
+    mixing: Tensor
+    minus_ground: Tensor
+
+    def __init__(self, model: Model, modalities: tuple[str, ...] | None = None, looks: Looks | None = None) -> None:
         """``modalities``: its inputs; None = all the model has. ValueError if the model lacks one."""
         super().__init__()
+        self.looks = looks
         self.modalities = modalities or tuple(model.encoders)
         for modality in self.modalities:
-            if modality not in model.encoders:
-                raise ValueError(f"this model has no {modality} encoder: it has {', '.join(model.encoders)}")
+            model.check_modality(modality)
         asked = "both" if len(self.modalities) == 2 else self.modalities[0]
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.modalities})
         self.projectors = nn.ModuleDict({m: p for m, p in model.projectors.items() if m in self.modalities})
@@ -53,6 +60,12 @@ class ExportModule(nn.Module):
         mean, std = (torch.tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
         self.register_buffer("scale", 1 / (255 * std))
         self.register_buffer("shift", -mean / std)
+        if looks:
+            mixing = [looks.source.mixtures @ target.colours.T for target in looks.targets]
+            ground = [target.level + target.rest for target in looks.targets]
+            self.register_buffer("lamps", torch.from_numpy(looks.source.rest).float())
+            self.register_buffer("mixing", torch.from_numpy(np.stack(mixing)).float())
+            self.register_buffer("minus_ground", torch.from_numpy(-np.stack(ground)).float())
         self.eval()
 
     def view(self, images: Tensor, filter: Tensor) -> Tensor:
@@ -63,13 +76,28 @@ class ExportModule(nn.Module):
         sensors = [x[:, i : i + 3] * self.scale + self.shift for i in range(0, x.shape[1], 3)]
         return torch.cat(sensors, dim=1) if len(sensors) > 1 else sensors[0]
 
+    def encode(self, modality: str, images: Tensor, filter: Tensor) -> Tensor:
+        """Features [B, D] of uint8 [B, S, S, C]."""
+        if not (self.looks and modality == "touch"):
+            return self.encoders[modality](self.view(images, filter))
+        found = self.encoders[modality](self.view(self.recoloured(images), filter))
+        return found.reshape(len(self.mixing), -1, found.shape[1]).mean(0)
+
+    def recoloured(self, images: Tensor) -> Tensor:
+        """The new sensor's images [B, S, S, 3] in the colours of each known one, [L B, S, S, 3] in whole grey levels."""
+        levels = images.float()
+        slopes = levels - levels.mean((1, 2), keepdim=True) - self.lamps
+        # A difference, because int8 exports round what is added.
+        shown = [slopes @ mixing - ground for mixing, ground in zip(self.mixing, self.minus_ground, strict=True)]
+        return torch.cat(shown).round().clamp(0, 255)
+
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
         """The outputs, in the order of ``outputs``, of the images, in the order of ``modalities``."""
         given = dict(zip(self.modalities, images, strict=True))
-        features = {m: self.encoders[m](self.view(x, self.filter)) for m, x in given.items()}
+        features = {m: self.encode(m, x, self.filter) for m, x in given.items()}
         wanted = features
         if self.twice:
-            wanted = {m: self.encoders[m](self.view(given[m], self.head_filter)) for m in self.projectors}
+            wanted = {m: self.encode(m, given[m], self.head_filter) for m in self.projectors}
         shared = [F.normalize(head(wanted[m]), dim=1) for m, head in self.projectors.items()]
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         return (*features.values(), *shared, *(probe(joined) for probe in self.probes))

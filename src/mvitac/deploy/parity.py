@@ -23,13 +23,17 @@ def reference(
     """The outputs of ``graph`` for pack rows, computed by the code of ``Model`` itself."""
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 64)):
-        images = {m: torch.from_numpy(pack.images[m][chunk]).permute(0, 3, 1, 2) for m in graph.modalities}
-        features = {m: model.features(m, x) for m, x in images.items()}
+        images = {m: pack.images[m][chunk] for m in graph.modalities}
+        shown = {m: graph.looks(x) if graph.looks and m == "touch" else [x] for m, x in images.items()}
+
+        def mean(modality: str, shown: dict[str, list[np.ndarray]] = shown, **asked: bool) -> torch.Tensor:
+            each = [torch.from_numpy(look).permute(0, 3, 1, 2) for look in shown[modality]]
+            return torch.stack([model.features(modality, look, **asked) for look in each]).mean(0)
+
+        features = {m: mean(m) for m in images}
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         found = {f"embedding_{m}": x for m, x in features.items()}
-        found |= {
-            f"shared_{m}": model.project(m, model.features(m, images[m], for_heads=True)) for m in graph.projectors
-        }
+        found |= {f"shared_{m}": model.project(m, mean(m, for_heads=True)) for m in graph.projectors}
         found |= {output_of(r): r(joined) for r in graph.probes}  # type: ignore[arg-type]
         chunks.append(found)
         advance(len(chunk))

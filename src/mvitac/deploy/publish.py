@@ -20,6 +20,7 @@ from mvitac.evaluation.leaks import Scored, Source, write_sources
 from mvitac.evaluation.probe import ProbeSplit, scorable, score_predictions, score_rows, split_rows
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.evaluation.scores import summarise
+from mvitac.evaluation.sensors import sensors_of
 from mvitac.evaluation.value_scores import error_by_range
 from mvitac.model import Model
 from mvitac.model_files import load
@@ -191,6 +192,7 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         _, record = load_run(run)
         pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on a pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
+        model.spec = replace(model.spec, sensors=_sensors(model, pack))
         _write_weights(model, partial)
         write_json(partial / "run.json", record, sealed=True)
         if learned is not None:
@@ -212,15 +214,19 @@ def _write_weights(model: Model, folder: Path) -> None:
         write_atomic(folder / "probes.safetensors", lambda file: file.write(data))
 
 
+def _sensors(model: Model, pack: Pack) -> tuple[str, ...]:
+    """Names of the touch sensors that the encoders of ``model`` met, as far as that is known, or its probes."""
+    return tuple(sorted({*model.spec.sensors, *sensors_of(pack, pack.rows("train", "val", "unlabelled"))}))
+
+
 def _describe(model: Model, pack: Pack) -> dict[str, Any]:
     """artifact.json without its files and digest."""
-    sensors = sorted(set(pack.column("sensor").astype(str))) if "sensor" in pack.table.column_names else []
     keys = ("name", "licence", "source")
     infos = [r.info for r in model.probes.values()]
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "preprocessing": preprocessing(model, tuple(sensors)),
+        "preprocessing": preprocessing(model),
         "probes": [to_json(q) for q in infos if isinstance(q, ProbeInfo)],
         **({"values": values} if (values := [to_json(q) for q in infos if isinstance(q, ValueInfo)]) else {}),
         "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},

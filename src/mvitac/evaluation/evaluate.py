@@ -24,7 +24,7 @@ from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, score_name, sources_of, tested_on
 from mvitac.evaluation.scores import summarise
-from mvitac.evaluation.sensors import describe_statistics, sensor_records
+from mvitac.evaluation.sensors import about_new, describe_statistics, sensor_records
 from mvitac.model import Model
 from mvitac.model_files import Which, load, weights_file
 from mvitac.nn.encoders import build_trunk
@@ -138,10 +138,10 @@ def probe_runs(
 
 
 def _about_sensors(each: Sequence[Probed], pack: Pack, session: ProbeConfig) -> dict[str, Any]:
-    """Which statistics of touch sensors were used, and what features tell of the sensor, if either was asked for."""
-    found: dict[str, Any] = (
-        {"statistics": describe_statistics(pack, session.standardise)} if session.standardise else {}
-    )
+    """Which touch sensors are new, which statistics were used, and, if asked for, what features tell of the sensor."""
+    new = dict.fromkeys(about_new(model, pack, session.standardise) for _, model, _, _ in each)
+    lines = [*filter(None, new), *(describe_statistics(pack, session.standardise) if session.standardise else ())]
+    found: dict[str, Any] = {"statistics": lines} if lines else {}
     if session.sensors:
         scored = ((name, model, record) for _, model, name, _ in each for record in sensor_records(model, pack))
         found["sensors"] = [{"source": name, "seed": model.run.seed, **record} for name, model, record in scored]

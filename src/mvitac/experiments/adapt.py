@@ -17,6 +17,7 @@ from mvitac.evaluation.evaluate import check_channels, check_unseen
 from mvitac.evaluation.leaks import Scored, Source, read_sources
 from mvitac.evaluation.probe import probe_model, scorable, split_rows
 from mvitac.evaluation.retrieval import cross_modal, retrieved_rows
+from mvitac.evaluation.sensors import RecolouredPack, Standardise
 from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.nn.initial import Init
@@ -27,6 +28,7 @@ from mvitac.training.loop import train
 from mvitac.training.setup import check_out
 
 NEW, OLD, TRANSFER = "new data", "old data", "probes of old labels on new data"
+COLOURED = f"{TRANSFER}, in the colours of old sensors"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +87,7 @@ def adapt(
         for name, one in packs.items():
             learned = read_sources(out, after.run, pack.digest, one)
             for source, scored, known in (("before", model, sources[name]), ("after", after, learned)):
-                found = _scores(scored, one, known, retrieval=name != TRANSFER)
+                found = _scores(scored, one, known, retrieval=name in (NEW, OLD))
                 records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
                 advance()
     result = {"ancestor": str(ancestor), "group_by": pack.spec.group_by, "records": records}
@@ -104,7 +106,10 @@ def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, asked
 
 
 def _old_packs(model: Model, given: Path | None, new: Pack, say: Callable[[str], object]) -> dict[str, Pack]:
-    """What the model was trained on, or the pack ``given``; and, joined with ``new``, probes that are learned on it."""
+    """What the model was trained on, or the pack ``given``; and, joined with ``new``, probes that are learned on it.
+
+    They are also scored on new sensors in the colours of old ones, which needs no training: what adapting has to beat.
+    """
     try:
         old = Pack(given) if given else model.open_data(quiet=True)
     except ValueError as error:
@@ -112,19 +117,23 @@ def _old_packs(model: Model, given: Path | None, new: Pack, say: Callable[[str],
             raise
         say(f"what is forgotten is not scored: {brief(error)} (--old PACK names data of the old sensors)")
         return {}
-    try:
-        return {OLD: old} | ({TRANSFER: JoinedPack(old, new)} if scorable(old) and scorable(new) else {})
-    except ValueError as error:
-        say(f"{TRANSFER}: not scored ({error})")
-        return {OLD: old}
+    found, other = {OLD: old}, set(new.sensor_names) - set(old.sensor_names)
+    for name, join in ((TRANSFER, JoinedPack), *([(COLOURED, RecolouredPack)] if other else [])):
+        try:
+            found |= {name: join(old, new)} if scorable(old) and scorable(new) else {}
+        except ValueError as error:
+            say(f"{name}: not scored ({error})")
+            break  # nor in other colours
+    return found
 
 
 def _scores(model: Model, pack: Pack, learned: Sequence[Source] | None, *, retrieval: bool) -> list[dict[str, Any]]:
     """Records of linear probes of every task, and of retrieval between modalities: on test groups, or val without any."""
     tasks, scored = {task.name: task for task in scorable(pack)}, Scored(pack)
     modalities = [*pack.spec.modalities, *(["both"] if len(pack.spec.modalities) == 2 else [])]
-    records = []
-    for record in probe_model(model, pack, [*tasks.values()], modalities, ["linear"]) if tasks else ():
+    records: list[dict[str, Any]] = []
+    looks: tuple[Standardise, ...] = ("colours", "features") if isinstance(pack, RecolouredPack) else ()
+    for record in probe_model(model, pack, [*tasks.values()], modalities, ["linear"], looks) if tasks else ():
         leak = scored.leak(learned, split_rows(pack, tasks[record["task"]]).test)
         records += [{**record, "leak": leak}] if record["probe"] == "linear" else []
     rows = retrieved_rows(pack)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.data.images import decode
+from mvitac.sim.sensors import SENSORS
 from mvitac.system.files import brief
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
@@ -29,6 +30,7 @@ class Source(ABC):
 
     fps: float = 30.0  # nominal rate
     paced: bool = True  # whether ``read`` itself waits for the next frame
+    sensor: str = ""  # name of the touch sensor, as in column sensor of packs; "" = not known
 
     @abstractmethod
     def open(self) -> None: ...
@@ -152,6 +154,7 @@ class Simulated(Source):
 
     def __init__(self, modality: str, seed: int = 0, fps: float = 30.0, size: int = 72) -> None:
         self.modality, self.seed, self.fps, self.size = modality, seed, fps, size
+        self.sensor = min(name for name, sensor in SENSORS.items() if not sensor.held_out)
 
     def open(self) -> None:
         self.number, self.touch = 0, -1
@@ -165,14 +168,13 @@ class Simulated(Source):
         if int(touch) != self.touch:
             self.touch = int(touch)
             rng = np.random.default_rng([self.seed, self.touch])
-            sensors = {name: s for name, s in materials.SENSORS.items() if not s.held_out}
             while True:  # all touches by one sensor, as on a robot
                 address = int(rng.integers(len(materials.CLASSES))), int(rng.integers(60)), int(rng.integers(5))
                 pair = materials.touch(self.seed, *address, size=self.size)
-                if pair["sensor"] == min(sensors):
+                if pair["sensor"] == self.sensor:
                     break
             quiet = np.zeros((self.size, self.size), np.float32)
-            blank = gel.render(quiet, sensors[pair["sensor"]], rng, pixel_mm=12.8 / self.size, unit=1)
+            blank = gel.render(quiet, SENSORS[self.sensor], rng, pixel_mm=12.8 / self.size, unit=1)
             self.pictures = {"vision": (pair["vision"],) * 2, "touch": (blank, pair["touch"])}
         self.number += 1
         image = self.pictures[self.modality][phase >= self.rest].astype(np.float32)

@@ -32,13 +32,15 @@ class Recorder:
         *,
         fps: float = 10.0,
         form: Literal["pack", "lerobot"] = "pack",
+        sensor: str = "",
         tell: Callable[[str], object] = print,
     ) -> None:
         """Record into the new folder ``out``; ``channels``: modality -> C of its images, uint8 [S, S, C].
 
         ``tell`` is called when recording ends early.
 
-        ``fps`` is the maximum number of pairs per second, a whole number for lerobot.
+        ``fps`` is the maximum number of pairs per second, a whole number for lerobot. ``sensor`` is the name of the touch
+        sensor, if it is known (column sensor).
         """
         if not fps > 0:
             raise ValueError(f"fps {fps:g}: give pairs a second, more than 0")
@@ -63,7 +65,7 @@ class Recorder:
             source="mvitac live",
         )
         self.spool.mkdir(parents=True)
-        write_json(self.spool / "recording.json", {"spec": to_json(spec), "form": form, "fps": fps})
+        write_json(self.spool / "recording.json", {"spec": to_json(spec), "form": form, "fps": fps, "sensor": sensor})
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num = 0
         self._next = float("-inf")
@@ -129,6 +131,7 @@ class Recorded(Source):
         self.files = sorted(path.glob("*.npz"))
         meta = read_json(path / "recording.json", "an unfinished recording")
         self.form, self.fps, self._spec = meta["form"], meta["fps"], meta["spec"]
+        self.named = {"sensor": sensor} if (sensor := meta.get("sensor")) else {}  # older recordings have none
 
     def spec(self) -> DataSpec:
         return from_json(DataSpec, self._spec, "spec")
@@ -156,6 +159,6 @@ class Recorded(Source):
             own: dict[str, Any] = {name: values[i] for name, values in columns.items()}
             # Frames of one touch are near-copies, so each touch is a group; so is each rest between touches.
             group = f"touch-{own['touch_number']:06d}" if own["contact"] else f"rest-{own['touch_number']:06d}"
-            own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled"}
+            own |= {"id": f"{first + i:08d}", "group": group, "touch_group": group, "split": "unlabelled", **self.named}
             samples.append(Sample(vision=pick("vision", i), touch=pick("touch", i), columns=own))
         return samples

@@ -122,9 +122,9 @@ def print_retrieval(result: dict[str, Any], console: Console) -> None:
 
 
 def print_sensors(result: dict[str, Any], console: Console) -> None:
-    """Print which statistics of touch sensors were used, and what features tell of the sensor, if either was asked for."""
+    """Print which touch sensors are new, which statistics were used, and what features tell of the sensor, if known."""
     for line in result.get("statistics", ()):
-        console.print(line, markup=False, highlight=False)
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     if not result.get("sensors"):
         return
     table = Table("", "", "%", "chance %", title="touch sensors", title_justify="left", title_style="bold")

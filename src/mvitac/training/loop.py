@@ -99,7 +99,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
     with log_or_none or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
             log.say(describe_precision(setup.asked.precision, run.precision, setup.device))
-        validation = Validation(out, run, method, pack, log, setup.kept) if log and validate else None
+        validation = Validation(out, run, method, pack, setup.spec, log, setup.kept) if log and validate else None
         if validation and start == 0:
             validation(0)
         method.train()
@@ -142,7 +142,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
     if world.writes:
-        Model(method, run, pack.spec, pack.size).save(out / "model.safetensors")
+        Model(method, run, setup.spec, pack.size).save(out / "model.safetensors")
         check_still_there(out)
         (out / checkpoint.PREVIOUS).unlink(missing_ok=True)
     world.wait()

@@ -11,9 +11,11 @@ import numpy as np
 import torch
 
 from mvitac.data.pack import Pack
+from mvitac.data.spec import DataSpec
 from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
+from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.methods.supervised import Supervised, SupervisedConfig
 from mvitac.model import Model
@@ -54,6 +56,7 @@ class Setup:
     start: int  # number of steps that are already done
     num_steps: int
     kept: dict[str, Any]  # state of validation (``Validation``)
+    spec: DataSpec  # that of ``pack``, with the sensors that the model met
 
     def chunks(self, start: int, num_steps: int) -> Iterator[list[Chunk]]:
         """The chunks of each step from ``start`` to ``num_steps`` (``load_chunks``)."""
@@ -90,13 +93,15 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     num_steps = run.num_steps(len(rows))
     kept: dict[str, Any] = {}
     start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
-    setup = Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept)
+    before = start_weights.sensors if start_weights and "touch" in taken["taken"] else ()
+    spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
+    setup = Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept, spec)
     if start == 0:
         _before_first_step(setup)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere(replicated(method))
     if not resumed and world.writes:
-        record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(pack.spec)}
+        record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(spec)}
         here = {"device": describe(device), "precision": run.precision}
         if start_weights:
             record |= {"start": taken}

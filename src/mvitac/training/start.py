@@ -29,6 +29,7 @@ class Start:
     heads: dict[str, State]  # modality -> state dict of the head into the shared space
     trunk: str  # timm name of the trunks; "" if it is not known
     sources: list[Source]  # what its weights were trained on
+    sensors: tuple[str, ...] = ()  # touch sensors that they met, as far as the file says
 
 
 def read_start(init: Init, pack: Pack) -> Start | None:
@@ -40,7 +41,8 @@ def read_start(init: Init, pack: Pack) -> Start | None:
         model = load(init.file)
         trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
         heads = {m: head.state_dict() for m, head in model.projectors.items()}
-        return Start(init, trunks, heads, model.run.encoder.trunk, _learned(init.file, pack))
+        learned = _learned(init.file, pack)
+        return Start(init, trunks, heads, model.run.encoder.trunk, learned, model.spec.sensors)
     trunks = {m: _below(f"encoders.{m}.", tensors) for m in ("vision", "touch")}
     heads = {m: state for m in trunks if (state := _below(f"projectors.{m}.", tensors))}
     trunks = {m: state for m, state in trunks.items() if state} or {ANY: tensors}

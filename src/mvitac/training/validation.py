@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, Task
+from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import pack_features
 from mvitac.methods.base import Method
@@ -32,15 +32,19 @@ ratio: accuracy of a class (errors: wrong rows; guess: all rows), R2 of a value 
 class Validation:
     """Evaluates a method while it trains, compares it with its start, and keeps the best weights.
 
-    ``kept`` is the state of the last checkpoint, which a resumed run continues with; empty at the start.
+    ``spec`` describes the models that are kept (``Setup.spec``). ``kept`` is the state of the last checkpoint, which a
+    resumed run continues with; empty at the start.
     """
 
-    def __init__(self, out: Path, run: Run, method: Method, pack: Pack, log: Log, kept: dict[str, Any]) -> None:
-        self.out, self.run, self.method, self.pack, self.log, self.kept = out, run, method, pack, log, kept
+    def __init__(
+        self, out: Path, run: Run, method: Method, pack: Pack, spec: DataSpec, log: Log, kept: dict[str, Any]
+    ) -> None:
+        self.out, self.run, self.method, self.pack, self.spec = out, run, method, pack, spec
+        self.log, self.kept = log, kept
 
     def __call__(self, step: int, *, last: bool = False) -> None:
         """Evaluate after ``step`` steps; write model.best.safetensors if it is the best so far."""
-        model = Model(self.method, self.run, self.pack.spec, self.pack.size)
+        model = Model(self.method, self.run, self.spec, self.pack.size)
         values, cells = validate(model, self.pack, self.run)
         self.method.train()
         if step == 0:

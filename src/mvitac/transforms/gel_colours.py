@@ -62,6 +62,24 @@ def recolour(images: np.ndarray, source: GelColours, target: GelColours) -> np.n
     return np.clip(np.rint(target.level + target.rest + slopes), 0, 255).astype(np.uint8)
 
 
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """A sensor in the colours of others: call it with images uint8 [N, H, W, 3] to get them as each target shows them."""
+
+    sensor: str
+    names: tuple[str, ...]  # of the targets
+    num_images: int  # unlabelled images of the sensor that its colours were learned from
+    source: GelColours
+    targets: tuple[GelColours, ...]
+
+    def __call__(self, images: np.ndarray) -> list[np.ndarray]:
+        return [recolour(images, self.source, target) for target in self.targets]
+
+    def about(self) -> dict[str, object]:
+        """What a description of a model keeps, JSON-ready."""
+        return {"sensor": self.sensor, "in_colours_of": list(self.names), "num_images": self.num_images}
+
+
 def _without_light(images: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """``images`` minus the sensor's lamps ``rest`` and minus their own mean colour: LEDs and tint drift."""
     levels = images.astype(np.float64)

@@ -1,0 +1,225 @@
+"""An export for a touch sensor that the model never met: in live, its answers are those of the probe in known colours."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvitac.cli.main import main
+from mvitac.data.build import build
+from mvitac.data.joined_pack import JoinedPack
+from mvitac.data.pack import Pack
+from mvitac.data.source import Sample
+from mvitac.datasets.pack import PackConfig
+from mvitac.datasets.simulated import Materials, MaterialsConfig
+from mvitac.deploy.engine import Engine, about_sensor
+from mvitac.deploy.export import ExportConfig, export
+from mvitac.deploy.publish import with_probes
+from mvitac.evaluation.probe import probe_model
+from mvitac.evaluation.sensors import (
+    RecolouredPack,
+    about_new,
+    learn_looks,
+    sensors_of,
+    touch_features,
+    unlabelled_rows,
+)
+from mvitac.live.cameras import Ended, Source
+from mvitac.live.contact import LiveConfig
+from mvitac.live.predictor import Live
+from mvitac.live.recorder import Recorder
+from mvitac.live.streams import Stream
+from mvitac.model import Model
+from mvitac.model_files import load
+from mvitac.recipes import recipe
+from mvitac.sim import materials
+from mvitac.sim.sensors import SENSORS
+from mvitac.training.loop import train
+from support.faults import Clock
+
+OPTION = "--new-sensor"
+
+
+class Unlabelled(Materials):
+    """Simulated touches, of which only those of test keep their split."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        kept = sample.columns["split"] == "test"
+        return [sample if kept else replace(sample, columns={**sample.columns, "split": "unlabelled"})]
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    config = MaterialsConfig(num=200, touches=1, size=32, makes=("mini", "digit"))
+    return build(Materials(config), tmp_path_factory.mktemp("old") / "pack", size=32, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def new(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    config = MaterialsConfig(num=100, touches=1, size=32, held_out_sensor=True)
+    return build(Unlabelled(config), tmp_path_factory.mktemp("new") / "pack", size=32, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def run(old: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = replace(recipe("smoke", PackConfig(path=old.path)), steps=4, eval_every=0)
+    return train(run, tmp_path_factory.mktemp("run") / "run", quiet=True, validate=False)
+
+
+@pytest.fixture(scope="module")
+def model(run: Path, old: Pack) -> Model:
+    return with_probes(load(run), old)
+
+
+@pytest.fixture(scope="module")
+def engine(run: Path, old: Pack, new: Pack, tmp_path_factory: pytest.TempPathFactory) -> Engine:
+    out = tmp_path_factory.mktemp("export") / "slim"
+    packs = ["--on", str(old.path), OPTION, str(new.path)]
+    assert main(["export", str(run), "--out", str(out), *packs, "--threads", "1"]) == 0
+    return Engine(out, threads=1)
+
+
+def by_the_probe(model: Model, both: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """The answers of the probes on both modalities, on features of ``probe --standardise colours``."""
+    z = [touch_features(model, both, m, rows, ("colours",), maps=False) for m in ("vision", "touch")]
+    x = torch.from_numpy(np.concatenate(z, axis=1))
+    return {probe.info.task: probe(x).numpy() for probe in model.probes.values() if probe.info.modality == "both"}
+
+
+class Played(Source):
+    """Frames given beforehand."""
+
+    paced = False
+
+    def __init__(self, frames: list[np.ndarray]) -> None:
+        self.left = deque(frames)
+
+    def open(self) -> None:
+        pass
+
+    def read(self) -> np.ndarray:
+        if not self.left:
+            raise Ended
+        return self.left.popleft()
+
+
+def play(engine: Engine, pack: Pack, rows: np.ndarray, **options: Any) -> list[dict[str, np.ndarray]]:
+    """The answers of ``Live`` on touch after touch, four frames each, with the free gel between."""
+    free = materials.touch(0, 0, 0, 0, size=32, sensors=(SENSORS["slim"],), background=True)["background"]
+    given: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
+    for row in rows:
+        given["touch"] += [free] * 6 + [pack.images["touch"][row]] * 4
+        given["vision"] += [pack.images["vision"][row]] * 10
+    clock = Clock()
+    streams = {m: [Stream(m, Played(frames), clock=clock)] for m, frames in given.items()}
+    live = Live(engine, streams, LiveConfig(calibration=6), clock=clock, **options)
+    answers, last = [], None
+    while not all(stream.ended for stream in live.all):
+        clock.now += 0.1
+        for stream in live.all:
+            stream.pump()
+        live.tick()
+        if live.touch is None and live.last is not None and live.last is not last:
+            last = live.last
+            newest = {task: seen[0] for task, seen in last.values.items()}
+            answers.append({task: total / last.num_frames for task, total in last.totals.items()} | newest)
+    return answers
+
+
+def test_live_answers_as_the_probe_in_known_colours(engine: Engine, model: Model, old: Pack, new: Pack) -> None:
+    both = RecolouredPack(old, new)
+    rows = both.rows("test")
+    expected = by_the_probe(model, both, rows)
+    found = play(engine, new, np.concatenate([new.rows("test"), new.rows("test")[:1]]))[
+        : len(rows)
+    ]  # the last never ends
+    assert len(found) == len(rows) == 20 and found[0].keys() == expected.keys() == {
+        "category",
+        "soft",
+        "rough",
+        "force",
+    }
+    for task, wanted in expected.items():
+        np.testing.assert_allclose([answers[task] for answers in found], wanted, atol=2e-3)
+    plain = by_the_probe(model, JoinedPack(old, new), rows)  # as it is: another model
+    assert np.abs(plain["rough"] - expected["rough"]).max() > 0.02
+
+
+def test_scores_of_the_export_are_those_of_the_probe(engine: Engine, model: Model, old: Pack, new: Pack) -> None:
+    both = RecolouredPack(old, new)
+    records = probe_model(model, both, both.spec.tasks, ("both",), ("linear",), ("colours",))
+    expected = {record["task"]: 100 * record["accuracy"] for record in records}
+    found = {task: scores["export"] for task, scores in engine.meta["report"]["accuracy"].items()}
+    assert found == pytest.approx(expected) and len(found) == 3
+    shown = {"sensor": "slim", "in_colours_of": ["digit", "mini"], "num_images": 80}
+    assert engine.new_sensor is not None and {**engine.new_sensor, "in_colours_of": ["digit", "mini"]} == shown
+
+
+@pytest.mark.parametrize("kind", ["openvino", "torch"])
+def test_other_engines_show_the_same(kind: Any, model: Model, old: Pack, new: Pack, tmp_path: Path) -> None:
+    """The export is refused unless it is the model on recoloured images, so writing it is the check."""
+    config = ExportConfig(kind=kind, modalities=("touch",), num_rows=20, threads=1)
+    report = export(model, old, tmp_path / "slim", config, new=new)
+    assert report["num_rows"] == 20
+
+
+def test_a_recording_gives_one_image_of_each_touch(engine: Engine, old: Pack, new: Pack, tmp_path: Path) -> None:
+    """Frames of one touch are near-copies: they would make the sign look sure. The colours are those of the images."""
+    rows = unlabelled_rows(new, 0, 400)
+    recorder = Recorder(tmp_path / "slim", {"vision": 3, "touch": 3}, fps=100.0, sensor="slim")
+    play(engine, new, rows, record=recorder)
+    assert recorder.close() == 10 * len(rows)
+    recording = Pack(tmp_path / "slim")
+    assert recording.sensor_names == ("slim",)
+    found, wanted = (learn_looks(old, pack, OPTION) for pack in (recording, new))
+    assert found.about() == wanted.about()
+    np.testing.assert_array_equal(found.source.colours, wanted.source.colours)
+    images = new.images["touch"][new.rows("test")]
+    for one, other in zip(found(images), wanted(images), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_cannot_be_shown_is_refused(model: Model, old: Pack, new: Pack, tmp_path: Path) -> None:
+    few = Unlabelled(MaterialsConfig(num=30, touches=1, size=32, held_out_sensor=True))
+    cases: list[tuple[Pack, ExportConfig, str]] = [
+        (old, ExportConfig(), "no sensor but digit, mini"),
+        (
+            build(few, tmp_path / "few", size=32, quiet=True),
+            ExportConfig(),
+            "needs 32 of different presses.*--new-sensor out",
+        ),
+        (new, ExportConfig(modalities=("vision",)), "about touch"),
+    ]
+    for pack, config, why in cases:
+        with pytest.raises(ValueError, match=why):
+            export(model, old, tmp_path / "out", config, new=pack)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_knows_its_sensors(model: Model, old: Pack, new: Pack) -> None:
+    assert model.spec.sensors == ("digit", "mini") and "(touch sensors digit, mini)" in repr(model)
+    assert sensors_of(new, new.rows("test")) == ("slim",) and about_new(model, old) == ""
+    assert "slim is new to the model, which knows digit, mini: nothing is done" in about_new(model, new)
+    assert about_new(model, RecolouredPack(old, new), ("colours",)).endswith("--standardise colours is used")
+
+
+def test_live_says_which_sensor_is_new(engine: Engine) -> None:
+    def said(name: str, **about: Any) -> str:
+        given = {"inputs": engine.inputs, "sensors": ["digit", "mini"], "new_sensor": None}
+        return about_sensor(SimpleNamespace(**{**given, **about}), name)
+
+    assert "slim is new to the model, which knows digit, mini: nothing is done" in said("slim")
+    assert said("mini") == "" and "--sensor NAME says" in said("")
+    assert said("", sensors=[]) == "" and "nothing says" in said("slim", sensors=[])
+    assert said("slim", inputs={"vision": (32, 32, 3)}) == ""
+    for name in ("", "slim"):
+        assert "slim is new to the model: it is shown in the colours of" in about_sensor(engine, name)
+    assert "export the model again for mini" in about_sensor(engine, "mini")
