@@ -18,7 +18,7 @@ from mvitac.evaluation.scores import by_cell, summarise
 from mvitac.report import html as page
 from mvitac.report.figures import to_svg
 from mvitac.report.tables import probe_name
-from mvitac.system.files import write_atomic
+from mvitac.system.files import fields_of, write_atomic
 
 GUESS = "majority or mean"
 CONTROLS = (GUESS, "border", "pixels", "untrained")
@@ -78,8 +78,9 @@ def write_board(files: Sequence[Path], out: Path) -> Path:
     results: dict[str, dict[str, Any]] = {}
     for path in files:
         result = read_result(path)
-        if found := problems(result):
-            raise ValueError(f"{path}: {found[0]}")
+        with fields_of(path):
+            if found := problems(result):
+                raise ValueError(f"{path}: {found[0]}")
         first = next(iter(results.values()), result)
         if first["suite_digest"] != result["suite_digest"]:
             versions = " and ".join(f"{r['suite']['name']} ({r['suite_digest'][:12]})" for r in (first, result))
@@ -87,7 +88,8 @@ def write_board(files: Sequence[Path], out: Path) -> Path:
         if (name := result["encoder"]["name"]) in results:
             raise ValueError(f"{path}: another result is of an encoder named {name!r}: bench one of them with --name")
         results[name] = result
-    text = _page(gather(results))
+    with fields_of(" or ".join(map(str, files))):
+        text = _page(gather(results))
     write_atomic(out, lambda file: file.write(text.encode()))
     return out
 

@@ -14,13 +14,15 @@ import re
 import sys
 import zipfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import safetensors.numpy
 
-from mvitac.system.files import brief, digest, digest_file, read_json
+from mvitac.registry import from_json
+from mvitac.system.files import brief, digest, digest_file, fields_of, read_json
 
 FORMAT, FORMAT_VERSION = "mvitac-export", 1
 MANIFEST, CHECK = "export.json", "check.safetensors"
@@ -32,6 +34,16 @@ TORCH_MEMBERS = re.compile(
 """Files that torch.export writes of a model; not among them: compiled libraries and pickled objects, which it would run."""
 Images = Mapping[str, np.ndarray]
 Call = Callable[[list[np.ndarray]], list[np.ndarray]]
+
+
+@dataclass(frozen=True)
+class _Target:
+    """What export.json says of a value."""
+
+    name: str
+    unit: str
+    edges: tuple[float, ...]
+    spread: tuple[float, ...]
 
 
 class Engine:
@@ -47,9 +59,15 @@ class Engine:
         """``threads``: CPU threads, 0 = all cores. ValueError if a file or an output differs from the export's."""
         folder = Path(folder)
         self.meta = read_manifest(folder)
+        with fields_of(folder / MANIFEST):
+            self._open(folder, threads)
+
+    def _open(self, folder: Path, threads: int) -> None:
         self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
         self.classes: dict[str, list[str]] = self.meta["classes"]
         self.values: dict[str, list[dict[str, Any]]] = self.meta.get("values", {})
+        from_json(dict[str, tuple[str, ...]], self.classes, "classes")
+        from_json(dict[str, tuple[_Target, ...]], self.values, "values")
         """task -> name, unit, edges and spread of each target (``spread_at``)."""
         self.difference: bool = self.meta["preprocessing"].get("difference", False)
         """Whether the touch input is (touch - background) / 2 + 128."""
@@ -117,7 +135,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{folder / MANIFEST} is of another version: export it again")
     if meta.get("digest") != digest({key: value for key, value in meta.items() if key != "digest"}):
         raise ValueError(f"{folder / MANIFEST} does not match its digest: it was changed or damaged, copy it again")
-    if set(meta["files"]) != {CHECK, *FILES[meta["kind"]]}:
+    if set(meta.get("files") or ()) != {CHECK, *FILES[meta["kind"]]}:
         raise ValueError(f"{folder / MANIFEST} names other files than {', '.join(FILES[meta['kind']])}: refused")
     for name, expected in meta["files"].items():
         if not (folder / name).is_file() or digest_file(folder / name) != expected:

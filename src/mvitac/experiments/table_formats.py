@@ -279,10 +279,14 @@ def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
     return f"{number} {ends}{paper}{leak_mark(cell.leak)}"
 
 
+_TEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "&%_#${}"} | {"\\": r"\textbackslash{}", "^": r"\^{}", "~": r"\~{}"}
+)
+"""What LaTeX would obey in a name or a unit."""
+
+
 def _tex(text: str) -> str:
-    for sign in "&%_#":
-        text = text.replace(sign, "\\" + sign)
-    return text
+    return text.translate(_TEX)
 
 
 def comma(result: dict[str, Any]) -> str:
