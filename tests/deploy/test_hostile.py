@@ -27,7 +27,7 @@ from mvitac.deploy.engine import Engine
 from mvitac.deploy.search import Index, build
 from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.run_names import names_of
-from mvitac.system.files import digest, digest_file
+from mvitac.system.files import digest, digest_file, read_json
 
 RESULT = Path(__file__).parents[2] / "benchmarks" / "board" / "sim-v1" / "sim-v1-resnet18-random.json"
 
@@ -180,10 +180,14 @@ def test_initial_weights_are_neither_opened_nor_fetched(
 def test_start_weights_of_another_run_are_not_opened(copy: Path, trap: Path, pack: Pack, known: dict[str, str]) -> None:
     """They would be an error here: what opens them is no Python, so that no hook sees it."""
     (trap / "letter.safetensors").write_text("dear")
+    record = read_json(copy / "run.json", "a record") | {"start": {"name": "older", "trained_on": ["tag"]}}
+    (copy / "run.json").write_text(json.dumps(record))
     forge(copy, trap, run=lambda trap, run: run.update(init={"path": str(trap / "letter.safetensors"), **known}))
     model = mvitac.load(str(copy))
     assert model.run.init.path is None and model.run.init.digest == known.get("digest", "unknown")
-    assert names_of([copy], [model]) == ["mvitac"] and describe([model], [str(copy)], About())["images_seen"] is None
+    assert names_of([copy], [model]) == ["mvitac"]
+    found = describe([model], [str(copy)], About())
+    assert found["trained_on"] == "toy; starts from older, which was trained on: tag" and found["images_seen"] is None
 
 
 def test_the_pack_of_an_artifact_without_a_list_is_not_opened(

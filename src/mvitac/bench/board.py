@@ -156,7 +156,8 @@ SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder
 of values. Controls come first. Encoders follow by their mean rank, which is for reading only: the order of each task is
 below. An empty cell was not run."""
 ORDER = """'>' means that the 95 % interval of the difference to the next encoder, paired over test groups, excludes 0; '≈'
-that this order is not resolved. Differences are in points, not corrected for the number of comparisons."""
+that this order is not resolved. If either has one seed, the interval leaves out the variation between seeds.
+Differences are in points, not corrected for the number of comparisons."""
 LEAKS = """Leaks compare the rows and groups that an encoder was trained on with the test rows, where a list of them came
 with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
 DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.
