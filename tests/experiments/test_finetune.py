@@ -16,6 +16,7 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
+from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import NEW, OLD, TRANSFER, Adaptation, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
@@ -222,6 +223,9 @@ def test_a_leak_of_the_ancestor_stands_beside_the_score(ancestor: Path, pack: Pa
     records = tune(ancestor, Pack(seen), tmp_path / "out", asked)["records"]
     leaks = {r["source"]: r["leak"] for r in records}
     assert "72 of 72 test rows" in leaks["fine-tuned, all"] and "72 of 72" in leaks[FROZEN] and leaks[SCRATCH] == ""
+    scratch = tmp_path / "out" / "scratch" / "seed0"  # saw its own train alone, which the other split tests
+    with pytest.raises(ValueError, match=r"has seen what .* 72 of 72 test rows and 36 of 36 test instances"):
+        check_unseen([scratch], [load(scratch)], pack, pack.spec.tasks, allow_leak=False)
 
 
 # -- adapt --------------------------------------------------------------------------------------------------------------
