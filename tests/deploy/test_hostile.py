@@ -109,7 +109,7 @@ PLACES: list[tuple[str, Change]] = [
     ("publish", data("lerobot", path="{trap}")),
     ("export", data("touch-and-go", root="{trap}")),
     ("explore", data("calandra", path="{trap}")),
-    ("export", lambda trap, run: run.update(data={"name": "mix", "parts": [f"a={trap}", f"b={trap}:2"]})),
+    ("export", lambda trap, run: run.update(data={"name": "mix", "parts": [f"a={trap}:1", f"b={trap}:2"]})),
     ("probe", lambda trap, run: run.update(data={"name": "mix", "parts": ["http://198.51.100.7/a", f"{trap}"]})),
 ]
 

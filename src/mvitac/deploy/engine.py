@@ -58,21 +58,21 @@ class Engine:
     def __init__(self, folder: str | Path, *, threads: int = 0) -> None:
         """``threads``: CPU threads, 0 = all cores. ValueError if a file or an output differs from the export's."""
         folder = Path(folder)
-        self.meta = read_manifest(folder)
         with fields_of(folder / MANIFEST):
             self._open(folder, threads)
 
     def _open(self, folder: Path, threads: int) -> None:
+        self.meta = read_manifest(folder)
         self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
         self.classes: dict[str, list[str]] = self.meta["classes"]
         self.values: dict[str, list[dict[str, Any]]] = self.meta.get("values", {})
-        from_json(dict[str, tuple[str, ...]], self.classes, "classes")
-        from_json(dict[str, tuple[_Target, ...]], self.values, "values")
         """task -> name, unit, edges and spread of each target (``spread_at``)."""
         self.difference: bool = self.meta["preprocessing"].get("difference", False)
         """Whether the touch input is (touch - background) / 2 + 128."""
         self.window: dict[str, Any] | None = self.meta["preprocessing"].get("window")
         """For windows: number of frames, stride, its unit (order) and modalities (of), as in export.json."""
+        from_json(dict[str, tuple[str, ...]], self.classes, "classes")
+        from_json(dict[str, tuple[_Target, ...]], self.values, "values")
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})
@@ -135,7 +135,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{folder / MANIFEST} is of another version: export it again")
     if meta.get("digest") != digest({key: value for key, value in meta.items() if key != "digest"}):
         raise ValueError(f"{folder / MANIFEST} does not match its digest: it was changed or damaged, copy it again")
-    if set(meta.get("files") or ()) != {CHECK, *FILES[meta["kind"]]}:
+    if set(meta["files"]) != {CHECK, *FILES[meta["kind"]]}:
         raise ValueError(f"{folder / MANIFEST} names other files than {', '.join(FILES[meta['kind']])}: refused")
     for name, expected in meta["files"].items():
         if not (folder / name).is_file() or digest_file(folder / name) != expected:
