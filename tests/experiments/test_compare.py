@@ -525,7 +525,7 @@ def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack:
 
 
 def test_names_and_units_are_text_in_latex_and_markdown() -> None:
-    assert _tex(r"\input{x} N%$_^~") == r"\textbackslash{}input\{x\} N\%\$\_\^{}\~{}"
+    assert _tex("\\input{x}\n N%$_^~") == r"\textbackslash{}input\{x\} N\%\$\_\^{}\~{}"
     assert pipes(["a|b"], [["c|d"]], words=1) == [r"| a\|b |", "|---|", r"| c\|d |", ""]
 
 
