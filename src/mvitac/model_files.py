@@ -25,6 +25,11 @@ def weights_file(folder: Path, which: Which) -> Path:
     return folder / (BEST if which == "best" else "model.safetensors")
 
 
+def is_foreign(folder: Path) -> bool:
+    """Whether ``folder`` is an artifact or an index, which may be a stranger's: no place that its run names is opened."""
+    return any((folder / name).exists() for name in ("artifact.json", "index.json"))
+
+
 def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
     """The model of ``run`` before training, initialised from its seed. Used as a control, and to load weights into."""
     torch.manual_seed(run.seed)
@@ -62,7 +67,9 @@ def load(path: str | Path, which: Which = "last") -> Model:
         with torch.device("meta"):
             check_tensors(file, fresh(empty, spec, stored).state_dict(), tensors)
         model = fresh(empty, spec, stored)
+    model.foreign = is_foreign(file.parent)
+    if model.foreign and run.init:
+        run = replace(run, init=replace(run.init, path=None, digest=run.init.digest or "unknown"))
     model.run = run
-    model.foreign = any((file.parent / name).exists() for name in ("artifact.json", "index.json"))
     model.load_state_dict(tensors)
     return model

@@ -66,6 +66,7 @@ name = "pack"
 at = {{ path = "elsewhere" }}
 data = {{ name = "pack" }}
 """
+FORM = 'at = { path = "stripes" }\ndata = { name = "pack" }'
 BOARD = Path(__file__).parents[2] / "benchmarks" / "board"
 GOLDEN = {
     "calandra-v1": "b9de4eee4353",
@@ -400,6 +401,13 @@ def test_shipped_suites_keep_their_definitions() -> None:
         (SUITE.replace("linear", "quadratic"), "unknown value of suite.probes"),
         (SUITE.replace('"folded"', '"stripes"'), "two sets have one name"),
         (SUITE.replace('name = "pack" }', 'name = "packs" }', 1), "unknown dataset"),
+        (SUITE.replace('"clone" }', '"../clone" }', 1), "not a place below --data-root"),
+        (SUITE.replace('"clone" }', '"/clone" }', 1), "not a place below --data-root"),
+        (SUITE.replace('name = "pack" }', 'name = "pack", path = "/etc" }', 1), "names a place in 'path'"),
+        (SUITE.replace(FORM, 'data = { name = "stream", url = "http://198.51.100.7/x" }', 1), "a place in 'url'"),
+        (SUITE.replace(FORM, 'data = { name = "mix", parts = ["/a", "/b"] }', 1), "a place in 'parts'"),
+        (SUITE.replace(RANDOM.format(1), "external:python:antigravity:fly"), "weights=random"),
+        (SUITE.replace(RANDOM.format(1), "external:timm/resnet18"), "weights=random"),
     ],
 )
 def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Forty artifacts made by a stranger: each is refused in one line or used as plain data.
+"""Artifacts, indexes, exports and results made by a stranger: each is refused in one line or used as plain data.
 
 While a command runs, every path and network address that Python touches is recorded by an audit hook. None may lie in the
 trap, a folder that only the artifact names, and none may be on the network.
@@ -18,10 +18,18 @@ import safetensors
 import safetensors.torch
 
 import mvitac
+from mvitac.bench.encoder import About, describe
+from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import seal
-from mvitac.system.files import digest, digest_file
+from mvitac.deploy.engine import Engine
+from mvitac.deploy.search import Index, build
+from mvitac.evaluation.leaks import read_sources
+from mvitac.evaluation.run_names import names_of
+from mvitac.system.files import digest, digest_file, read_json
+
+RESULT = Path(__file__).parents[2] / "benchmarks" / "board" / "sim-v1" / "sim-v1-resnet18-random.json"
 
 _touched: list[str] | None = None
 
@@ -101,6 +109,8 @@ PLACES: list[tuple[str, Change]] = [
     ("publish", data("lerobot", path="{trap}")),
     ("export", data("touch-and-go", root="{trap}")),
     ("explore", data("calandra", path="{trap}")),
+    ("export", lambda trap, run: run.update(data={"name": "mix", "parts": [f"a={trap}:1", f"b={trap}:2"]})),
+    ("probe", lambda trap, run: run.update(data={"name": "mix", "parts": ["http://198.51.100.7/a", f"{trap}"]})),
 ]
 
 
@@ -166,6 +176,35 @@ def test_initial_weights_are_neither_opened_nor_fetched(
     check(list(touched), trap)
 
 
+@pytest.mark.parametrize("known", [{}, {"digest": "0" * 64}])
+def test_start_weights_of_another_run_are_not_opened(copy: Path, trap: Path, pack: Pack, known: dict[str, str]) -> None:
+    """They would be an error here: what opens them is no Python, so that no hook sees it."""
+    (trap / "letter.safetensors").write_text("dear")
+    record = read_json(copy / "run.json", "a record") | {"start": {"name": "older", "trained_on": ["tag"]}}
+    (copy / "run.json").write_text(json.dumps(record))
+    forge(copy, trap, run=lambda trap, run: run.update(init={"path": str(trap / "letter.safetensors"), **known}))
+    model = mvitac.load(str(copy))
+    assert model.run.init.path is None and model.run.init.digest == known.get("digest", "unknown")
+    assert names_of([copy], [model]) == ["mvitac"]
+    found = describe([model], [str(copy)], About())
+    assert found["trained_on"] == "toy; starts from older, which was trained on: tag" and found["images_seen"] is None
+
+
+def test_the_pack_of_an_artifact_without_a_list_is_not_opened(
+    copy: Path, trap: Path, pack: Pack, touched: list[str]
+) -> None:
+    """A log makes it look like a run, whose own pack would say what it was trained on."""
+    forge(
+        copy, trap, run=data("pack", path="{trap}"), manifest=lambda trap, m: m["files"].pop("trained_on.safetensors")
+    )
+    (copy / "trained_on.safetensors").unlink()
+    (copy / "log.jsonl").write_text("")
+    model = mvitac.load(str(copy))
+    touched.clear()
+    assert read_sources(copy, model.run, "0" * 64, pack) is None
+    check(list(touched), trap)
+
+
 def setting(*keys: str, value: Any) -> Change:
     """``value`` at ``keys`` of the run or of artifact.json."""
 
@@ -223,3 +262,99 @@ def test_refused(
     with pytest.raises(ValueError, match=says):
         mvitac.load(str(copy))
     check(list(touched), trap)
+
+
+@pytest.fixture(scope="module")
+def index(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(mvitac.load(str(artifact)), pack, tmp_path_factory.mktemp("index") / "index").folder
+
+
+def above(trap: Path, whole: dict[str, Any]) -> None:
+    whole["files"]["../trap/pairs.csv"] = "0"
+
+
+FOLDERS: list[tuple[str, str, Change, str]] = [
+    ("index", "file above", above, "names other files"),
+    ("index", "files are a number", setting("files", value=7), "is damaged"),
+    ("index", "no classes", lambda trap, m: m.pop("classes"), "is damaged"),
+    ("index", "a number for a class", setting("classes", value={"pattern": [1, 2, 3]}), "expected str, got 1"),
+    ("index", "classes of no task", setting("classes", value={"x": ["a"]}), "is damaged"),
+    ("index", "a class less", setting("classes", value={"pattern": ["a", "b"]}), "labels that are no classes"),
+    ("index", "a list for its pack", setting("pack", value=["/"]), "pack: expected str"),
+    ("onnx", "file above", above, "names other files"),
+    ("onnx", "files are a number", setting("files", value=7), "is damaged"),
+    ("onnx", "no tolerance", lambda trap, m: m.pop("tolerance"), "is damaged"),
+    ("onnx", "a number for a class", setting("classes", value={"pattern": [1]}), "expected str, got 1"),
+    ("onnx", "a value without unit", setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
+    ("onnx", "a number for outputs", setting("outputs", value=1e308), "is damaged"),
+]
+
+
+@pytest.mark.parametrize(("kind", "change", "says"), [
+    pytest.param(kind, change, says, id=f"{kind}: {name}") for kind, name, change, says in FOLDERS
+])  # fmt: skip
+def test_indexes_and_exports(
+    request: pytest.FixtureRequest,
+    trap: Path,
+    tmp_path: Path,
+    touched: list[str],
+    kind: str,
+    change: Change,
+    says: str,
+) -> None:
+    """With digests that fit again, as in ``forge``."""
+    folder = shutil.copytree(request.getfixturevalue(kind), tmp_path / kind)
+    manifest = folder / ("index.json" if kind == "index" else "export.json")
+    described = json.loads(manifest.read_text())
+    change(trap, described)
+    manifest.write_text(json.dumps({**described, "digest": seal(described)}))
+    touched.clear()
+    with pytest.raises(ValueError, match=says):
+        Index(folder) if kind == "index" else Engine(folder)
+    check(list(touched), trap)
+
+
+def record(name: str, value: Any) -> Change:
+    return lambda trap, result: result["blocks"][0]["records"][0].update({name: value})
+
+
+RESULTS: list[tuple[str, Change]] = [
+    ("check", record("accuracy", [])),
+    ("check", record("rows", "x")),
+    ("check", record("group_correct", {})),
+    ("check", lambda trap, result: result["blocks"][0].update(leaks=1e308)),
+    ("check", lambda trap, result: result["encoder"].pop("seeds")),
+    ("check", lambda trap, result: result.update(blocks=["x"])),
+    ("board", record("modality", ["touch"])),
+    ("board", lambda trap, result: result["encoder"].update(licence=["x"])),
+    ("board", lambda trap, result: result["encoder"].update(parameters=3)),
+    ("board", lambda trap, result: result["blocks"][0].pop("data")),
+]
+
+
+def forged_result(trap: Path, out: Path, change: Change) -> Path:
+    """A result of the bench after ``change``, with a digest that fits."""
+    result = json.loads(RESULT.read_text())
+    change(trap, result)
+    result["digest"] = digest({key: part for key, part in result.items() if key not in VOLATILE})
+    out.write_text(json.dumps(result))
+    return out
+
+
+@pytest.mark.parametrize(("command", "change"), RESULTS)
+def test_results_of_a_bench(
+    trap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, change: Change
+) -> None:
+    file = forged_result(trap, tmp_path / "result.json", change)
+    assert main(["bench", command, str(file), *(["--out", f"{tmp_path}/x.html"] if command == "board" else [])]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert f"{file} is damaged: a field is missing or of another kind" in error and not (tmp_path / "x.html").exists()
+
+
+def test_names_in_results_are_text(trap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evil = "\x1b]0;owned\x07<img src=http://198.51.100.7>"
+    file = forged_result(trap, tmp_path / "result.json", lambda trap, result: result["encoder"].update(name=evil))
+    assert main(["bench", "check", str(file)]) == 0
+    assert "?]0;owned?<img" in (shown := capsys.readouterr().out) and "\x1b" not in shown
+    assert main(["bench", "board", str(file), "--out", str(tmp_path / "x.html")]) == 0
+    assert "&lt;img src" in (page := (tmp_path / "x.html").read_text()) and "<img src=http" not in page

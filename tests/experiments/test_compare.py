@@ -33,6 +33,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.evaluation.evaluate import ProbeConfig
+from mvitac.evaluation.score_text import pipes
 from mvitac.experiments import collect, jobs
 from mvitac.experiments.collect import cost, forecast, gather, lay_out, leaks, pairs_of
 from mvitac.experiments.cross_validation import lay_out_folds
@@ -40,7 +41,7 @@ from mvitac.experiments.jobs import do, do_all, seconds_of
 from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
 from mvitac.experiments.plan import Plan, Row, changed, setting, slug
 from mvitac.experiments.table import lines_of
-from mvitac.experiments.table_formats import comma, latex, markdown, write_tables
+from mvitac.experiments.table_formats import _tex, comma, latex, markdown, write_tables
 from mvitac.recipes import RECIPES, recipe
 from mvitac.system.files import write_json
 from mvitac.system.locks import Busy, hold_lock
@@ -521,6 +522,11 @@ def test_what_must_be_said_beside_every_result_is(done: tuple[Path, dict], pack:
     assert latex(result, lines).splitlines()[1] == "% Note: half of it is the same."
     older = {key: value for key, value in result.items() if key not in ("notes", "run_commits", "run_devices")}
     assert "Note" not in markdown(older, lines) + latex(older, lines)
+
+
+def test_names_and_units_are_text_in_latex_and_markdown() -> None:
+    assert _tex("\\input{x}\n N%$_^~") == r"\textbackslash{}input\{x\} N\%\$\_\^{}\~{}"
+    assert pipes(["a|b"], [["c|d"]], words=1) == [r"| a\|b |", "|---|", r"| c\|d |", ""]
 
 
 def test_tables_name_the_code_of_runs_and_tables(done: tuple[Path, dict]) -> None:

@@ -17,6 +17,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import sensors
+from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import COLOURED, NEW, OLD, TRANSFER, Adaptation, _old_packs, _scores, adapt
 from mvitac.experiments.finetune import FROZEN, SCRATCH, Finetuning, finetune
@@ -223,6 +224,9 @@ def test_a_leak_of_the_ancestor_stands_beside_the_score(ancestor: Path, pack: Pa
     records = tune(ancestor, Pack(seen), tmp_path / "out", asked)["records"]
     leaks = {r["source"]: r["leak"] for r in records}
     assert "72 of 72 test rows" in leaks["fine-tuned, all"] and "72 of 72" in leaks[FROZEN] and leaks[SCRATCH] == ""
+    scratch = tmp_path / "out" / "scratch" / "seed0"  # saw its own train alone, which the other split tests
+    with pytest.raises(ValueError, match=r"has seen what .* (\d+) of \1 test rows"):
+        check_unseen([scratch], [load(scratch)], pack, pack.spec.tasks, allow_leak=False)
 
 
 # -- adapt --------------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from mvitac.evaluation.scores import by_cell, summarise
 from mvitac.report import html as page
 from mvitac.report.figures import to_svg
 from mvitac.report.tables import probe_name
-from mvitac.system.files import write_atomic
+from mvitac.system.files import fields_of, write_atomic
 
 GUESS = "majority or mean"
 CONTROLS = (GUESS, "border", "pixels", "untrained")
@@ -78,8 +78,9 @@ def write_board(files: Sequence[Path], out: Path) -> Path:
     results: dict[str, dict[str, Any]] = {}
     for path in files:
         result = read_result(path)
-        if found := problems(result):
-            raise ValueError(f"{path}: {found[0]}")
+        with fields_of(path):
+            if found := problems(result):
+                raise ValueError(f"{path}: {found[0]}")
         first = next(iter(results.values()), result)
         if first["suite_digest"] != result["suite_digest"]:
             versions = " and ".join(f"{r['suite']['name']} ({r['suite_digest'][:12]})" for r in (first, result))
@@ -87,7 +88,8 @@ def write_board(files: Sequence[Path], out: Path) -> Path:
         if (name := result["encoder"]["name"]) in results:
             raise ValueError(f"{path}: another result is of an encoder named {name!r}: bench one of them with --name")
         results[name] = result
-    text = _page(gather(results))
+    with fields_of(" or ".join(map(str, files))):
+        text = _page(gather(results))
     write_atomic(out, lambda file: file.write(text.encode()))
     return out
 
@@ -154,7 +156,8 @@ SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder
 of values. Controls come first. Encoders follow by their mean rank, which is for reading only: the order of each task is
 below. An empty cell was not run."""
 ORDER = """'>' means that the 95 % interval of the difference to the next encoder, paired over test groups, excludes 0; '≈'
-that this order is not resolved. Differences are in points, not corrected for the number of comparisons."""
+that this order is not resolved. If either has one seed, the interval leaves out the variation between seeds.
+Differences are in points, not corrected for the number of comparisons."""
 LEAKS = """Leaks compare the rows and groups that an encoder was trained on with the test rows, where a list of them came
 with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
 DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.

@@ -17,7 +17,8 @@ from mvitac.experiments.plan import slug
 from mvitac.external import ExternalModel
 from mvitac.model import Model
 from mvitac.nn.encoders import SCRATCH, num_features
-from mvitac.system.files import check_place, digest
+from mvitac.run import load_run
+from mvitac.system.files import check_place, digest, fields_of
 from mvitac.system.locks import hold_lock
 from mvitac.system.provenance import provenance
 
@@ -92,6 +93,11 @@ def _of_external(model: ExternalModel) -> dict[str, Any]:
 def _of_run(model: Model, path: Path) -> dict[str, Any]:
     run = model.run
     start = [] if run.encoder.weights == SCRATCH else [f"starts from {Path(run.encoder.weights).name}"]
+    if run.init.digest:
+        record = load_run(path)[1] if (path / "run.json").exists() else {}
+        with fields_of(path / "run.json"):
+            known = record.get("start", {"name": "other weights", "trained_on": [UNKNOWN]})
+            start += [f"starts from {known['name']}, which was trained on: {', '.join(known['trained_on'])}"]
     widths = {m: num_features(trunk) for m, trunk in model.encoders.items()}
     name = f"{run.method.name} ({run.recipe}, {run.encoder.trunk})"
     about = {"name": name, "licence": None, "trained_on": "; ".join([model.spec.name, *start])}
@@ -101,7 +107,7 @@ def _of_run(model: Model, path: Path) -> dict[str, Any]:
 def _images_seen(model: Model, path: Path) -> int | None:
     """Steps x batch size, which is images of each modality. None if it started from weights, or rows are not known."""
     run, steps = model.run, model.run.steps
-    if run.encoder.weights != SCRATCH or not (steps or (path / FILE).exists()):
+    if run.encoder.weights != SCRATCH or run.init.digest or not (steps or (path / FILE).exists()):
         return None
     if not steps:
         with_rows = read_sources(path, run, None, None)  # type: ignore[arg-type]  # the file exists, no pack is needed

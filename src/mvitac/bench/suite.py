@@ -6,6 +6,7 @@ digests of the data that was measured. A definition that changes gets another na
 
 import copy
 import tomllib
+import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.evaluation.probe import Probe
+from mvitac.nn.external.base import parse
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief, digest
 
@@ -102,10 +104,24 @@ def find_suite(name: str) -> Suite:
     try:
         suite = from_json(Suite, tomllib.loads(file.read_text()), "suite")
         for form in (form for one in suite.sets for form in one.forms):
-            _config(form, Path(), form.data)
+            _check_places(form, _config(form, Path(), form.data))
+        for text in suite.untrained:
+            if getattr(parse(text), "weights", "") != "random":
+                raise ValueError(f"untrained {text!r}: give external:timm/NAME,weights=random")
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{file} is not a suite ({brief(error)})") from None
     return suite
+
+
+def _check_places(form: Form, config: DatasetConfig) -> None:
+    """ValueError unless all places that the form names are below --data-root: a suite may be a stranger's."""
+    hints = typing.get_type_hints(type(config))
+    for name in {**form.data, **form.score_on}:
+        if "Path" in str(hints.get(name)) or name in ("url", "parts"):
+            raise ValueError(f"form {form.name!r} names a place in {name!r}: say in 'at' where it is below --data-root")
+    for place in form.at.values():
+        if Path(place).is_absolute() or {"..", "~"} & {*Path(place).parts} or ":" in place:
+            raise ValueError(f"form {form.name!r}: {place!r} is not a place below --data-root")
 
 
 def _config(form: Form, root: Path, options: dict[str, Any]) -> DatasetConfig:

@@ -16,7 +16,7 @@ from mvitac.evaluation.leaks import leaks_of
 from mvitac.evaluation.scores import summarise
 from mvitac.report.tables import print_summary
 from mvitac.system.console import Console
-from mvitac.system.files import check_place
+from mvitac.system.files import check_place, fields_of
 from mvitac.system.progress import shown
 
 
@@ -93,7 +93,8 @@ def check(argv: list[str]) -> None:
     if not options.files:
         raise ValueError("name the results to check (see mvitac bench check --help)")
     for path in options.files:
-        found = problems(result := read_result(path))
+        with fields_of(path):
+            found = problems(result := read_result(path))
         if found:
             more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
             raise ValueError(f"{path}: {found[0]}{more}")

@@ -7,6 +7,7 @@ from mvitac.data.spec import listed
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, pipes, score_name, sources_of, tested_on
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ValueInfo
+from mvitac.system.files import fields_of
 
 
 def card(model: Model, manifest: dict[str, Any]) -> str:
@@ -41,11 +42,12 @@ def _start(start: dict[str, Any] | None) -> list[str]:
     """A line on the weights that training started from, as its record says; nothing without them."""
     if not start:
         return []
-    parts = [f"{modality} {' and '.join(names)}" for modality, names in start["taken"].items()]
-    return [
-        f"Started from the weights of {start['name']} (sha256 {start['digest']}): {', '.join(parts)}. They were trained"
-        f" on: {', '.join(start['trained_on'])}. The data's licences above are not theirs."
-    ]
+    with fields_of("run.json"):
+        parts = [f"{modality} {' and '.join(names)}" for modality, names in start["taken"].items()]
+        return [
+            f"Started from the weights of {start['name']} (sha256 {start['digest']}): {', '.join(parts)}. They were trained"
+            f" on: {', '.join(start['trained_on'])}. The data's licences above are not theirs."
+        ]
 
 
 def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> list[str]:

@@ -14,6 +14,7 @@ import re
 import sys
 import zipfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ import numpy as np
 import safetensors.numpy
 
 from mvitac.data.spec import listed
-from mvitac.system.files import brief, digest, digest_file, read_json
+from mvitac.registry import from_json
+from mvitac.system.files import brief, digest, digest_file, fields_of, read_json
 
 FORMAT, FORMAT_VERSION = "mvitac-export", 1
 MANIFEST, CHECK = "export.json", "check.safetensors"
@@ -33,6 +35,16 @@ TORCH_MEMBERS = re.compile(
 """Files that torch.export writes of a model; not among them: compiled libraries and pickled objects, which it would run."""
 Images = Mapping[str, np.ndarray]
 Call = Callable[[list[np.ndarray]], list[np.ndarray]]
+
+
+@dataclass(frozen=True)
+class _Target:
+    """What export.json says of a value."""
+
+    name: str
+    unit: str
+    edges: tuple[float, ...]
+    spread: tuple[float, ...]
 
 
 class Engine:
@@ -47,6 +59,10 @@ class Engine:
     def __init__(self, folder: str | Path, *, threads: int = 0) -> None:
         """``threads``: CPU threads, 0 = all cores. ValueError if a file or an output differs from the export's."""
         folder = Path(folder)
+        with fields_of(folder / MANIFEST):
+            self._open(folder, threads)
+
+    def _open(self, folder: Path, threads: int) -> None:
         self.meta = read_manifest(folder)
         self.inputs: dict[str, tuple[int, ...]] = {m: tuple(s) for m, s in self.meta["inputs"].items()}
         self.classes: dict[str, list[str]] = self.meta["classes"]
@@ -60,6 +76,9 @@ class Engine:
         """Names of the touch sensors that the model met, as far as its file says."""
         self.new_sensor: dict[str, Any] | None = self.meta["preprocessing"].get("new_sensor")
         """For an export for a sensor that the model never met: sensor, in_colours_of (known ones), num_images."""
+        from_json(dict[str, tuple[str, ...]], self.classes, "classes")
+        from_json(dict[str, tuple[_Target, ...]], self.values, "values")
+        from_json(tuple[str, ...], self.sensors, "sensors")
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
         found = self(**{m: check[f"input_{m}"] for m in self.inputs})

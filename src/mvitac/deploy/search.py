@@ -22,8 +22,8 @@ import torch
 from mvitac.data.pack import Pack, has_difference
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.registry import unknown
-from mvitac.system.files import digest, digest_file, naming, read_json, write_atomic, write_json
+from mvitac.registry import from_json, unknown
+from mvitac.system.files import digest, digest_file, fields_of, naming, read_json, write_atomic, write_json
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 from mvitac.transforms.preprocess import ImageInput
@@ -178,6 +178,13 @@ class Index:
             raise ValueError(f"{folder / 'index.json'} does not describe an index: make one with `mvitac index`")
         if meta.get("digest") != digest({key: value for key, value in meta.items() if key != "digest"}):
             raise ValueError(f"{folder / 'index.json'} does not match its digest: it was changed: make it again")
+        with fields_of(folder / "index.json"):
+            self._open(meta, verify)
+
+    def _open(self, meta: dict[str, Any], verify: bool) -> None:
+        folder = self.folder
+        for name in ("pack", "pack_digest", "weights", "space"):
+            from_json(str, meta[name], name)
         allowed = {"model.safetensors", "rows.parquet", "vision.npy", "touch.npy"}
         if not {"model.safetensors", "rows.parquet"} <= set(meta["files"]) <= allowed:
             raise ValueError(f"{folder / 'index.json'} names other files than {', '.join(sorted(allowed))}: refused")
@@ -186,6 +193,7 @@ class Index:
                 raise ValueError(f"{folder / name} is missing or does not match its digest: make the index again")
         self.meta: dict[str, Any] = meta
         self.table: pa.Table = pq.read_table(folder / "rows.parquet")
+        self.table.select(["id", "group", "row"])
         self.banks: dict[str, np.ndarray] = {}
         for modality in ("vision", "touch"):
             if f"{modality}.npy" in meta["files"]:
@@ -193,6 +201,9 @@ class Index:
                 if bank.ndim != 2 or bank.dtype != np.float32 or len(bank) != self.table.num_rows:
                     raise ValueError(f"{folder}: {modality}.npy does not fit its table: make the index again")
                 self.banks[modality] = bank
+        for task, classes in from_json(dict[str, tuple[str, ...]], meta["classes"], "classes").items():
+            if self.table.column(f"label_{task}").to_numpy().max() >= len(classes):
+                raise ValueError(f"{folder}: task {task!r} has labels that are no classes: make the index again")
 
     def model(self) -> Model:
         """The model that embedded the rows, for queries."""

@@ -20,6 +20,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import row_hashes
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
+from mvitac.model_files import is_foreign
 from mvitac.run import Run
 from mvitac.system.files import SEAL, brief, digest, write_atomic
 
@@ -102,8 +103,8 @@ def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list
 
 
 def _own_pack(folder: Path, run: Run) -> Pack | None:
-    """The pack that a run was trained on, if it is on disk. Published artifacts name paths of other machines: None."""
-    if not (folder / "log.jsonl").exists():
+    """The pack that a run was trained on, if it is on disk. Artifacts name paths of other machines or strangers: None."""
+    if is_foreign(folder) or not (folder / "log.jsonl").exists():
         return None
     try:
         place = run.data.path if isinstance(run.data, PackConfig) else run.data.place()

@@ -20,7 +20,8 @@ def percent(value: float) -> str:
 def pipes(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -> list[str]:
     """Lines of a Markdown table. The first ``words`` columns are left-aligned, the others right-aligned."""
     rule = "|---" * words + "|---:" * (len(heads) - words) + "|"
-    return [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(row)} |" for row in rows), ""]
+    first, *lines = (" | ".join(cell.replace("|", r"\|") for cell in row) for row in (heads, *rows))
+    return [f"| {first} |", rule, *(f"| {line} |" for line in lines), ""]
 
 
 def with_interval(mean: float, low: float | None, high: float, leak: str = "") -> str:

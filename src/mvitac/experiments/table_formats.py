@@ -228,7 +228,7 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     plan = _plan(result)
     text = _tabular(lines)
     for task, each in target_lines(result).items():
-        text += ["", f"% {task}: every target, and its mean absolute error", *_tabular(each)]
+        text += ["", f"% {_tex(task)}: every target, and its mean absolute error", *_tabular(each)]
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if any(cell.printed is not None for line in lines for cell in line.cells.values()):
         note += f"; in parentheses: printed in the paper on {plan.printed_on}"
@@ -236,7 +236,7 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     notes = [note, *(f"% Note: {note}." for note in _notes(result)), intervals]
     if result["leaks"]:
         notes.append(f"% LEAK: {result['leaks']}.")
-    return "\n".join([*notes, *text]) + "\n"
+    return "\n".join([*(" ".join(line.split()) for line in notes), *text]) + "\n"
 
 
 def _tabular(lines: Sequence[Line]) -> list[str]:
@@ -279,10 +279,14 @@ def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
     return f"{number} {ends}{paper}{leak_mark(cell.leak)}"
 
 
+_TEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "&%_#${}"} | {"\\": r"\textbackslash{}", "^": r"\^{}", "~": r"\~{}"}
+)
+"""What LaTeX would obey in a name or a unit."""
+
+
 def _tex(text: str) -> str:
-    for sign in "&%_#":
-        text = text.replace(sign, "\\" + sign)
-    return text
+    return " ".join(text.split()).translate(_TEX)
 
 
 def comma(result: dict[str, Any]) -> str:

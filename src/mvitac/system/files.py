@@ -145,6 +145,16 @@ def read_json(path: Path, what: str) -> Any:
     return value
 
 
+@contextlib.contextmanager
+def fields_of(files: Path | str) -> Iterator[None]:
+    """Raise ValueError if the code inside finds a field missing, or of another kind, in ``files``, perhaps a stranger's."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, TypeError, AssertionError, ArithmeticError) as error:
+        what = f"{type(error).__name__}: {brief(error)}"
+        raise ValueError(f"{files} is damaged: a field is missing or of another kind ({what}): make it again") from None
+
+
 def parse_json(text: str) -> Any:
     """Parse JSON; ValueError if it is invalid, or nested more deeply than Python can read."""
     try:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from PIL import Image
 
@@ -218,6 +219,16 @@ def test_classes_that_differ_in_spelling_only(pack: Pack) -> None:
         found = similar_names(other)
         assert found.verdict == ("look" if alike else "ok"), classes
         assert (f"classes of pattern: {alike}" == found.evidence) == bool(alike), found.evidence
+
+
+def test_groups_of_two_parts_that_differ_in_spelling_only(pack: Pack) -> None:
+    """The parts of a mix are one training set; equal names are one group there, and numbers mean nothing outside a part."""
+    other, half = copy.copy(pack), pack.num // 2
+    other.parts = {"a": pack, "b": pack}
+    for first, second, differ in (("Mug", "mug ", True), ("mug", "mug", False), ("1", "01", False)):
+        groups = pa.array([f"a/{first}"] * half + [f"b/{second}"] * (pack.num - half))
+        other.table = pack.table.set_column(pack.table.schema.get_field_index("group"), "group", groups)
+        assert ("group: 'a/Mug' and 'b/mug '" in similar_names(other).evidence) == differ, (first, second)
 
 
 # -- the source and the pack --------------------------------------------------------------------------------------------

@@ -10,6 +10,8 @@ from mvitac.data.checks.finding import Finding, some
 from mvitac.data.checks.table_checks import KEYS, sides_of
 from mvitac.data.pack import Pack
 
+PREFIXED = ("group", "touch_group")  # columns in which a mix writes <part>/ before each name
+
 
 def similar_names(pack: Pack) -> Finding:
     """Find groups and classes whose names differ only in Unicode form, case, blanks or leading zeros."""
@@ -20,7 +22,7 @@ def similar_names(pack: Pack) -> Finding:
         if column not in pack.table.column_names:
             continue
         values = pack.column(column).astype(str)
-        alike = _alike(np.unique(values).tolist())
+        alike = _alike(np.unique(values).tolist(), across_parts=bool(pack.parts) and column in PREFIXED)
         on = [{side for name in names for side in sides[values == name].tolist()} for names in alike]
         apart = sum(len(found) > 1 for found in on)
         if alike:
@@ -39,12 +41,18 @@ def similar_names(pack: Pack) -> Finding:
     )
 
 
-def _alike(names: list[str] | tuple[str, ...]) -> list[list[str]]:
-    """Return the sets of names with the same ``_key``."""
-    found: dict[str, list[str]] = defaultdict(list)
+def _alike(names: list[str] | tuple[str, ...], *, across_parts: bool = False) -> list[list[str]]:
+    """Return the sets of names with the same ``_key``.
+
+    With ``across_parts`` names of a mix are compared without their prefix ``<part>/``. Equal ones are one group, and
+    numbers mean nothing outside their part.
+    """
+    found: dict[str, dict[str, str]] = defaultdict(dict)
     for name in names:
-        found[_key(name)].append(name)
-    return [several for several in found.values() if len(several) > 1]
+        own = name.partition("/")[2] if across_parts else name
+        own = name if own.isdigit() else own
+        found[_key(own)].setdefault(own, name)
+    return [[*several.values()] for several in found.values() if len(several) > 1]
 
 
 def _key(name: str) -> str:
