@@ -212,5 +212,5 @@ class IJEPA(Contrastive):
         return dict(self.trunks)
 
     def after_step(self, progress: float) -> None:
-        for modality, trunk in self.trunks.items():
-            self.teachers[modality].follow(vit.vit_of(trunk), self.config.ema_at(progress))  # type: ignore[operator]
+        for teacher in self.teachers.values():
+            teacher.follow(self.config.ema_at(progress))  # type: ignore[operator]
