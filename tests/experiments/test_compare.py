@@ -37,7 +37,7 @@ from mvitac.evaluation.score_text import pipes
 from mvitac.experiments import collect, jobs
 from mvitac.experiments.collect import cost, forecast, gather, lay_out, leaks, pairs_of
 from mvitac.experiments.cross_validation import lay_out_folds
-from mvitac.experiments.jobs import do, do_all, seconds_of
+from mvitac.experiments.jobs import do, do_all
 from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
 from mvitac.experiments.plan import Plan, Row, changed, setting, slug
 from mvitac.experiments.table import lines_of
@@ -472,13 +472,12 @@ def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> 
     assert by_row["MViTac"]["images"] == 4 * 16 * 2 * 2 and by_row["supervised, touch"]["images"] == 4 * 16
     assert by_row["MViTac"]["pairs"] == by_row["supervised, touch"]["pairs"] == 64
     assert all(0 < c["seconds"] < 60 for c in result["cost"])
-    fake = out.parent / "fake"
-    fake.mkdir()
-    (fake / "run.json").write_text(json.dumps({"run": {"batch_size": 16}}))
-    steps = [{"step": 10, "pairs_per_s": 80.0}, {"step": 10, "eval": {}}, {"step": 30, "pairs_per_s": 160.0}]
-    (fake / "log.jsonl").write_text("\n".join(map(json.dumps, steps)))
-    assert seconds_of(fake) == pytest.approx(10 * 16 / 80 + 20 * 16 / 160)
     work = lay_out(small(pack), pack, out, ProbeConfig())
+    fake = replace(work.jobs[0], out=out.parent / "fake")
+    fake.out.mkdir()
+    steps = [{"step": 10, "pairs_per_s": 80.0}, {"step": 15, "eval": {}}, {"step": 30, "pairs_per_s": 160.0}]
+    (fake.out / "log.jsonl").write_text("\n".join(map(json.dumps, steps)))
+    assert fake.seconds() == pytest.approx(10 * 16 / 80 + 20 * 16 / 160)
     assert cost("MViTac", work.jobs[:1], pack)["trained_parameters"] > 100_000
 
 

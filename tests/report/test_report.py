@@ -38,7 +38,7 @@ from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.report import figures
 from mvitac.report.galleries import nearest_groups
-from mvitac.report.report import wall_seconds, write_report
+from mvitac.report.report import write_report
 from mvitac.report.tables import retrieval_rows
 from mvitac.run import Run
 from mvitac.system.files import read_json, write_json
@@ -417,16 +417,6 @@ def test_only_a_complete_result_of_the_same_weights_is_used_again(
     write_json(file, result, sealed=True)
     file.write_text(file.read_text().replace('"seed": 0', '"seed": 1', 1))
     assert stored_result(runs, pack) is None and "probe.json does not match its digest" in capsys.readouterr().err
-
-
-def test_wall_time_adds_up_the_logged_speeds(materials: Path) -> None:
-    from mvitac.report.report import open_runs
-
-    run = open_runs([materials / "run0"])[0]
-    log = [{"step": 10, "loss": 1.0, "pairs_per_s": 8.0}, {"step": 10, "eval": {}}]
-    log += [{"step": 14, "loss": 1.0, "pairs_per_s": 16.0}]
-    assert wall_seconds(replace(run, log=log)) == 10 * 8 / 8 + 4 * 8 / 16
-    assert wall_seconds(replace(run, log=[])) is None
 
 
 def test_mistakes_end_in_one_line(
