@@ -13,7 +13,6 @@ from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.nn.initial import Init
-from mvitac.nn.vit import check_vit
 from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -223,8 +222,7 @@ class Run:
                 f"encoder.temporal {self.encoder.temporal} has no effect on single images: give --data.num-frames 2 or"
                 " more, or leave it out"
             )
-        if self.method.needs_vit:
-            check_vit(self.encoder, self.method.name, self.augment.size)
+        self.method.check_encoder(self.encoder, self.augment.size)
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 

@@ -27,7 +27,7 @@ from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.deploy import search
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.run import Run

@@ -24,7 +24,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.sharding import assign_rows, write_shards
 from mvitac.data.streaming import Cache, StreamedPack
 from mvitac.datasets.pack import StreamConfig
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from mvitac.run import Run

@@ -185,6 +185,10 @@ class MethodConfig(Registered, ABC):
         trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
         return self.build(spec, replace(encoder, trunk=trunk, weights=SCRATCH))
 
+    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
+        """Raise ValueError if the method cannot train ``encoder`` on views of ``size`` px."""
+        return
+
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
         if self.needs_pairs and len(spec.modalities) < 2:
@@ -211,6 +215,11 @@ class MethodConfig(Registered, ABC):
                 "lambda_sensor needs rows of one press (column press) and different sensors (column sensor) to train on:"
                 " simulate with --data.sensors-per-press 2"
             )
+
+    @property
+    def heads_from_probes(self) -> bool:
+        """Whether the heads start as linear probes of the start weights' features (``training.heads``)."""
+        return False
 
     @property
     def label_splits(self) -> tuple[str, ...]:

@@ -81,6 +81,9 @@ class IJEPAConfig(MethodConfig):
                 raise ValueError(f"{name} {(low, high)}: give two rising numbers above 0, at most {top:g}")
         vit.check_predictor("predictor", self.predictor_width, self.predictor_depth)
 
+    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
+        vit.check_vit(encoder, self.name, size)
+
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> "IJEPA":
         return IJEPA(self, spec, encoder)
 

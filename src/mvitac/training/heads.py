@@ -7,15 +7,16 @@ from torch import nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation.classifiers import fit_linear
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.regressors import fit_ridge
-from mvitac.methods.supervised import Supervised, ValueHead
+from mvitac.methods.base import Method
+from mvitac.methods.supervised import ValueHead
 from mvitac.model import Model
 from mvitac.run import Run
 
 
 @torch.no_grad()
-def fit_heads(method: Supervised, run: Run, pack: Pack, rows: np.ndarray) -> None:
+def fit_heads(method: Method, run: Run, pack: Pack, rows: np.ndarray) -> None:
     """Set each head of ``method`` to a linear probe fitted on features of ``rows``, as the head sees them.
 
     C or alpha is chosen on the groups of split val among ``rows``, or on a fifth of their groups. A task with labels of one

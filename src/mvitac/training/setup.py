@@ -17,7 +17,6 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
-from mvitac.methods.supervised import Supervised, SupervisedConfig
 from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.nn.finetuning import renew_norms
@@ -31,7 +30,6 @@ from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.heads import fit_heads
 from mvitac.training.sampler import check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
@@ -227,8 +225,9 @@ def _before_first_step(setup: Setup) -> None:
         for module in method.modules():
             if isinstance(module, Momentum):
                 module.restart()
-    if isinstance(run.method, SupervisedConfig) and run.method.heads_from == "probe":
-        assert isinstance(method, Supervised)
+    if run.method.heads_from_probes:
+        from mvitac.training.heads import fit_heads  # few runs need scikit-learn
+
         fit_heads(method, run, setup.pack, setup.rows)
 
 
