@@ -178,15 +178,9 @@ class Run:
         return num_rows // self.batch_size
 
     def check(self, spec: DataSpec, num_rows: int, stored_size: int) -> None:
-        """Check the settings against each other and the data, before training starts.
+        """Raise ValueError unless the settings fit each other and the data, before training starts.
 
-        Args:
-            spec: Description of the dataset.
-            num_rows: Number of training rows.
-            stored_size: Side in pixels of the pack's images.
-
-        Raises:
-            ValueError: If they do not fit.
+        ``num_rows`` is the number of training rows, ``stored_size`` the side in pixels of the pack's images.
         """
         if num_rows < 2:
             raise ValueError(
@@ -262,11 +256,7 @@ def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
 
 
 def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
-    """Read a run.json. Returns the ``Run`` and the whole record.
-
-    Raises:
-        ValueError: If the file is not a run's record. Names the file and the field.
-    """
+    """Read a run.json: the ``Run`` and the whole record. ValueError names the file and the field that is wrong."""
     record = read_json(file, "a run's record")
     if not isinstance(record, dict) or "run" not in record:
         raise ValueError(f"{file} is not a run's record: give the run.json that `mvitac pretrain` wrote")

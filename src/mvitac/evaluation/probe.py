@@ -56,17 +56,10 @@ class ProbeSplit:
 
 
 def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
-    """Labelled (or measured) rows of ``task`` by split.
+    """Labelled (or measured) rows of ``task`` by split that have an image of ``modality`` ("both": both, "none": any).
 
-    Without a validation split, a fifth of the training groups is set aside for it.
-
-    Args:
-        pack: The data.
-        task: The task whose labels, row filter and split column apply.
-        modality: Rows must have an image of this modality; "both" asks for both, "none" for no image.
-
-    Raises:
-        ValueError: If no labelled row is left in train or in test, or a target has no different values there.
+    Without a validation split, a fifth of the training groups is set aside for it. ValueError if no labelled row is left in
+    train or in test, or a target has no different values there.
     """
     having = names_in(modality, pack)
     known = pack.answered(task)
@@ -202,11 +195,8 @@ def probe_model(
 ) -> list[dict[str, Any]]:
     """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
 
-    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones.
-
-    Returns:
-        One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
-        model's own head is "own".
+    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones. There is one
+    record per (task, modality, probe): these names and the scores of ``score_rows``. The probe of an own head is "own".
     """
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:

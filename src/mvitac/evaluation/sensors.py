@@ -89,17 +89,10 @@ def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> lis
 def touch_features(
     model: Model, pack: Pack, modality: str, rows: np.ndarray, standardise: tuple[Standardise, ...] = (), *, maps: bool
 ) -> np.ndarray:
-    """``features`` of pack rows, those of touch in the statistics of each row's own sensor.
+    """``features`` of pack ``rows`` (ascending), those of touch in the statistics of each row's own sensor.
 
-    Args:
-        model: The model.
-        pack: The data.
-        modality: vision (nothing is changed) or touch.
-        rows: Pack rows, ascending.
-        standardise: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
-            each sensor. features: each sensor's features are standardised by their own mean and standard deviation.
-            colours: those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``.
-        maps: Return the trunk's last feature maps [N, P, D] instead of features [N, D].
+    ``ProbeConfig.standardise`` says how. With colours, the features of a ``RecolouredPack``'s new sensors are the mean over
+    its ``looks``. With ``maps``, they are the trunk's last feature maps [N, P, D].
     """
     if modality != "touch" or not standardise:
         return features(model, pack, modality, rows, maps=maps)
@@ -126,10 +119,7 @@ def touch_features(
 def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     """A copy of ``model`` whose touch encoder has the BatchNorm statistics of the touch images of ``rows``.
 
-    Source: Schneider et al., https://arxiv.org/abs/2006.16971.
-
-    Raises:
-        ValueError: If the encoder has no BatchNorm.
+    ValueError if it has no BatchNorm. Source: Schneider et al., https://arxiv.org/abs/2006.16971.
     """
     made = copy.deepcopy(model)
     trunk = made.encoders["touch"]
