@@ -9,7 +9,7 @@ import torch
 from mvitac.data.spec import DataSpec
 from mvitac.model import ABOUT, Model
 from mvitac.nn.encoders import SCRATCH
-from mvitac.nn.weights import check_tensors, read_model
+from mvitac.nn.weights import misfit, read_model
 from mvitac.registry import from_json
 from mvitac.run import Run
 from mvitac.system.files import brief, parse_json
@@ -65,7 +65,8 @@ def load(path: str | Path, which: Which = "last") -> Model:
     # Check shapes before allocating: a damaged header may describe a network larger than the memory.
     with torch.random.fork_rng(devices=[]):  # keep the caller's random state
         with torch.device("meta"):
-            check_tensors(file, fresh(empty, spec, stored).state_dict(), tensors)
+            if why := misfit(fresh(empty, spec, stored).state_dict(), tensors):
+                raise ValueError(f"{file} holds other weights than its run describes: {why}")
         model = fresh(empty, spec, stored)
     model.foreign = is_foreign(file.parent)
     if model.foreign and run.init:

@@ -96,11 +96,8 @@ def _load_single(trunk: nn.Module, state: dict[str, Tensor]) -> None:
         own, other = expected.get(f"{name}.weight"), state.get(f"{name}.weight")
         if own is not None and other is not None and own.ndim == other.ndim == 4 and not other.shape[1] % 3:
             state[f"{name}.weight"] = adapt_stem(other, own.shape[1])
-    for name in sorted(expected.keys() ^ state.keys()):
-        raise ValueError(f"tensor {name!r} {'is missing' if name in expected else 'has no place in this trunk'}")
-    for name, value in expected.items():
-        if value.shape != state[name].shape:
-            raise ValueError(f"{name!r} is {tuple(state[name].shape)}, this trunk needs {tuple(value.shape)}")
+    if why := misfit(expected, state):
+        raise ValueError(why)
     trunk.load_state_dict(state)
 
 
