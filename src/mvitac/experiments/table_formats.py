@@ -204,17 +204,15 @@ def _retrieval(result: dict[str, Any]) -> list[str]:
 
 
 def _cost(result: dict[str, Any]) -> list[str]:
-    text = [
-        "| cost of one run | seeds | steps | pairs | from | images seen | trained weights | seconds | peak GPU MiB |",
-        "|---|---:|---:|---:|---|---:|---:|---:|---:|",
-    ]
+    heads = ["cost of one run", "from", "seeds", "steps", "pairs", "images seen", "trained weights", "seconds"]
+    rows = []
     for c in result["cost"]:
         peak = f"{c['peak_gpu_bytes'] / 2**20:.0f}" if c["peak_gpu_bytes"] else "not measured"
-        text.append(
-            f"| {c['row']} | {c['seeds']} | {c['steps']} | {c['pairs']} | {c['pairs_of']} | {c['images']} |"
-            f" {c['trained_parameters'] / 1e6:.2f} M | {c['seconds']:.0f} | {peak} |"
-        )
-    return [*text, "", *(f"- {line}" for line in about_lines(result.get("encoders", ())))]
+        numbers = [f"{c[key]}" for key in ("seeds", "steps", "pairs", "images")]
+        weights = f"{c['trained_parameters'] / 1e6:.2f} M"
+        rows.append([c["row"], c["pairs_of"], *numbers, weights, f"{c['seconds']:.0f}", peak])
+    text = pipes([*heads, "peak GPU MiB"], rows)
+    return [*text, *(f"- {line}" for line in about_lines(result.get("encoders", ())))]
 
 
 NAMES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "none": "-"}
