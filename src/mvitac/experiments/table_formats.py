@@ -36,10 +36,6 @@ def _plan(result: dict[str, Any]) -> Plan:
     return from_json(Plan, result["plan"], "plan")
 
 
-def _tasks(lines: Sequence[Line]) -> list[str]:
-    return list(dict.fromkeys(task for line in lines for task in line.cells))
-
-
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what was compared, the tables, stress tests, AUROC, retrieval and cost."""
     plan = _plan(result)
@@ -61,31 +57,28 @@ def _first_cells(line: Line) -> list[str]:
 
 def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
     """Lines as a Markdown table, with the paper's numbers if ``shown``, and the error of targets."""
-    tasks, known = _tasks(lines), _columns(lines)
-    heads = ["", "modality"]
-    for task in tasks:
-        error = ["error"] if known[task].target else []
-        score = "R2 " * (known[task].score == "R2")
-        heads += [f"{task} {score}%", *error, *(["printed"] if shown else []), f"to {reference}"]
-    rows = []
-    for line in lines:
-        row = _first_cells(line)
-        for task in tasks:
+    heads, rows = ["", "modality"], [_first_cells(line) for line in lines]
+    for task, known in _columns(lines).items():
+        score = "R2 " * (known.score == "R2")
+        heads += [f"{task} {score}%", *["error"] * bool(known.target), *["printed"] * shown, f"to {reference}"]
+        for line, row in zip(lines, rows, strict=True):
             cell = line.cells.get(task)
-            score = with_interval(cell.mean, cell.low, cell.high, cell.leak) if cell else ""
-            error = [error_text(cell.target) if cell and cell.target else ""] if known[task].target else []
-            row += [score, *error, *([_printed(cell)] if shown else []), _gap(cell)]
-        rows.append(row)
+            row.append(with_interval(cell.mean, cell.low, cell.high, cell.leak) if cell else "")
+            row += _errors(cell, known)
+            if shown:
+                row.append("" if cell is None or cell.printed is None else percent(cell.printed))
+            row.append(_gap(cell))
     return pipes(heads, rows)
 
 
 def _columns(lines: Sequence[Line]) -> dict[str, Cell]:
-    """One cell of each column."""
+    """One cell of each task or target."""
     return {task: cell for line in lines for task, cell in line.cells.items()}
 
 
-def _printed(cell: Cell | None) -> str:
-    return "" if cell is None or cell.printed is None else percent(cell.printed)
+def _errors(cell: Cell | None, known: Cell) -> list[str]:
+    """The cell beside a score: its error, if the column's ``known`` cell has one."""
+    return [error_text(cell.target) if cell and cell.target else ""] * bool(known.target)
 
 
 def _gap(cell: Cell | None) -> str:
@@ -239,11 +232,9 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
 
 def _tabular(lines: Sequence[Line]) -> list[str]:
     """Lines as one LaTeX table."""
-    known = _columns(lines)
     heads = ["Method", "Modality"]
-    for task in _tasks(lines):
-        heads.append(f"{_tex(task)} ({'$R^2$, ' * (known[task].score == 'R2')}\\%)")
-        heads += ["error"] * bool(known[task].target)
+    for task, known in _columns(lines).items():
+        heads += [f"{_tex(task)} ({'$R^2$, ' * (known.score == 'R2')}\\%)", *["error"] * bool(known.target)]
     text = [
         r"\begin{tabular}{ll" + "r" * (len(heads) - 2) + "}",
         r"\toprule",
@@ -253,16 +244,11 @@ def _tabular(lines: Sequence[Line]) -> list[str]:
     for number, line in enumerate(lines):
         if line.control and not any(earlier.control for earlier in lines[:number]):
             text.append(r"\midrule")
-        cells = [text for task in _tasks(lines) for text in _tex_cells(line, task, lines)]
-        text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
+        row = [_tex(line.source), NAMES[line.modality]]
+        for task, known in _columns(lines).items():
+            row += [_tex_cell(line, task, lines), *map(_tex, _errors(line.cells.get(task), known))]
+        text.append(" & ".join(row) + r" \\")
     return [*text, r"\bottomrule", r"\end{tabular}"]
-
-
-def _tex_cells(line: Line, task: str, lines: Sequence[Line]) -> list[str]:
-    """The cells of one task or target: its score, and the error of a target."""
-    cell = line.cells.get(task)
-    error = [_tex(error_text(cell.target)) if cell and cell.target else ""] * bool(_columns(lines)[task].target)
-    return [_tex_cell(line, task, lines), *error]
 
 
 def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
