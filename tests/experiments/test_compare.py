@@ -247,18 +247,18 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
         for r in result["records"]
         if (r["source"], r["modality"], r["task"]) == ("MViTac", "touch", "pattern") and r["probe"] == "linear"
     ]
-    assert len(own) == 2 and touch.mean == pytest.approx(np.mean([r["accuracy"] for r in own]))
-    assert touch.printed is None and touch.difference is None
+    assert len(own) == 2 and touch["mean"] == pytest.approx(np.mean([r["accuracy"] for r in own]))
+    assert touch["printed"] is None and touch["difference"] is None
     assert ("supervised, touch", "vision") not in lines and ("supervised, touch", "touch") in lines
-    assert lines["supervised, touch, end to end", "touch"].cells["pattern"].difference is not None
+    assert lines["supervised, touch, end to end", "touch"].cells["pattern"]["difference"] is not None
     assert {"majority", "untrained", "pixels", "border", "noise only"} <= {line.source for line in lines.values()}
     text = (out / "table.md").read_text()
-    assert f"| MViTac | touch | {100 * touch.mean:.1f} [" in text
+    assert f"| MViTac | touch | {100 * touch['mean']:.1f} [" in text
     assert "equal budget: every run saw 64 pairs in 4 steps" in text and "LEAK" not in text
     rows = list(csv.DictReader((out / "table.csv").read_text().splitlines()))
     assert len(rows) == sum(len(line.cells) for line in lines.values())
     found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
-    assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"].mean
+    assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"]["mean"]
     tex = (out / "table.tex").read_text()
     assert tex.count(r"\\") == len(lines) + 1 and "(57.6)" not in tex
     assert json.loads((out / "result.json").read_text())["rows"] == ["MViTac", "colder", "supervised, touch"]
@@ -295,7 +295,8 @@ def test_printed_numbers_stand_beside_the_same_split_probe_and_positives(
     for cost_ in result["cost"]:
         cost_["pairs_of"] = pairs if cost_["row"] == "MViTac" else "one row"
     lines = lines_of(result)
-    found = {(line.source, task): cell.printed for line in lines for task, cell in line.cells.items() if cell.printed}
+    printed = {(line.source, task): cell["printed"] for line in lines for task, cell in line.cells.items()}
+    found = {key: value for key, value in printed.items() if value}
     same = probe == "paper" and data == "touch-and-go (official)"
     assert found == {
         **({("MViTac", "pattern"): 57.6 / 100} if shown else {}),

@@ -293,11 +293,11 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
 def test_the_comparison_sorts_methods_and_shares_the_palette() -> None:
     """Best method on top, controls below all methods, one colour per modality in every figure."""
     dots = [
-        figures.Dot("weak", "touch", 0.2, 0.1, 0.3, None, False),
-        figures.Dot("strong", "touch", 0.3, 0.2, 0.4, None, False),
-        figures.Dot("strong", "both", 0.6, 0.5, 0.7, 0.65, False),
-        figures.Dot("pixels", "touch", 0.9, 0.8, 1.0, None, True),
-        figures.Dot("majority", "none", 0.1, 0.1, 0.1, None, True),
+        figures.Dot("weak", "touch", False, {"mean": 0.2, "low": 0.1, "high": 0.3, "printed": None}),
+        figures.Dot("strong", "touch", False, {"mean": 0.3, "low": 0.2, "high": 0.4, "printed": None}),
+        figures.Dot("strong", "both", False, {"mean": 0.6, "low": 0.5, "high": 0.7, "printed": 0.65}),
+        figures.Dot("pixels", "touch", True, {"mean": 0.9, "low": 0.8, "high": 1.0, "printed": None}),
+        figures.Dot("majority", "none", True, {"mean": 0.1, "low": 0.1, "high": 0.1, "printed": None}),
     ]
     axes = figures.comparison({"task": dots}).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["pixels", "weak", "strong"]  # from below

@@ -39,11 +39,12 @@ def _plan(result: dict[str, Any]) -> Plan:
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what was compared, the tables, stress tests, AUROC, retrieval and cost."""
     plan = _plan(result)
-    shown = any(cell.printed is not None for line in lines for cell in line.cells.values())
+    shown = any(cell["printed"] is not None for line in lines for cell in line.cells.values())
     text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, lines, shown), ""]
     text += _table(lines, plan.reference, shown)
     for task, each in target_lines(result).items():
-        text += [f"**{task}**: every target, and its mean absolute error", "", *_table(each, plan.reference, False)]
+        rows = _table(each, plan.reference, False, targets=True)
+        text += [f"**{task}**: every target, and its mean absolute error", "", *rows]
     for kind, worse in stresses_of(result).items():
         text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
     text += [*_auroc(result, plan, lines), *_retrieval(result), *_cost(result)]
@@ -55,36 +56,31 @@ def _first_cells(line: Line) -> list[str]:
     return [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
 
 
-def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
-    """Lines as a Markdown table, with the paper's numbers if ``shown``, and the error of targets."""
+def _table(lines: Sequence[Line], reference: str, shown: bool, *, targets: bool = False) -> list[str]:
+    """Lines as a Markdown table, with the paper's numbers if ``shown``, and the error of ``targets``."""
     heads, rows = ["", "modality"], [_first_cells(line) for line in lines]
-    for task, known in _columns(lines).items():
-        score = "R2 " * (known.score == "R2")
-        heads += [f"{task} {score}%", *["error"] * bool(known.target), *["printed"] * shown, f"to {reference}"]
+    for task, score in _columns(lines).items():
+        heads += [f"{task} {'R2 ' * (score == 'R2')}%", *["error"] * targets, *["printed"] * shown, f"to {reference}"]
         for line, row in zip(lines, rows, strict=True):
-            cell = line.cells.get(task)
-            row.append(with_interval(cell.mean, cell.low, cell.high, cell.leak) if cell else "")
-            row += _errors(cell, known)
+            cell = line.cells.get(task, {})
+            row.append(with_interval(cell["mean"], cell["low"], cell["high"], cell.get("leak", "")) if cell else "")
+            if targets:
+                row.append(error_text(cell["targets"][0]) if cell else "")
             if shown:
-                row.append("" if cell is None or cell.printed is None else percent(cell.printed))
+                row.append("" if cell.get("printed") is None else percent(cell["printed"]))
             row.append(_gap(cell))
     return pipes(heads, rows)
 
 
-def _columns(lines: Sequence[Line]) -> dict[str, Cell]:
-    """One cell of each task or target."""
-    return {task: cell for line in lines for task, cell in line.cells.items()}
+def _columns(lines: Sequence[Line]) -> dict[str, str]:
+    """What each column scores: task or target -> "accuracy" or "R2"."""
+    return {t: "R2" if "targets" in cell else "accuracy" for line in lines for t, cell in line.cells.items()}
 
 
-def _errors(cell: Cell | None, known: Cell) -> list[str]:
-    """The cell beside a score: its error, if the column's ``known`` cell has one."""
-    return [error_text(cell.target) if cell and cell.target else ""] * bool(known.target)
-
-
-def _gap(cell: Cell | None) -> str:
-    if cell is None or cell.difference is None:
+def _gap(cell: Cell) -> str:
+    if not cell or cell["difference"] is None:
         return ""
-    mean, _, _, p = cell.difference
+    mean, _, _, p = cell["difference"]
     return f"{100 * mean:+.1f}" if p is None else f"{100 * mean:+.1f} (p {_p(p)})"
 
 
@@ -128,7 +124,7 @@ def _probes(result: dict[str, Any], plan: Plan) -> str:
 
 def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> str:
     """What p is, and its smallest possible value for each task."""
-    if all(not cell.difference or cell.difference[3] is None for line in lines for cell in line.cells.values()):
+    if all((cell["difference"] or [None])[-1] is None for line in lines for cell in line.cells.values()):
         return f"Differences to {plan.reference} have no p, which needs several seeds."
     groups = {record["task"]: num_groups_of(record) for record in result["records"]}
     least = ", ".join(f"{task} {_p(least_p(num))} ({num} {result['group_by']}s)" for task, num in groups.items())
@@ -219,9 +215,9 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     plan = _plan(result)
     text = _tabular(lines)
     for task, each in target_lines(result).items():
-        text += ["", f"% {_tex(task)}: every target, and its mean absolute error", *_tabular(each)]
+        text += ["", f"% {_tex(task)}: every target, and its mean absolute error", *_tabular(each, targets=True)]
     note = f"% {plan.title or plan.name}; data {result['data']}"
-    if any(cell.printed is not None for line in lines for cell in line.cells.values()):
+    if any(cell["printed"] is not None for line in lines for cell in line.cells.values()):
         note += f"; in parentheses: printed in the paper on {plan.printed_on}"
     intervals = f"% 95 % intervals: {covered(result['group_by'], result['records'])}"
     notes = [note, *(f"% Note: {note}." for note in _notes(result)), intervals]
@@ -230,11 +226,11 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     return "\n".join([*(" ".join(line.split()) for line in notes), *text]) + "\n"
 
 
-def _tabular(lines: Sequence[Line]) -> list[str]:
-    """Lines as one LaTeX table."""
+def _tabular(lines: Sequence[Line], *, targets: bool = False) -> list[str]:
+    """Lines as one LaTeX table, with the error of ``targets``."""
     heads = ["Method", "Modality"]
-    for task, known in _columns(lines).items():
-        heads += [f"{_tex(task)} ({'$R^2$, ' * (known.score == 'R2')}\\%)", *["error"] * bool(known.target)]
+    for task, score in _columns(lines).items():
+        heads += [f"{_tex(task)} ({'$R^2$, ' * (score == 'R2')}\\%)", *["error"] * targets]
     text = [
         r"\begin{tabular}{ll" + "r" * (len(heads) - 2) + "}",
         r"\toprule",
@@ -245,8 +241,9 @@ def _tabular(lines: Sequence[Line]) -> list[str]:
         if line.control and not any(earlier.control for earlier in lines[:number]):
             text.append(r"\midrule")
         row = [_tex(line.source), NAMES[line.modality]]
-        for task, known in _columns(lines).items():
-            row += [_tex_cell(line, task, lines), *map(_tex, _errors(line.cells.get(task), known))]
+        for task in _columns(lines):
+            error = _tex(error_text(line.cells[task]["targets"][0])) if targets and task in line.cells else ""
+            row += [_tex_cell(line, task, lines), *[error] * targets]
         text.append(" & ".join(row) + r" \\")
     return [*text, r"\bottomrule", r"\end{tabular}"]
 
@@ -256,11 +253,11 @@ def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
     cell = line.cells.get(task)
     if cell is None:
         return ""
-    best = max(x.cells[task].mean for x in lines if x.modality == line.modality and task in x.cells)
-    number, _, ends = with_interval(cell.mean, cell.low, cell.high).partition(" ")
-    number = rf"\textbf{{{number}}}" if not line.control and cell.mean == best else number
-    paper = f" ({percent(cell.printed)})" if cell.printed is not None else ""
-    return f"{number} {ends}{paper}{leak_mark(cell.leak)}"
+    best = max(x.cells[task]["mean"] for x in lines if x.modality == line.modality and task in x.cells)
+    number, _, ends = with_interval(cell["mean"], cell["low"], cell["high"]).partition(" ")
+    number = rf"\textbf{{{number}}}" if not line.control and cell["mean"] == best else number
+    paper = f" ({percent(cell['printed'])})" if cell["printed"] is not None else ""
+    return f"{number} {ends}{paper}{leak_mark(cell.get('leak', ''))}"
 
 
 _TEX = str.maketrans(
@@ -300,17 +297,19 @@ def comma(result: dict[str, Any]) -> str:
                 key = line.source, table if table in known else next(iter(known)), line.modality, task, name
                 if key not in written:
                     written.add(key)
-                    writer.writerow(_csv_row(key, cell, line.control)[: len(heads) + 5 + len(more)])
+                    writer.writerow(_csv_row(key, cell, line.control, bool(whole))[: len(heads) + 5 + len(more)])
     return buffer.getvalue()
 
 
-def _csv_row(key: Sequence[str], cell: Cell, control: bool) -> list[Any]:
+def _csv_row(key: Sequence[str], cell: Cell, control: bool, target: bool) -> list[Any]:
     """One line of the CSV. An interval without an end is empty."""
     source, probe, modality, task, name = key
-    numbers = [cell.mean, cell.low, cell.high, cell.seeds, cell.printed, *(cell.difference or ("",) * 4)]
+    seeds, gap = max(1, len(cell["seeds"])), cell["difference"] or ("",) * 4
+    numbers = [cell["mean"], cell["low"], cell["high"], seeds, cell["printed"], *gap]
     ends = ["" if value in (math.inf, -math.inf) else value for value in numbers]
-    target = [name, *(cell.target[key] for key in ("unit", "mae", "rmse"))] if cell.target else [""] * 4
-    return [source, int(control), probe, modality, task, *ends, cell.leak, cell.score, *target]
+    about = [name, *(cell["targets"][0][key] for key in ("unit", "mae", "rmse"))] if target else [""] * 4
+    score = "R2" if "targets" in cell else "accuracy"
+    return [source, int(control), probe, modality, task, *ends, cell.get("leak", ""), score, *about]
 
 
 def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
@@ -318,6 +317,5 @@ def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
     panels: dict[str, list[Dot]] = {}
     for line in lines:
         for task, cell in line.cells.items():
-            known = cell.mean, cell.low, cell.high, cell.printed, line.control, cell.score
-            panels.setdefault(task, []).append(Dot(line.source, line.modality, *known))
+            panels.setdefault(task, []).append(Dot(line.source, line.modality, line.control, cell))
     return to_png(comparison(panels), dpi=110)

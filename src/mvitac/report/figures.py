@@ -138,16 +138,12 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, l
 
 @dataclass(frozen=True)
 class Dot:
-    """A score, "accuracy" or "R2", of one source at one modality ("none" = a control without features), at most 1."""
+    """A score of one source at one modality ("none" = a control without features)."""
 
     source: str
     modality: str
-    mean: float
-    low: float
-    high: float
-    printed: float | None
     control: bool
-    score: str = "accuracy"
+    cell: Mapping[str, Any]  # mean, low, high, printed (may be None); "targets" if the score is R2
 
 
 @matplotlib.rc_context({**STYLE, "font.size": 10})
@@ -160,7 +156,7 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
     best: dict[tuple[bool, str], float] = {}
     for dot in dots:
         key = dot.control, dot.source
-        best[key] = max(best.get(key, -math.inf), dot.mean if dot in next(iter(panels.values())) else -math.inf)
+        best[key] = max(best.get(key, -math.inf), dot.cell["mean"] if dot in next(iter(panels.values())) else -math.inf)
     rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
     names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
     figure = Figure(figsize=(3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows)))
@@ -173,7 +169,7 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
         axes.set_ylim(-0.7, len(rows) - 0.3)
         controls = sum(control for control, _ in best)
         axes.axhline(controls - 0.5, color=colour("soft"), linewidth=0.7)
-        axes.set_xlabel(f"{panel[0].score} %")
+        axes.set_xlabel(f"{'R2' if 'targets' in panel[0].cell else 'accuracy'} %")
         axes.grid(axis="x")
         axes.spines["left"].set_visible(False)
     entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
@@ -183,19 +179,20 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
 
 
 def _dot(axes: Axes, dot: Dot, rows: Sequence[str]) -> None:
+    mean, low = dot.cell["mean"], dot.cell["low"]
     if dot.modality == "none":
         if dot.source in ONE_ANSWER:
-            at = 100 * max(LEAST, dot.mean)
+            at = 100 * max(LEAST, mean)
             axes.axvline(at, color=colour("soft"), linewidth=1, linestyle=ONE_ANSWER[dot.source], label=dot.source)
         return
     hue = colour(MODALITY_HUES[dot.modality])
     y = rows.index(dot.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[dot.modality]
-    if math.isfinite(dot.low):
-        axes.plot([100 * max(LEAST, v) for v in (dot.low, dot.high)], [y, y], color=hue, linewidth=1.6)
-    marker = "o" if dot.mean >= LEAST else "<"  # R2 may be lower than the axis goes
-    axes.plot(100 * max(LEAST, dot.mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
-    if dot.printed is not None:
-        axes.plot(100 * dot.printed, y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
+    if low is not None:
+        axes.plot([100 * max(LEAST, v) for v in (low, dot.cell["high"])], [y, y], color=hue, linewidth=1.6)
+    marker = "o" if mean >= LEAST else "<"  # R2 may be lower than the axis goes
+    axes.plot(100 * max(LEAST, mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
+    if dot.cell.get("printed") is not None:
+        axes.plot(100 * dot.cell["printed"], y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
 
 
 @dataclass(frozen=True)
