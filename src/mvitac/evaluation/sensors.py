@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import nn
+from torch.optim.swa_utils import update_bn
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.jpeg import Lazy
@@ -20,7 +21,6 @@ from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
-from mvitac.nn.finetuning import renew_norms
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, Looks, learn_colours, recolour
 from mvitac.transforms.preprocess import encoder_input
 
@@ -123,18 +123,15 @@ def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     """
     made = copy.deepcopy(model)
     trunk = made.encoders["touch"]
-    norms = [layer for layer in trunk.modules() if isinstance(layer, nn.modules.batchnorm._BatchNorm)]
-    if not norms:
+    if not any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in trunk.modules()):
         raise ValueError(f"trunk {model.run.encoder.trunk} has no BatchNorm: leave --standardise batch-norm out")
-    for layer in norms:
-        layer.train()
     device = next(trunk.parameters()).device
 
-    def see(chunk: np.ndarray) -> None:
-        images = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][chunk])).permute(0, 3, 1, 2).to(device)
-        trunk(encoder_input(images, model.run.augment.eval_size))
+    def images(rows: np.ndarray) -> torch.Tensor:
+        found = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][rows])).permute(0, 3, 1, 2).to(device)
+        return encoder_input(found, model.run.augment.eval_size)
 
-    renew_norms(trunk, (partial(see, chunk) for chunk in np.array_split(rows, max(1, len(rows) // 64))))
+    update_bn((images(chunk) for chunk in np.array_split(rows, max(1, len(rows) // 64))), trunk)
     return made.eval()
 
 

@@ -3,12 +3,12 @@
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch.optim.swa_utils import update_bn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
@@ -19,7 +19,6 @@ from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.nn.finetuning import renew_norms
 from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.nn.momentum import Momentum
 from mvitac.registry import to_json
@@ -221,7 +220,7 @@ def _before_first_step(setup: Setup) -> None:
         if setup.world.size > 1:
             raise ValueError("renew_norms works on one process only: leave it out, or start without torchrun")
         steps = setup.chunks(0, run.renew_norms)
-        renew_norms(method.train(), (partial(method, chunk()) for chunks in steps for chunk in chunks))
+        update_bn((chunk() for chunks in steps for chunk in chunks), method)
         for module in method.modules():
             if isinstance(module, Momentum):
                 module.restart()
