@@ -105,9 +105,7 @@ def train_heads(
     All tasks and seeds that share rows are trained at once. Adam updates each weight independently, so every head ends
     as if it were trained alone. A model's seed sets its batch order and dropout, which all its tasks share.
     ``features`` [S, N, D] are of S models, with a seed each, on the device to train on; ``labels`` [T, N] of T tasks.
-
-    Returns:
-        For each model a list of T weight matrices [num_classes, D + 1]; the last column is the bias.
+    Returns for each model a list of T weight matrices [num_classes, D + 1]; the last column is the bias.
     """
     models, num, width = features.shape
     device = features.device

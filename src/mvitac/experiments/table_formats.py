@@ -47,7 +47,10 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
         text += [f"**{task}**: every target, and its mean absolute error", "", *rows]
     for kind, worse in stresses_of(result).items():
         text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
-    text += [*_auroc(result, plan, lines), *_retrieval(result), *_cost(result)]
+    text += _auroc(result, plan, lines)
+    if rows := retrieval_rows(result["retrieval"]):
+        text += pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows)
+    text += _cost(result)
     return "\n".join(text).rstrip() + "\n"
 
 
@@ -185,11 +188,6 @@ def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[st
     tasks = list(dict.fromkeys(task for row in found.values() for task in row))
     rows = [[*first, *(row.get(task, "") for task in tasks)] for first, row in found.items()]
     return pipes(["AUROC %", "modality", *tasks], rows)
-
-
-def _retrieval(result: dict[str, Any]) -> list[str]:
-    rows = retrieval_rows(result["retrieval"])
-    return pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows) if rows else []
 
 
 def _cost(result: dict[str, Any]) -> list[str]:

@@ -73,31 +73,21 @@ class Method(nn.Module, ABC):
         return {}
 
     def prepare(self, rows: Tensor) -> None:
-        """Allocate memory that depends on the training rows, e.g. a memory bank.
+        """Allocate memory that depends on the pack ``rows`` [N] int64 (ascending) to train on, e.g. a memory bank.
 
         Called once, after the weights are initialised and before a checkpoint is loaded.
-
-        Args:
-            rows: [N] int64, the pack rows that training draws from, in ascending order.
         """
         return
 
     def learn_scale(self, values: dict[str, Tensor]) -> None:
-        """Take mean and standard deviation of the values that training learns from. Called once, after ``prepare``.
-
-        Args:
-            values: As ``Views.values``, of all training rows.
-        """
+        """Take mean and standard deviation of ``values``, those of all training rows. Called once, after ``prepare``."""
         return
 
     def after_step(self, progress: float) -> None:
         """Run the updates that follow the optimiser's step, e.g. of a momentum encoder.
 
         Values it needs from the batch are left by ``forward`` in the attribute ``pending``, which ``forward`` itself
-        never reads.
-
-        Args:
-            progress: Share of the run that is done, from 0 to 1.
+        never reads. ``progress`` is the share of the run that is done, from 0 to 1.
         """
         return
 
