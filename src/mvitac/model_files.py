@@ -39,12 +39,8 @@ def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
 def load(path: str | Path, which: Which = "last") -> Model:
     """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
 
-    Args:
-        path: The folder or the file.
-        which: Weights of a run's folder: those after its last step, or the best on split val (``Run.eval_every``).
-
-    Raises:
-        ValueError: If there is no such model, or the file is damaged or was changed.
+    ``which`` weights of a folder: those after its last step, or the best on split val (``Run.eval_every``). ValueError if
+    there is no such model, or the file is damaged or was changed.
     """
     path = Path(path)
     file = weights_file(path, which) if path.is_dir() else path

@@ -87,15 +87,10 @@ def probe_runs(
     weights: Which = "last",
     encoders: Sequence[str] = (),
 ) -> Scores:
-    """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
+    """Probe finished runs and their controls, and write the result to probe.json in the folder of each run, as ``probe``.
 
-    Args:
-        paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
-        session: What to probe.
-        pack: Other data to probe on. Default: the data the runs were trained on.
-        allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
-        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
-        encoders: Other people's encoders to probe beside the runs ("external:..."). They need ``pack``.
+    ``weights`` are those after the last step, or the best on split val, whose result is in probe.best.json. ``encoders``
+    are other people's to probe beside the runs ("external:..."); they need ``pack``.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
