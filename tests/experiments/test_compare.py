@@ -295,8 +295,8 @@ def test_printed_numbers_stand_beside_the_same_split_probe_and_positives(
     for cost_ in result["cost"]:
         cost_["pairs_of"] = pairs if cost_["row"] == "MViTac" else "one row"
     lines = lines_of(result)
-    printed = {(line.source, task): cell["printed"] for line in lines for task, cell in line.cells.items()}
-    found = {key: value for key, value in printed.items() if value}
+    cells = [(line.source, task, cell["printed"]) for line in lines for task, cell in line.cells.items()]
+    found = {(source, task): printed for source, task, printed in cells if printed}
     same = probe == "paper" and data == "touch-and-go (official)"
     assert found == {
         **({("MViTac", "pattern"): 57.6 / 100} if shown else {}),
