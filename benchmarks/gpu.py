@@ -293,8 +293,8 @@ def table(folder: Path) -> dict[str, Any]:
 
     result = read_json(folder / "result.json", "a comparison")
     cells = [
-        {"row": line.source, "modality": line.modality, "task": task, "seeds": cell.seeds}
-        | {"mean": cell.mean, "low": cell.low, "high": cell.high}
+        {"row": line.source, "modality": line.modality, "task": task, "seeds": max(1, len(cell["seeds"]))}
+        | {key: cell[key] for key in ("mean", "low", "high")}
         for line in lines_of(result)
         for task, cell in line.cells.items()
     ]

@@ -42,7 +42,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
 from mvitac.evaluation.classifiers import EPOCHS, train_heads
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.methods.base import Views
 from mvitac.model import Model
 from mvitac.nn.encoders import SCRATCH, EncoderConfig

@@ -24,8 +24,8 @@ from mvitac.data.spec import Event
 from mvitac.datasets.folder import FolderConfig
 from mvitac.evaluation.controls import thumbnails
 from mvitac.evaluation.events import with_event
-from mvitac.evaluation.features import pack_features
 from mvitac.evaluation.intervals import interval, paired_difference
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import lead_text, percent, with_interval
 from mvitac.evaluation.scores import event_of, pool

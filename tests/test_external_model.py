@@ -329,7 +329,7 @@ def test_a_plan_has_rows_of_encoders(pack: Pack, tmp_path: Path) -> None:
     do(work.jobs[0], pack)
     result = gather(work, tmp_path, config)
     lines = [line for line in lines_of(result) if line.source == "theirs (NC)"]
-    assert [line.modality for line in lines] == ["touch"] and lines[0].cells["pattern"].difference is not None
+    assert [line.modality for line in lines] == ["touch"] and lines[0].cells["pattern"]["difference"] is not None
     text = markdown(result, lines_of(result))
     assert "| theirs (NC) |" in text and "licence CC-BY-NC-4.0, no commercial use" in text
     kept = (tmp_path / "encoders.json").read_bytes()

@@ -190,8 +190,7 @@ def is_noncommercial(licence: str) -> bool:
 def load_external(text: str) -> ExternalModel:
     """Open the encoders that ``text`` names: one, or one for each sense joined by "+".
 
-    Raises:
-        ValueError: If there is no such encoder, or two encoders read the same sense.
+    ValueError if there is no such encoder, or two encoders read the same sense.
     """
     texts = [START + part for part in text.removeprefix(START).split(f"+{START}")]
     opened = [open_encoder(each) for each in texts]

@@ -9,7 +9,7 @@ import torch
 from mvitac.data.spec import DataSpec
 from mvitac.model import ABOUT, Model
 from mvitac.nn.encoders import SCRATCH
-from mvitac.nn.weights import check_tensors, read_model
+from mvitac.nn.weights import misfit, read_model
 from mvitac.registry import from_json
 from mvitac.run import Run
 from mvitac.system.files import brief, parse_json
@@ -39,12 +39,8 @@ def fresh(run: Run, spec: DataSpec, stored: int) -> Model:
 def load(path: str | Path, which: Which = "last") -> Model:
     """Load a trained model from the folder of a run or from its model.safetensors. Never unpickles.
 
-    Args:
-        path: The folder or the file.
-        which: Weights of a run's folder: those after its last step, or the best on split val (``Run.eval_every``).
-
-    Raises:
-        ValueError: If there is no such model, or the file is damaged or was changed.
+    ``which`` weights of a folder: those after its last step, or the best on split val (``Run.eval_every``). ValueError if
+    there is no such model, or the file is damaged or was changed.
     """
     path = Path(path)
     file = weights_file(path, which) if path.is_dir() else path
@@ -65,7 +61,8 @@ def load(path: str | Path, which: Which = "last") -> Model:
     # Check shapes before allocating: a damaged header may describe a network larger than the memory.
     with torch.random.fork_rng(devices=[]):  # keep the caller's random state
         with torch.device("meta"):
-            check_tensors(file, fresh(empty, spec, stored).state_dict(), tensors)
+            if why := misfit(fresh(empty, spec, stored).state_dict(), tensors):
+                raise ValueError(f"{file} holds other weights than its run describes: {why}")
         model = fresh(empty, spec, stored)
     model.foreign = is_foreign(file.parent)
     if model.foreign and run.init:

@@ -13,7 +13,6 @@ from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.nn.initial import Init
-from mvitac.nn.vit import check_vit
 from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -179,15 +178,9 @@ class Run:
         return num_rows // self.batch_size
 
     def check(self, spec: DataSpec, num_rows: int, stored_size: int) -> None:
-        """Check the settings against each other and the data, before training starts.
+        """Raise ValueError unless the settings fit each other and the data, before training starts.
 
-        Args:
-            spec: Description of the dataset.
-            num_rows: Number of training rows.
-            stored_size: Side in pixels of the pack's images.
-
-        Raises:
-            ValueError: If they do not fit.
+        ``num_rows`` is the number of training rows, ``stored_size`` the side in pixels of the pack's images.
         """
         if num_rows < 2:
             raise ValueError(
@@ -223,8 +216,7 @@ class Run:
                 f"encoder.temporal {self.encoder.temporal} has no effect on single images: give --data.num-frames 2 or"
                 " more, or leave it out"
             )
-        if self.method.needs_vit:
-            check_vit(self.encoder, self.method.name, self.augment.size)
+        self.method.check_encoder(self.encoder, self.augment.size)
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
 
@@ -264,11 +256,7 @@ def load_run(path: Path) -> tuple[Run, dict[str, Any]]:
 
 
 def read_record(file: Path) -> tuple[Run, dict[str, Any]]:
-    """Read a run.json. Returns the ``Run`` and the whole record.
-
-    Raises:
-        ValueError: If the file is not a run's record. Names the file and the field.
-    """
+    """Read a run.json: the ``Run`` and the whole record. ValueError names the file and the field that is wrong."""
     record = read_json(file, "a run's record")
     if not isinstance(record, dict) or "run" not in record:
         raise ValueError(f"{file} is not a run's record: give the run.json that `mvitac pretrain` wrote")

@@ -24,7 +24,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.sharding import assign_rows, write_shards
 from mvitac.data.streaming import Cache, StreamedPack
 from mvitac.datasets.pack import StreamConfig
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from mvitac.run import Run
@@ -346,7 +346,7 @@ def test_evaluation_reads_few_shards(shards: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(validation, "NUM_EVAL_TRAIN", 8)
     monkeypatch.setattr(validation, "NUM_EVAL_VAL", 8)
     found, run = opened(shards, tmp_path), stream(shards, tmp_path)
-    values = validation.evaluate(fresh(run, found.spec, found.size), found, run)
+    values, _ = validation.validate(fresh(run, found.spec, found.size), found, run)
     assert values["touch/rankme"] > 0 and found.fetched == 4 * FILE  # one shard of train, one of val
 
 

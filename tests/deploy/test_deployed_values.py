@@ -22,7 +22,7 @@ from mvitac.deploy.engine import Engine, spread_at
 from mvitac.deploy.export import ExportConfig
 from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.parity import parity, reference
-from mvitac.evaluation.probe import score_predictions, split_rows
+from mvitac.evaluation.probe import score_rows, split_rows
 from mvitac.nn.linear_probe import Error, ValueInfo
 
 LEVEL = Target(name="level", unit="levels")
@@ -34,7 +34,7 @@ def test_predicted_values_score_as_the_artifact_says(value_artifact: Path, measu
         rows = split_rows(measured, task).test
         for modality, names in (("touch", ["touch"]), ("both", ["vision", "touch"])):
             found = model.predict(**{m: measured.images[m][rows] for m in names})[task.name]
-            again = score_predictions(measured, task, rows, found.numpy())
+            again = score_rows(measured, task, rows, found.numpy())
             errors = model.probes[f"{task.name}.{modality}"].info.errors
             for target, error in zip(again["targets"], errors, strict=True):
                 assert (error.r2, error.mae) == pytest.approx((target["r2"], target["mae"]), abs=1e-4)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mvitac.data.spec import DataSpec
-from mvitac.evaluation.classifiers import fit_knn, spread_out
+from mvitac.evaluation.classifiers import fit_knn, fit_linear
 from mvitac.evaluation.controls import borders, controls_of, start_weights, starts_of, thumbnails
 from mvitac.methods.moco import MoCoConfig
 from mvitac.methods.supervised import SupervisedConfig
@@ -59,7 +59,9 @@ def test_neighbours_are_by_cosine_and_vote_in_shares() -> None:
 
 
 def test_classes_never_seen_get_probability_zero() -> None:
-    assert spread_out(np.array([[0.2, 0.8]]), np.array([0, 2]), 4).tolist() == [[0.2, 0, 0.8, 0]]
+    x, y = np.array([[-1.0], [-0.9], [0.9], [1.0]]), np.array([0, 0, 2, 2])
+    found = fit_linear(x, y, x, y, 4)[0](np.array([[1.0]]))[0]
+    assert found[2] > found[0] > 0 and found[[1, 3]].tolist() == [0, 0] and found.sum() == pytest.approx(1)
 
 
 @pytest.mark.parametrize(("num_rows", "size"), [(30, 10), (12, 6), (1, 1)])

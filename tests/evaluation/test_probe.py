@@ -108,15 +108,14 @@ def test_nothing_is_chosen_on_test(pack: Pack, monkeypatch: pytest.MonkeyPatch) 
     task = pack.spec.tasks[0]
     rows, x = split_rows(pack, task), features_that_know(pack, 0, how_well=0.6)
     before = probe_features(x, pack, task, rows, "linear", 0)
-    real = Pack.column
+    real = Pack.labels
 
-    def shuffled(self: Pack, name: str) -> np.ndarray:
-        values = real(self, name)
-        if name == "label_pattern":
-            values[rows.test] = (values[rows.test] + 1) % 3
+    def shuffled(self: Pack, task: str, *splits: str) -> np.ndarray:
+        values = real(self, task, *splits).copy()
+        values[rows.test] = (values[rows.test] + 1) % 3
         return values
 
-    monkeypatch.setattr(Pack, "column", shuffled)
+    monkeypatch.setattr(Pack, "labels", shuffled)
     after = probe_features(x, pack, task, rows, "linear", 0)
     assert after["C"] == before["C"]
     assert np.array_equal(np.roll(before["confusion"], 1, axis=0), after["confusion"])

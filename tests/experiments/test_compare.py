@@ -37,7 +37,7 @@ from mvitac.evaluation.score_text import pipes
 from mvitac.experiments import collect, jobs
 from mvitac.experiments.collect import cost, forecast, gather, lay_out, leaks, pairs_of
 from mvitac.experiments.cross_validation import lay_out_folds
-from mvitac.experiments.jobs import do, do_all, seconds_of
+from mvitac.experiments.jobs import do, do_all
 from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
 from mvitac.experiments.plan import Plan, Row, changed, setting, slug
 from mvitac.experiments.table import lines_of
@@ -247,18 +247,18 @@ def test_result_and_tables_agree(done: tuple[Path, dict]) -> None:
         for r in result["records"]
         if (r["source"], r["modality"], r["task"]) == ("MViTac", "touch", "pattern") and r["probe"] == "linear"
     ]
-    assert len(own) == 2 and touch.mean == pytest.approx(np.mean([r["accuracy"] for r in own]))
-    assert touch.printed is None and touch.difference is None
+    assert len(own) == 2 and touch["mean"] == pytest.approx(np.mean([r["accuracy"] for r in own]))
+    assert touch["printed"] is None and touch["difference"] is None
     assert ("supervised, touch", "vision") not in lines and ("supervised, touch", "touch") in lines
-    assert lines["supervised, touch, end to end", "touch"].cells["pattern"].difference is not None
+    assert lines["supervised, touch, end to end", "touch"].cells["pattern"]["difference"] is not None
     assert {"majority", "untrained", "pixels", "border", "noise only"} <= {line.source for line in lines.values()}
     text = (out / "table.md").read_text()
-    assert f"| MViTac | touch | {100 * touch.mean:.1f} [" in text
+    assert f"| MViTac | touch | {100 * touch['mean']:.1f} [" in text
     assert "equal budget: every run saw 64 pairs in 4 steps" in text and "LEAK" not in text
     rows = list(csv.DictReader((out / "table.csv").read_text().splitlines()))
     assert len(rows) == sum(len(line.cells) for line in lines.values())
     found = next(r for r in rows if (r["row"], r["modality"], r["task"]) == ("colder", "both", "bright"))
-    assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"].mean
+    assert float(found["accuracy"]) == lines["colder", "both"].cells["bright"]["mean"]
     tex = (out / "table.tex").read_text()
     assert tex.count(r"\\") == len(lines) + 1 and "(57.6)" not in tex
     assert json.loads((out / "result.json").read_text())["rows"] == ["MViTac", "colder", "supervised, touch"]
@@ -295,7 +295,8 @@ def test_printed_numbers_stand_beside_the_same_split_probe_and_positives(
     for cost_ in result["cost"]:
         cost_["pairs_of"] = pairs if cost_["row"] == "MViTac" else "one row"
     lines = lines_of(result)
-    found = {(line.source, task): cell.printed for line in lines for task, cell in line.cells.items() if cell.printed}
+    cells = [(line.source, task, cell["printed"]) for line in lines for task, cell in line.cells.items()]
+    found = {(source, task): printed for source, task, printed in cells if printed}
     same = probe == "paper" and data == "touch-and-go (official)"
     assert found == {
         **({("MViTac", "pattern"): 57.6 / 100} if shown else {}),
@@ -472,13 +473,12 @@ def test_cost_counts_images_and_seconds(done: tuple[Path, dict], pack: Pack) -> 
     assert by_row["MViTac"]["images"] == 4 * 16 * 2 * 2 and by_row["supervised, touch"]["images"] == 4 * 16
     assert by_row["MViTac"]["pairs"] == by_row["supervised, touch"]["pairs"] == 64
     assert all(0 < c["seconds"] < 60 for c in result["cost"])
-    fake = out.parent / "fake"
-    fake.mkdir()
-    (fake / "run.json").write_text(json.dumps({"run": {"batch_size": 16}}))
-    steps = [{"step": 10, "pairs_per_s": 80.0}, {"step": 10, "eval": {}}, {"step": 30, "pairs_per_s": 160.0}]
-    (fake / "log.jsonl").write_text("\n".join(map(json.dumps, steps)))
-    assert seconds_of(fake) == pytest.approx(10 * 16 / 80 + 20 * 16 / 160)
     work = lay_out(small(pack), pack, out, ProbeConfig())
+    fake = replace(work.jobs[0], out=out.parent / "fake")
+    fake.out.mkdir()
+    steps = [{"step": 10, "pairs_per_s": 80.0}, {"step": 15, "eval": {}}, {"step": 30, "pairs_per_s": 160.0}]
+    (fake.out / "log.jsonl").write_text("\n".join(map(json.dumps, steps)))
+    assert fake.seconds() == pytest.approx(10 * 16 / 80 + 20 * 16 / 160)
     assert cost("MViTac", work.jobs[:1], pack)["trained_parameters"] > 100_000
 
 

@@ -12,7 +12,7 @@ import torch
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.evaluation.classifiers import fit_linear
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.methods.supervised import Supervised, SupervisedConfig
 from mvitac.model import Model

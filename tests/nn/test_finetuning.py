@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 import timm
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, PerFrame, build_trunk, last_map
-from mvitac.nn.finetuning import AttentivePool, Lora, freeze_statistics, merged, renew_norms, train_part
+from mvitac.nn.finetuning import AttentivePool, Lora, freeze_statistics, merged, train_part
 from mvitac.nn.initial import load_trunk
 
 
@@ -107,24 +106,6 @@ def test_attention_starts_from_the_features_of_the_trunk() -> None:
     freeze_statistics(pooled)
     assert {name.split(".")[0] for name in moved(pooled, images)} == {"query", "attention", "norm"}
     assert not torch.allclose(pooled(images), trunk(images))
-
-
-def test_statistics_anew_are_those_of_the_batches() -> None:
-    network = nn.Sequential(nn.Conv2d(3, 4, 1), nn.BatchNorm2d(4, momentum=0.3), nn.ReLU())
-    batches = [torch.randn(16, 3, 8, 8) * 3 + 1 for _ in range(3)]
-    network(torch.randn(16, 3, 8, 8))  # statistics of other data
-    renew_norms(network.train(), [lambda b=b: network(b) for b in batches])
-    norm = network[1]
-    found = [network[0](b) for b in batches]
-    mean = torch.stack([z.mean((0, 2, 3)) for z in found]).mean(0)
-    variance = torch.stack([z.var((0, 2, 3)) for z in found]).mean(0)
-    torch.testing.assert_close(norm.running_mean, mean)
-    torch.testing.assert_close(norm.running_var, variance)
-    assert norm.momentum == 0.3
-    z = network.eval()(torch.cat(batches))
-    torch.testing.assert_close(
-        z, F.relu((network[0](torch.cat(batches)) - mean[:, None, None]) / (variance + 1e-5).sqrt()[:, None, None])
-    )
 
 
 def test_a_learned_pooling_starts_from_plain_weights_and_gives_them() -> None:

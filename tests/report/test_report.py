@@ -38,7 +38,7 @@ from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.report import figures
 from mvitac.report.galleries import nearest_groups
-from mvitac.report.report import wall_seconds, write_report
+from mvitac.report.report import write_report
 from mvitac.report.tables import retrieval_rows
 from mvitac.run import Run
 from mvitac.system.files import read_json, write_json
@@ -293,11 +293,11 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
 def test_the_comparison_sorts_methods_and_shares_the_palette() -> None:
     """Best method on top, controls below all methods, one colour per modality in every figure."""
     dots = [
-        figures.Dot("weak", "touch", 0.2, 0.1, 0.3, None, False),
-        figures.Dot("strong", "touch", 0.3, 0.2, 0.4, None, False),
-        figures.Dot("strong", "both", 0.6, 0.5, 0.7, 0.65, False),
-        figures.Dot("pixels", "touch", 0.9, 0.8, 1.0, None, True),
-        figures.Dot("majority", "none", 0.1, 0.1, 0.1, None, True),
+        figures.Dot("weak", "touch", False, {"mean": 0.2, "low": 0.1, "high": 0.3, "printed": None}),
+        figures.Dot("strong", "touch", False, {"mean": 0.3, "low": 0.2, "high": 0.4, "printed": None}),
+        figures.Dot("strong", "both", False, {"mean": 0.6, "low": 0.5, "high": 0.7, "printed": 0.65}),
+        figures.Dot("pixels", "touch", True, {"mean": 0.9, "low": 0.8, "high": 1.0, "printed": None}),
+        figures.Dot("majority", "none", True, {"mean": 0.1, "low": 0.1, "high": 0.1, "printed": None}),
     ]
     axes = figures.comparison({"task": dots}).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["pixels", "weak", "strong"]  # from below
@@ -417,16 +417,6 @@ def test_only_a_complete_result_of_the_same_weights_is_used_again(
     write_json(file, result, sealed=True)
     file.write_text(file.read_text().replace('"seed": 0', '"seed": 1', 1))
     assert stored_result(runs, pack) is None and "probe.json does not match its digest" in capsys.readouterr().err
-
-
-def test_wall_time_adds_up_the_logged_speeds(materials: Path) -> None:
-    from mvitac.report.report import open_runs
-
-    run = open_runs([materials / "run0"])[0]
-    log = [{"step": 10, "loss": 1.0, "pairs_per_s": 8.0}, {"step": 10, "eval": {}}]
-    log += [{"step": 14, "loss": 1.0, "pairs_per_s": 16.0}]
-    assert wall_seconds(replace(run, log=log)) == 10 * 8 / 8 + 4 * 8 / 16
-    assert wall_seconds(replace(run, log=[])) is None
 
 
 def test_mistakes_end_in_one_line(

@@ -171,7 +171,9 @@ def test_tables_of_a_comparison_have_a_table_of_targets(scored: tuple[Path, Pack
     (line,) = (x for x in target_lines(whole)["both"] if (x.source, x.modality) == ("untrained", "touch"))
     weight = line.cells["weight"]
     cell = summarise(whole["records"], "linear")["both"]["touch"]["untrained"]["targets"][1]
-    assert (weight.mean, weight.low, weight.target) == (cell["mean"], cell["low"], cell) and weight.difference
+    assert (weight["mean"], weight["low"], weight["targets"]) == (cell["mean"], cell["low"], [cell]) and weight[
+        "difference"
+    ]
     for shown in (text, tex):
         assert f"{100 * cell['mean']:.1f} [{100 * cell['low']:.1f}, {100 * cell['high']:.1f}]" in shown
         assert f"{cell['mae']:.3g} N" in shown
@@ -203,7 +205,7 @@ def test_figures_cut_off_what_no_axis_can_show() -> None:
     assert "-4000.0" in {text.get_text() for text in drawn.axes[0].texts}
     whiskers = [line.get_xdata() for line in drawn.axes[0].lines if line.get_linestyle() == "-"]
     assert [20, 20] not in [list(x) for x in whiskers]
-    dots = [figures.Dot(s, "touch", c["mean"], c["low"], c["high"], None, False, "R2") for s, c in cells.items()]
+    dots = [figures.Dot(s, "touch", False, {**c, "targets": []}) for s, c in cells.items()]
     axes = figures.comparison({"force": dots}).axes[0]
     assert axes.get_xlabel() == "R2 %" and min(axes.get_xlim()) > -70
     assert [line.get_marker() for line in axes.lines if line.get_label() == "touch"] == ["o", "<"]

@@ -32,7 +32,7 @@ from mvitac.training.loader import Feed
 from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
 from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order
-from mvitac.training.validation import evaluate
+from mvitac.training.validation import validate
 from mvitac.training.views import make_views
 from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
@@ -305,7 +305,7 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
     pack = toy_pack(tmp_path / "pack", num=360)
     optim = Optim(name="adamw", lr=3e-3, schedule="cosine", warmup=0.1)
     run = smoke(pack, steps=80, batch_size=60, optim=optim, eval_every=0)
-    before = evaluate(fresh(run, pack.spec, pack.size), pack, run)
+    before = validate(fresh(run, pack.spec, pack.size), pack, run)[0]
     log = train(run, tmp_path / "r", quiet=True) / "log.jsonl"
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     after = lines[-1]["eval"]
@@ -329,7 +329,7 @@ def test_rows_that_were_trained_on_are_not_scored_as_held_out(pack: Pack) -> Non
     values = {}
     for labels in ("train", "train-and-val"):
         run = smoke(pack, method=SupervisedConfig(labels=labels))  # type: ignore[arg-type]
-        values[labels] = set(evaluate(fresh(run, pack.spec, pack.size), pack, run))
+        values[labels] = set(validate(fresh(run, pack.spec, pack.size), pack, run)[0])
     assert values["train"] - values["train-and-val"] == {
         *(f"{m}/knn {task}" for m in ("touch", "vision") for task in ("pattern", "bright")),
         *(f"{m}/linear {task}" for m in ("touch", "vision", "both") for task in ("pattern", "bright")),
@@ -345,7 +345,7 @@ def test_evaluation_never_reads_test_rows(pack: Pack, straight: Path, monkeypatc
     monkeypatch.setattr(
         module, "pack_features", lambda m, p, mod, rows, **k: used.append(rows) or real(m, p, mod, rows, **k)
     )
-    evaluate(mvitac.load(straight), pack, smoke(pack))
+    validate(mvitac.load(straight), pack, smoke(pack))
     assert used and not set(np.concatenate(used)) & set(pack.rows("test"))
 
 

@@ -100,7 +100,7 @@ def test_a_bare_file_and_one_modality(pack: Pack, smoke_run: Path, tmp_path: Pat
     found = load_start(read_start(run.init, pack), run.method.build(pack.spec, run.encoder))  # type: ignore[arg-type]
     assert describe(found).endswith(": touch trunk, not vision (it has touch only)")
     safetensors.torch.save_file(state, bare)
-    with pytest.raises(ValueError, match=r"'vision\.weight' has no place in this trunk"):
+    with pytest.raises(ValueError, match=r"'vision\.weight' has no place in this network"):
         started(pack, Init(path=bare))
 
 

@@ -25,7 +25,7 @@ from mvitac.system.files import read_json
 from mvitac.training import validation
 from mvitac.training.checkpoint import CHECKPOINT, seal
 from mvitac.training.loop import train
-from mvitac.training.validation import Cells, evaluate, validate, verdict
+from mvitac.training.validation import Cells, validate, verdict
 from support.training_runs import power_cut, smoke
 
 LINEAR = tuple(f"{m}/linear {task}" for m in ("vision", "touch", "both") for task in ("pattern", "bright"))
@@ -50,7 +50,7 @@ def test_the_start_is_evaluated_first(pack: Pack, run: Path) -> None:
     settings = mvitac.load(run).run
     evaluations = [entry for entry in log_of(run) if "eval" in entry]
     assert [entry["step"] for entry in evaluations] == [0, 2, 4, 6, 8]
-    assert evaluations[0]["eval"] == evaluate(fresh(settings, pack.spec, pack.size), pack, settings)
+    assert evaluations[0]["eval"] == validate(fresh(settings, pack.spec, pack.size), pack, settings)[0]
     assert set(LINEAR) < evaluations[0]["eval"].keys()
     assert [entry for entry in log_of(run) if "verdict" in entry] == evaluations[-1:]
 
@@ -60,7 +60,7 @@ def test_the_best_weights_are_those_with_the_highest_mean(pack: Pack, run: Path)
     means = [mean_of(entry) for entry in evaluations]
     best = evaluations[int(np.argmax(means))]  # the first of equal ones
     model = mvitac.load(run, which="best")
-    assert evaluate(model, pack, model.run) == pytest.approx(best["eval"], rel=1e-6)
+    assert validate(model, pack, model.run)[0] == pytest.approx(best["eval"], rel=1e-6)
     said = evaluations[-1]["verdict"]
     assert f"best at step {best['step']} ({100 * (max(means) - means[0]):+.1f}, model.best.safetensors)" in said
     assert f"{100 * (means[-1] - means[0]):+.1f} points" in said

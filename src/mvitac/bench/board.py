@@ -27,22 +27,14 @@ CONTROLS = (GUESS, "border", "pixels", "untrained")
 
 @dataclass(frozen=True)
 class Row:
-    """A task by one modality, with scores by the name of the encoder or control.
+    """A task by one modality, with scores by the name of the encoder or control."""
 
-    Attributes:
-        task: Set and task.
-        about: Its test groups.
-        records: Records of the probe, one for each seed.
-        cells: Their summary (``scores.summarise``).
-        few: [(fraction of the labels, summary)], from few labels to all.
-    """
-
-    task: str
-    about: str
+    task: str  # set and task
+    about: str  # its test groups
     modality: str
-    records: dict[str, list[dict[str, Any]]]
-    cells: dict[str, dict[str, Any]]
-    few: dict[str, list[tuple[float, dict[str, Any]]]]
+    records: dict[str, list[dict[str, Any]]]  # of the probe, one for each seed
+    cells: dict[str, dict[str, Any]]  # their summary (``scores.summarise``)
+    few: dict[str, list[tuple[float, dict[str, Any]]]]  # (fraction of the labels, summary), from few labels to all
 
     @cached_property
     def score(self) -> str:

@@ -35,7 +35,8 @@ def against_parameters(
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
     axes.margins(x=0.15)
-    _label(axes, "parameters in millions", what)
+    axes.set(xlabel="parameters in millions", ylabel=what)
+    axes.grid(axis="y")
     legend_below(figure, handles, names, 2)
     return figure
 
@@ -55,12 +56,7 @@ def against_labels(title: str, lines: Mapping[str, Sequence[tuple[float, Mapping
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
     score = "R2" if any("targets" in cell for line in lines.values() for _, cell in line) else "accuracy"
-    _label(axes, "labels used, % (log)", f"{score} %")
+    axes.set(xlabel="labels used, % (log)", ylabel=f"{score} %")
+    axes.grid(axis="y")
     legend_below(figure, handles, [shorten(name, 26) for name in lines], 2)
     return figure
-
-
-def _label(axes: Any, x: str, y: str) -> None:
-    axes.set_xlabel(x, color=colour("soft"), fontsize=9)
-    axes.set_ylabel(y, color=colour("soft"), fontsize=9)
-    axes.grid(axis="y", color=colour("rule"), linewidth=0.7)

@@ -131,21 +131,13 @@ def _config(form: Form, root: Path, options: dict[str, Any]) -> DatasetConfig:
 
 @dataclass(frozen=True)
 class Opened:
-    """A set with its data.
+    """A set with its data."""
 
-    Attributes:
-        form: Name of the form.
-        packs: One pack per fold, which differ in the column split only.
-        tasks: The tasks as the data defines them, beside what the suite asks.
-        digests: Digests of the data.
-        pinned: Whether the data is what the suite was measured on.
-    """
-
-    form: str
-    packs: tuple[Pack, ...]
-    tasks: tuple[tuple[SuiteTask, AnyTask], ...]
-    digests: dict[str, str]
-    pinned: Pinned
+    form: str  # name of the form
+    packs: tuple[Pack, ...]  # one per fold, which differ in the column split only
+    tasks: tuple[tuple[SuiteTask, AnyTask], ...]  # what the suite asks, and the task as the data defines it
+    digests: dict[str, str]  # of the data
+    pinned: Pinned  # whether the data is what the suite was measured on
 
 
 def open_set(one: SuiteSet, root: Path | None) -> Opened | str:

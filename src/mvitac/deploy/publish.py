@@ -7,25 +7,24 @@ from typing import Any
 
 import numpy as np
 import safetensors.torch
+import torch
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import AnyTask, Task, ValueTask
+from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.deploy.card import card
-from mvitac.evaluation.classifiers import fit_linear, spread_out
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
-from mvitac.evaluation.probe import ProbeSplit, scorable, score_predictions, score_rows, split_rows
-from mvitac.evaluation.regressors import fit_ridge
+from mvitac.evaluation.probe import fit_probe, scorable, score_rows, split_rows
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.evaluation.value_scores import error_by_range
 from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.nn.encoders import SCRATCH, build_trunk
-from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo, constant, from_logistic, from_ridge
+from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import to_json
 from mvitac.run import load_run
 from mvitac.system.files import brief, digest_file, write_atomic, write_json
@@ -67,22 +66,21 @@ def _fit_probe(
     except ValueError:
         return None
     x = np.concatenate([features(model, pack, m, rows.all) for m in modalities], axis=1)
-    return (_fit_values if isinstance(task, ValueTask) else _fit_classes)(x, pack, task, source, rows)  # type: ignore[arg-type]
-
-
-def _fit_values(
-    x: np.ndarray, pack: Pack, task: ValueTask, source: str, rows: ProbeSplit
-) -> tuple[LinearProbe, dict[str, Any]]:
-    """The ridge probe of one task on features ``x`` of ``rows.all``, and its record."""
     num = len(rows.fitted)
-    fitted, _ = fit_ridge(x[:num], pack.values(task)[rows.fitted], len(rows.val))
-    true, guess = pack.values(task)[rows.test], fitted(x[num:])
-    record = score_predictions(pack, task, rows.test, guess)
-    known = {"task": task.name, "modality": source}
-    scored = zip(record["targets"], true.T, guess.T, strict=True)
-    errors = tuple(_error(target, t[~np.isnan(t)], g[~np.isnan(t)]) for target, t, g in scored)
-    info = ValueInfo(**known, targets=task.targets, errors=errors, num_test=len(rows.test))
-    return from_ridge(info, *fitted.weights()), {**known, "probe": "linear", **record}
+    fitted: Any = fit_probe(x[:num], pack, task, rows, "linear", 0)[0]
+    guess, known = fitted(x[num:]), {"task": task.name, "modality": source}
+    record = score_rows(pack, task, rows.test, guess)
+    if isinstance(task, ValueTask):
+        scored = zip(record["targets"], pack.values(task)[rows.test].T, guess.T, strict=True)
+        errors = tuple(_error(target, t[~np.isnan(t)], g[~np.isnan(t)]) for target, t, g in scored)
+        info = ValueInfo(**known, targets=task.targets, errors=errors, num_test=len(rows.test))
+    else:
+        labels = pack.labels(task.name)
+        majority = float((labels[rows.test] == np.bincount(labels[rows.fitted]).argmax()).mean())
+        about = {"accuracy": record["accuracy"], "majority": majority, "num_test": len(rows.test)}
+        info = ProbeInfo(**known, classes=task.classes, **about)
+    weight, bias = (torch.from_numpy(part).float() for part in fitted.weights())
+    return LinearProbe(info, weight, bias), {**known, "probe": "linear", **record}
 
 
 def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error:
@@ -93,28 +91,6 @@ def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error
         edges=tuple(each["low"] for each in ranges[1:]),
         spread=tuple(each["rmse"] for each in ranges),
     )
-
-
-def _fit_classes(
-    x: np.ndarray, pack: Pack, task: Task, source: str, rows: ProbeSplit
-) -> tuple[LinearProbe, dict[str, Any]]:
-    """The logistic probe of one task on features ``x`` of ``rows.all``, and its record."""
-    labels = pack.column(f"label_{task.name}").astype(int)
-    seen = labels[rows.fitted]
-    common = int(np.bincount(seen).argmax())
-    learn, choose, test = np.split(x, np.cumsum([len(rows.train), len(rows.val)]))
-    known = {"task": task.name, "modality": source, "probe": "linear"}
-    given: dict[str, Any] = {"task": task.name, "modality": source, "classes": task.classes}
-    given |= {"majority": float((labels[rows.test] == common).mean()), "num_test": len(rows.test)}
-    if len(set(labels[rows.train])) < 2:
-        label = int(labels[rows.train][0])
-        guess = np.eye(len(task.classes))[np.full(len(rows.test), label)]
-        record = score_rows(pack, task, rows.test, guess)
-        return constant(ProbeInfo(**given, accuracy=record["accuracy"]), label, x.shape[1]), {**known, **record}
-    fitted, _ = fit_linear(learn, labels[rows.train], choose, labels[rows.val])
-    record = score_rows(pack, task, rows.test, spread_out(fitted(test), np.unique(seen), len(task.classes)))
-    info = ProbeInfo(**given, accuracy=record["accuracy"])
-    return from_logistic(info, fitted.model, fitted.mean, fitted.std), {**known, **record}
 
 
 def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from mvitac.evaluation.diagnostics import knn_votes
 
 Classifier = Callable[[np.ndarray], np.ndarray]
 
+UNSEEN = -1e4  # logit of a class without training examples: probability 0 in fp32, and still finite in fp16
 STRENGTHS = (0.001, 0.01, 0.1, 1.0)  # candidate values of C, the inverse regularisation strength of logistic regression
 EPOCHS, BATCH, DROPOUT = 60, 256, 0.2  # training settings of the paper's probe (appendix A)
 
@@ -32,20 +33,54 @@ def threadpools() -> ThreadpoolController:
 
 @dataclass(frozen=True)
 class Logistic:
-    """Logistic regression on standardised features. Calling it returns probabilities in ascending label order."""
+    """Logistic regression on standardised features: [N, D] to probabilities [N, K], 0 for classes it was not fitted on."""
 
     model: LogisticRegression
     mean: np.ndarray
     std: np.ndarray
+    num_classes: int
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        return self.model.predict_proba((z - self.mean) / self.std)
+        found = np.zeros((len(z), self.num_classes))
+        found[:, self.model.classes_] = self.model.predict_proba((z - self.mean) / self.std)
+        return found
+
+    def weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weight [K, D] and bias [K] on features as they are: probabilities = softmax(features W^T + b)."""
+        coef, intercept = np.asarray(self.model.coef_, float), np.asarray(self.model.intercept_, float)
+        if len(coef) == 1:  # with two classes scikit-learn has one logit, that of the second class
+            coef, intercept = np.concatenate([0 * coef, coef]), np.concatenate([0 * intercept, intercept])
+        weight, bias = np.zeros((self.num_classes, coef.shape[1])), np.full(self.num_classes, UNSEEN)
+        weight[self.model.classes_] = coef / self.std
+        bias[self.model.classes_] = intercept - (coef / self.std) @ self.mean
+        return weight, bias
 
 
-def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray) -> tuple[Logistic, float]:
+@dataclass(frozen=True)
+class Constant:
+    """One class for all rows, where there was no other to learn from; as ``Logistic``."""
+
+    label: int
+    num_classes: int
+    width: int  # D
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return np.eye(self.num_classes)[np.full(len(z), self.label)]
+
+    def weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """As of ``Logistic``."""
+        return np.zeros((self.num_classes, self.width)), np.where(
+            np.arange(self.num_classes) == self.label, 0.0, UNSEEN
+        )
+
+
+def fit_linear(
+    x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarray, num_classes: int = 0
+) -> tuple[Logistic, float]:
     """Fit logistic regression on standardised features; returns the classifier and C.
 
-    C is chosen on the validation rows. The final fit uses the training and validation rows together.
+    C is chosen on the validation rows. The final fit uses the training and validation rows together. ``num_classes`` is
+    K; 0 = up to the highest label.
     """
     mean, std = x.mean(0), x.std(0) + 1e-6
     x, x_val = (x - mean) / std, (x_val - mean) / std
@@ -59,7 +94,7 @@ def fit_linear(x: np.ndarray, y: np.ndarray, x_val: np.ndarray, y_val: np.ndarra
         if set(y_val) - set(y):  # a class seen only in val changes the shape of the weights
             model = LogisticRegression(max_iter=300, tol=1e-3)
         model.set_params(C=c).fit(np.concatenate([x, x_val]), np.concatenate([y, y_val]))
-    return Logistic(model, mean, std), c
+    return Logistic(model, mean, std, num_classes or int(max(y.max(), y_val.max())) + 1), c
 
 
 def train_heads(
@@ -70,9 +105,7 @@ def train_heads(
     All tasks and seeds that share rows are trained at once. Adam updates each weight independently, so every head ends
     as if it were trained alone. A model's seed sets its batch order and dropout, which all its tasks share.
     ``features`` [S, N, D] are of S models, with a seed each, on the device to train on; ``labels`` [T, N] of T tasks.
-
-    Returns:
-        For each model a list of T weight matrices [num_classes, D + 1]; the last column is the bias.
+    Returns for each model a list of T weight matrices [num_classes, D + 1]; the last column is the bias.
     """
     models, num, width = features.shape
     device = features.device
@@ -124,10 +157,3 @@ def fit_knn(x: np.ndarray, y: np.ndarray, num_classes: int) -> Classifier:
         return (votes / votes.sum(1, keepdim=True)).numpy()
 
     return shares
-
-
-def spread_out(probabilities: np.ndarray, seen: np.ndarray, num_classes: int) -> np.ndarray:
-    """Place the columns of ``probabilities``, one per class ``seen`` in training, among all ``num_classes`` columns."""
-    full = np.zeros((len(probabilities), num_classes))
-    full[:, seen] = probabilities
-    return full

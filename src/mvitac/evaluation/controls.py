@@ -16,13 +16,11 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task, ValueTask
 from mvitac.evaluation.probe import (
     ProbeSplit,
-    labels_of,
     names_in,
     probe_all,
     probe_features,
     probe_model,
     probes_of,
-    score_predictions,
     score_rows,
     split_rows,
 )
@@ -117,11 +115,10 @@ def label_controls(pack: Pack, tasks: Sequence[AnyTask]) -> Records:
 def _guess(pack: Pack, task: AnyTask, rows: ProbeSplit) -> dict[str, Any]:
     """Scores of one answer for all rows."""
     if isinstance(task, ValueTask):
-        mean = np.nanmean(pack.values(task)[rows.fitted], axis=0)
-        return score_predictions(pack, task, rows.test, np.tile(mean, (len(rows.test), 1)))
-    num = len(task.classes)
-    common = np.bincount(labels_of(pack, task)[rows.fitted], minlength=num).argmax()
-    return score_rows(pack, task, rows.test, np.eye(num)[np.full(len(rows.test), common)])
+        answer = np.nanmean(pack.values(task)[rows.fitted], axis=0)
+    else:
+        answer = np.eye(len(task.classes))[np.bincount(pack.labels(task.name)[rows.fitted]).argmax()]
+    return score_rows(pack, task, rows.test, np.tile(answer, (len(rows.test), 1)))
 
 
 def pixel_controls(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> Records:

@@ -87,15 +87,10 @@ def probe_runs(
     weights: Which = "last",
     encoders: Sequence[str] = (),
 ) -> Scores:
-    """Probe finished runs and their controls, and write the result to probe.json in the folder of each run.
+    """Probe finished runs and their controls, and write the result to probe.json in the folder of each run, as ``probe``.
 
-    Args:
-        paths: Folders of runs: seeds of one method, or several methods, trained on one dataset.
-        session: What to probe.
-        pack: Other data to probe on. Default: the data the runs were trained on.
-        allow_leak: Score also test rows of ``pack`` that a run was trained on, or whose groups it was.
-        weights: Those after the last step, or the best on split val, whose result is in probe.best.json.
-        encoders: Other people's encoders to probe beside the runs ("external:..."). They need ``pack``.
+    ``weights`` are those after the last step, or the best on split val, whose result is in probe.best.json. ``encoders``
+    are other people's to probe beside the runs ("external:..."); they need ``pack``.
 
     Returns:
         Scores, a dict with "data", "pack", "group_by", "notes", "leaks", "classes", "records", "retrieval", "summary",
@@ -115,7 +110,9 @@ def probe_runs(
     names = [name + ", best" * (weights == "best") for name in names_of(paths, models)]
     pack = _common_pack(models, pack)
     tasks, modalities = chosen(pack, session)
-    _check_models(paths, models, pack)
+    for path, model in zip(paths, models, strict=True):
+        check_place(path / "probe.json")
+        check_channels(path, model, pack, pack.spec.modalities)
     _check_tasks(pack, tasks, modalities)
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
@@ -242,13 +239,6 @@ def _check_paths(paths: Sequence[Path]) -> None:
             raise ValueError(f"{path} is a file: give the run's folder, where the scores are also written")
         if [p.resolve() for p in paths].count(path.resolve()) > 1:
             raise ValueError(f"run {path} is given twice: it would count as two seeds, give it once")
-
-
-def _check_models(paths: Sequence[Path], models: Sequence[Model], pack: Pack) -> None:
-    """Check that each model can embed this data and that its probe.json can be written."""
-    for path, model in zip(paths, models, strict=True):
-        check_place(path / "probe.json")
-        check_channels(path, model, pack, pack.spec.modalities)
 
 
 def check_channels(path: Path, model: Model, pack: Pack, modalities: Sequence[str]) -> None:

@@ -1,52 +1,17 @@
-"""Features of a pack's rows from a frozen model, with a cache on disk."""
+"""Features of a pack's rows from a frozen model, kept in a cache on disk."""
 
 import hashlib
 import io
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.model import Model
 from mvitac.system.files import cache_dir, digest, write_atomic
-from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.progress import work
-
-HALF = (-65504.0, 65504.0)  # range of fp16
-
-
-def pack_features(
-    model: Model,
-    pack: Pack,
-    modality: str,
-    rows: np.ndarray,
-    *,
-    for_heads: bool = False,
-    bf16: bool = False,
-    maps: bool = False,
-    advance: Callable[[int], object] = lambda num: None,
-) -> Tensor:
-    """``Model.features`` [len(rows), D] of pack rows, computed in chunks on the model's device, on the CPU.
-
-    With ``maps``, ``last_map`` instead: [len(rows), P, D] of fp16. ``advance`` is called with each chunk's number of
-    rows.
-    """
-    device = next(model.parameters()).device
-    if device.type == "cpu":
-        keep_freed_memory()  # else every activation is mapped again: over twice the time on a virtual machine
-    chunks = []
-    for chunk in np.array_split(rows, max(1, len(rows) // 256)):
-        images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        if maps:
-            chunks.append(model.last_map(modality, images).clamp(*HALF).half().cpu())
-        else:
-            chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
-        advance(len(chunk))
-    return torch.cat(chunks)
 
 
 def sample(rows: np.ndarray, num: int) -> np.ndarray:

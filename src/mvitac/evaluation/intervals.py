@@ -20,21 +20,15 @@ from mvitac.evaluation.value_scores import r2_without_each_group
 
 
 def interval(records: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
-    """Mean accuracy (R2 of values) over runs and its 95 % interval.
+    """Mean accuracy (R2 of values) of ``records``, and the lower and upper end of its 95 % interval.
 
-    With several records it covers other groups and other seeds; with one record, other groups for this one trained model.
-    With a single group the interval is that of all possible scores.
+    There is one record per seed, all on the same test groups. With several it covers other groups and other seeds; with
+    one, other groups for this one trained model. With a single group the interval is that of all possible scores.
 
     The interval of an accuracy is computed on the logit scale, which keeps it within 0 and 1, around
     (correct + 1) / (rows + 2). Its variance is at least that of independent rows: a few groups that are all right say
     little. That of R2 is computed on the scale of log(1 - R2), and is longer below than above R2, because the groups with
     the largest errors may not be among those tested. Its lower end is -inf if it is below 1 - 1000 (1 - R2).
-
-    Args:
-        records: One record per seed, all on the same test groups.
-
-    Returns:
-        Mean, lower end and upper end.
     """
     sizes, correct = _counts(records)
     rows = sizes.sum()
@@ -63,13 +57,10 @@ def least_of(record: dict[str, Any]) -> float:
 def paired_difference(
     ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]
 ) -> tuple[float, float, float, float | None]:
-    """Difference in accuracy (R2 of values) between two methods on the same test groups.
+    """Difference in accuracy (R2 of values) between two methods on the same test groups, ``ours`` - ``theirs``.
 
-    Groups are paired. Seeds are paired if both methods have the same seeds, which share batches and views.
-
-    Args:
-        ours: Records of one method, one per seed.
-        theirs: Records of the method to subtract.
+    There is one record per seed. Groups are paired. Seeds are paired if both methods have the same seeds, which share
+    batches and views.
 
     Returns:
         Mean difference, lower and upper end of its 95 % interval, and the two-sided p, at least ``least_p``. p is None if

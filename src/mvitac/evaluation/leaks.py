@@ -51,17 +51,13 @@ def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:
     """``own`` and those of ``ancestors`` that add rows or groups to the ones before them."""
     found = [own]
     for source in ancestors:
-        if not any((len(source.ids) and _covers(other, source)) or _same(other, source) for other in found):
+        if len(source.ids):
+            known = (np.isin(source.ids, o.ids).all() and np.isin(source.groups, o.groups).all() for o in found)
+        else:
+            known = (not len(other.ids) and other.name == source.name for other in found)
+        if not any(known):
             found.append(source)
     return found
-
-
-def _covers(whole: Source, part: Source) -> bool:
-    return bool(np.isin(part.ids, whole.ids).all() and np.isin(part.groups, whole.groups).all())
-
-
-def _same(a: Source, b: Source) -> bool:
-    return a.name == b.name and not len(a.ids) and not len(b.ids)
 
 
 def write_sources(folder: Path, sources: Sequence[Source]) -> None:

@@ -13,10 +13,10 @@ from scipy.special import softmax
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
-from mvitac.evaluation.classifiers import Classifier, fit_knn, fit_linear, fit_papers, spread_out
+from mvitac.evaluation.classifiers import Classifier, Constant, fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
-from mvitac.evaluation.regressors import Regressor, fit_curve, fit_neighbours, fit_ridge
+from mvitac.evaluation.regressors import fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
 from mvitac.evaluation.sensors import Standardise, touch_features
 from mvitac.evaluation.trained_probes import TRAINED, fit_network
@@ -33,6 +33,7 @@ VALUE_PROBES = ("linear", "knn", *TRAINED)
 """Probes of tasks with values: ridge regression, alpha chosen on validation groups, the mean of the 20 nearest, networks."""
 
 FeatureSource = Callable[[str, np.ndarray], np.ndarray]  # (modality, pack rows) -> features [len(rows), D]
+Fitted = Callable[[np.ndarray], np.ndarray]  # features -> class probabilities or values
 
 
 @dataclass(frozen=True)
@@ -55,17 +56,10 @@ class ProbeSplit:
 
 
 def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
-    """Labelled (or measured) rows of ``task`` by split.
+    """Labelled (or measured) rows of ``task`` by split that have an image of ``modality`` ("both": both, "none": any).
 
-    Without a validation split, a fifth of the training groups is set aside for it.
-
-    Args:
-        pack: The data.
-        task: The task whose labels, row filter and split column apply.
-        modality: Rows must have an image of this modality; "both" asks for both, "none" for no image.
-
-    Raises:
-        ValueError: If no labelled row is left in train or in test, or a target has no different values there.
+    Without a validation split, a fifth of the training groups is set aside for it. ValueError if no labelled row is left in
+    train or in test, or a target has no different values there.
     """
     having = names_in(modality, pack)
     known = pack.answered(task)
@@ -81,7 +75,8 @@ def split_rows(pack: Pack, task: AnyTask, modality: str = "none") -> ProbeSplit:
         groups = pack.column("group")[train].astype(str)
         names = np.random.default_rng(0).permutation(np.unique(groups))
         held = np.isin(groups, names[: max(1, len(names) // 5)])
-        if held.all() or _num_classes(pack, task, train[~held]) == 1:  # a single group: no rows can be held out
+        one_class = isinstance(task, Task) and len(set(pack.labels(task.name)[train[~held]])) == 1
+        if held.all() or one_class:  # a single group: no rows can be held out
             return ProbeSplit(train, train, test)
         train, val = train[~held], train[held]
     return ProbeSplit(train, val, test)
@@ -122,27 +117,14 @@ def seen_by(pack: Pack, task: AnyTask, modalities: Sequence[str]) -> list[str]:
     return [modality for modality in modalities if all(has[m] for m in names_in(modality, pack))]
 
 
-def _num_classes(pack: Pack, task: AnyTask, rows: np.ndarray) -> int:
-    """Number of classes among ``rows``; 0 for values."""
-    return 0 if isinstance(task, ValueTask) else len(set(labels_of(pack, task)[rows]))
-
-
-def labels_of(pack: Pack, task: Task) -> np.ndarray:
-    """Integer labels of all rows; -1 = unlabelled."""
-    return pack.column(f"label_{task.name}").astype(int)
-
-
 def probe_features(
     x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
 ) -> dict[str, Any]:
     """Fit and score one probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one."""
     num = len(rows.fitted)
-    if isinstance(task, ValueTask):
-        predict, extra = fit_values(x[:num], pack, task, rows, kind, seed)
-        return {**score_predictions(pack, task, rows.test, predict(x[num:])), **extra}
     predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
     predicted = predict(x[num:])
-    if task.event:
+    if isinstance(task, Task) and task.event:
         held = _held_out(x[:num], pack, task, rows, kind, seed)
         extra = {**extra, "event": score_event(pack, task, rows.fitted, held, rows.test, predicted)}
     return {**score_rows(pack, task, rows.test, predicted), **extra}
@@ -159,20 +141,23 @@ def _held_out(x: np.ndarray, pack: Pack, task: Task, rows: ProbeSplit, kind: str
 
 
 def fit_probe(
-    x: np.ndarray, pack: Pack, task: Task, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
-) -> tuple[Classifier, dict[str, Any]]:
+    x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
+) -> tuple[Fitted, dict[str, Any]]:
     """Fit one probe on features ``x`` of ``rows.fitted``.
 
     Returns:
-        A function from features [N, D] to class probabilities [N, K], and what was chosen (C of ``linear``).
+        A function from features [N, D] to class probabilities [N, K] or values [N, T], and what was chosen (C or alpha of
+        ``linear``). That of ``linear`` has ``weights()``.
     """
-    labels = labels_of(pack, task)
+    if isinstance(task, ValueTask):
+        return _fit_values(x, pack, task, rows, kind, seed)
+    labels = pack.labels(task.name)
     y, y_whole, num = labels[rows.train], labels[rows.fitted], len(task.classes)
     if len(np.unique(y)) < 2:
-        return lambda z: np.eye(num)[np.full(len(z), y[0])], {}  # a single class: nothing to learn
+        return Constant(int(y[0]), num, x.shape[-1]), {}
     if kind == "linear":
-        fitted, c = fit_linear(x[: len(y)], y, x[len(y) :], labels[rows.val])
-        return lambda z: spread_out(fitted(z), np.unique(y_whole), num), {"C": c}
+        fitted, c = fit_linear(x[: len(y)], y, x[len(y) :], labels[rows.val], num)
+        return fitted, {"C": c}
     if kind == "paper":
         return paper or fit_papers(x, [y_whole], [num], seed)[0], {}
     if kind == "knn":
@@ -183,13 +168,9 @@ def fit_probe(
     raise unknown("probe", kind, PROBES)
 
 
-def fit_values(
-    x: np.ndarray, pack: Pack, task: ValueTask, rows: ProbeSplit, kind: str, seed: int = 0
-) -> tuple[Regressor, dict[str, Any]]:
-    """Fit one probe of a task with values on features ``x`` of ``rows.fitted``.
-
-    Returns a function from features [N, D] to values [N, T], and what was chosen (alpha of ``linear``, which is ridge).
-    """
+def _fit_values(
+    x: np.ndarray, pack: Pack, task: ValueTask, rows: ProbeSplit, kind: str, seed: int
+) -> tuple[Fitted, dict[str, Any]]:
     y = pack.values(task)[rows.fitted]
     if kind == "linear":
         predict, alphas = fit_ridge(x, y, len(rows.val))
@@ -214,11 +195,8 @@ def probe_model(
 ) -> list[dict[str, Any]]:
     """Probe every task and modality that ``model`` has an encoder for, and its own heads where it has some.
 
-    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones.
-
-    Returns:
-        One record per (task, modality, probe): these names and the scores of ``scores.score``. The probe of the
-        model's own head is "own".
+    The features are those of ``sensors.touch_features`` with ``standardise``; own heads read plain ones. There is one
+    record per (task, modality, probe): these names and the scores of ``score_rows``. The probe of an own head is "own".
     """
     modalities = [m for m in modalities if set(names_in(m, pack)) <= set(model.encoders)]  # supervised: maybe one
     if not modalities:
@@ -264,10 +242,8 @@ def own_heads(
         z = {m: torch.from_numpy(features(model, pack, m, rows, for_heads=True)) for m in model.encoders}
         # Match columns by name: this pack may order the classes differently or have fewer.
         columns = [known[task.name].index(name) for name in _outputs(task)]
-        if isinstance(task, Task):
-            result = score_rows(pack, task, rows, model.classify(task.name, z).numpy()[:, columns])
-        else:
-            result = score_predictions(pack, task, rows, model.estimate(task.name, z).numpy()[:, columns])
+        predicted = (model.classify if isinstance(task, Task) else model.estimate)(task.name, z).numpy()[:, columns]
+        result = score_rows(pack, task, rows, predicted)
         records.append({"task": task.name, "modality": whole, "probe": "own", **result})
     return records
 
@@ -282,14 +258,12 @@ def with_classes(tasks: Sequence[AnyTask]) -> list[Task]:
     return [task for task in tasks if isinstance(task, Task)]
 
 
-def score_predictions(pack: Pack, task: ValueTask, rows: np.ndarray, predicted: np.ndarray) -> dict[str, Any]:
-    """Score values ``predicted`` [len(rows), T] of pack ``rows``."""
-    return score_values(pack.values(task)[rows], predicted, group_numbers(pack, rows), task.targets)
-
-
-def score_rows(pack: Pack, task: Task, rows: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
-    """Score class ``probabilities`` [len(rows), K] of pack ``rows``."""
-    return score(labels_of(pack, task)[rows], probabilities, group_numbers(pack, rows), len(task.classes))
+def score_rows(pack: Pack, task: AnyTask, rows: np.ndarray, predicted: np.ndarray) -> dict[str, Any]:
+    """Score class probabilities [len(rows), K], or values [len(rows), T], ``predicted`` for pack ``rows``."""
+    groups = group_numbers(pack, rows)
+    if isinstance(task, ValueTask):
+        return score_values(pack.values(task)[rows], predicted, groups, task.targets)
+    return score(pack.labels(task.name)[rows], predicted, groups, len(task.classes))
 
 
 def group_numbers(pack: Pack, rows: np.ndarray) -> np.ndarray:
@@ -342,7 +316,7 @@ def _papers(
             sharing.setdefault(split_rows(pack, task, modality).fitted.tobytes(), []).append(task)
         for key, group in sharing.items():
             rows = np.frombuffer(key, np.int64)
-            ys = [labels_of(pack, task)[rows] for task in group]
+            ys = [pack.labels(task.name)[rows] for task in group]
             fitted = fit_papers(source(modality, rows), ys, [len(task.classes) for task in group], seed)
             found.update({(task.name, modality): predict for task, predict in zip(group, fitted, strict=True)})
     return found

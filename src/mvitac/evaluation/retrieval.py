@@ -22,10 +22,10 @@ def shared_space(model: Model, pack: Pack, rows: np.ndarray) -> dict[str, Tensor
     return {m: model.project(m, x.to(device)).cpu() for m, x in z.items()}
 
 
-def retrieved_rows(pack: Pack) -> np.ndarray:
-    """Test rows with all modalities, of the phase that the first task is about."""
+def retrieved_rows(pack: Pack, split: str = "test") -> np.ndarray:
+    """Rows of ``split`` with all modalities, of the phase that the first task is about."""
     only = pack.spec.tasks[0].only if pack.spec.tasks else None
-    return pack.rows("test", only=only, having=pack.spec.modalities)
+    return pack.rows(split, only=only, having=pack.spec.modalities)
 
 
 def cross_modal(model: Model, pack: Pack, rows: np.ndarray | None = None) -> list[dict[str, Any]]:

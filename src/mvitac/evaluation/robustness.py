@@ -19,10 +19,8 @@ from mvitac.evaluation.features import features, sample
 from mvitac.evaluation.probe import (
     ProbeSplit,
     fit_probe,
-    fit_values,
     names_in,
     probe_features,
-    score_predictions,
     score_rows,
     seen_by,
     split_rows,
@@ -65,11 +63,8 @@ class _Case:
 
     def fit(self, x: np.ndarray, rows: ProbeSplit) -> Callable[[np.ndarray], dict[str, Any]]:
         """Fit logistic regression, or ridge; returns a function from features of the test rows to scores."""
-        if isinstance(task := self.task, ValueTask):
-            guess, found = fit_values(x, self.pack, task, rows, "linear")
-            return lambda z, task=task: {**score_predictions(self.pack, task, rows.test, guess(z)), **found}
-        predict, extra = fit_probe(x, self.pack, task, rows, "linear", self.seed)
-        return lambda z, task=task: {**score_rows(self.pack, task, rows.test, predict(z)), **extra}
+        predict, extra = fit_probe(x, self.pack, self.task, rows, "linear", self.seed)
+        return lambda z: {**score_rows(self.pack, self.task, rows.test, predict(z)), **extra}
 
     def probe(self, keep: np.ndarray, rows: ProbeSplit) -> dict[str, Any]:
         return probe_features(self.joined()[keep], self.pack, self.task, rows, "linear", self.seed)

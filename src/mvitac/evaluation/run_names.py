@@ -15,8 +15,7 @@ from mvitac.system.files import digest
 def names_of(paths: Sequence[Path], models: Sequence[Model]) -> list[str]:
     """Names of the runs: the method, the recipe if recipes differ, and the folder if runs of one name differ further.
 
-    Raises:
-        ValueError: If two runs are the same, since they would count as two seeds.
+    ValueError if two runs are the same, since they would count as two seeds.
     """
     several = len({model.run.recipe for model in models}) > 1
     names = [f"{m.run.method.name} ({m.run.recipe})" if several else m.run.method.name for m in models]

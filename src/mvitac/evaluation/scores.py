@@ -17,16 +17,9 @@ from mvitac.evaluation.value_scores import one_target, pool_values
 
 
 def score(y: np.ndarray, probabilities: np.ndarray, groups: np.ndarray, num_classes: int) -> dict[str, Any]:
-    """Score class probabilities [N, K] against labels ``y`` [N].
+    """Score class probabilities [N, K] against labels ``y`` [N]; ``groups`` [N] are group numbers, for intervals.
 
-    Args:
-        y: True labels.
-        probabilities: Class probabilities.
-        groups: Group number of each row, for intervals.
-        num_classes: K.
-
-    Returns:
-        Accuracy, balanced accuracy, macro F1, AUROC (two classes only), the confusion matrix and counts per group.
+    Returns accuracy, balanced accuracy, macro F1, AUROC (two classes only), the confusion matrix and counts per group.
     """
     guess = probabilities.argmax(1)
     present = np.unique(y)

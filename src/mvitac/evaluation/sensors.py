@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import nn
+from torch.optim.swa_utils import update_bn
 
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.jpeg import Lazy
@@ -20,7 +21,6 @@ from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
-from mvitac.nn.finetuning import renew_norms
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, Looks, learn_colours, recolour
 from mvitac.transforms.preprocess import encoder_input
 
@@ -89,17 +89,10 @@ def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> lis
 def touch_features(
     model: Model, pack: Pack, modality: str, rows: np.ndarray, standardise: tuple[Standardise, ...] = (), *, maps: bool
 ) -> np.ndarray:
-    """``features`` of pack rows, those of touch in the statistics of each row's own sensor.
+    """``features`` of pack ``rows`` (ascending), those of touch in the statistics of each row's own sensor.
 
-    Args:
-        model: The model.
-        pack: The data.
-        modality: vision (nothing is changed) or touch.
-        rows: Pack rows, ascending.
-        standardise: batch-norm: the running statistics of the encoder's BatchNorm layers are taken anew from images of
-            each sensor. features: each sensor's features are standardised by their own mean and standard deviation.
-            colours: those of a ``RecolouredPack``'s new sensors are the mean over its ``looks``.
-        maps: Return the trunk's last feature maps [N, P, D] instead of features [N, D].
+    ``ProbeConfig.standardise`` says how. With colours, the features of a ``RecolouredPack``'s new sensors are the mean over
+    its ``looks``. With ``maps``, they are the trunk's last feature maps [N, P, D].
     """
     if modality != "touch" or not standardise:
         return features(model, pack, modality, rows, maps=maps)
@@ -126,25 +119,19 @@ def touch_features(
 def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     """A copy of ``model`` whose touch encoder has the BatchNorm statistics of the touch images of ``rows``.
 
-    Source: Schneider et al., https://arxiv.org/abs/2006.16971.
-
-    Raises:
-        ValueError: If the encoder has no BatchNorm.
+    ValueError if it has no BatchNorm. Source: Schneider et al., https://arxiv.org/abs/2006.16971.
     """
     made = copy.deepcopy(model)
     trunk = made.encoders["touch"]
-    norms = [layer for layer in trunk.modules() if isinstance(layer, nn.modules.batchnorm._BatchNorm)]
-    if not norms:
+    if not any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in trunk.modules()):
         raise ValueError(f"trunk {model.run.encoder.trunk} has no BatchNorm: leave --standardise batch-norm out")
-    for layer in norms:
-        layer.train()
     device = next(trunk.parameters()).device
 
-    def see(chunk: np.ndarray) -> None:
-        images = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][chunk])).permute(0, 3, 1, 2).to(device)
-        trunk(encoder_input(images, model.run.augment.eval_size))
+    def images(rows: np.ndarray) -> torch.Tensor:
+        found = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][rows])).permute(0, 3, 1, 2).to(device)
+        return encoder_input(found, model.run.augment.eval_size)
 
-    renew_norms(trunk, (partial(see, chunk) for chunk in np.array_split(rows, max(1, len(rows) // 64))))
+    update_bn((images(chunk) for chunk in np.array_split(rows, max(1, len(rows) // 64))), trunk)
     return made.eval()
 
 
@@ -247,14 +234,13 @@ def _which_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:
     """None if train has one sensor only, or test one that train lacks."""
     train, val, test = (pack.rows(split, having=("touch",)) for split in ("train", "val", "test"))
     val = val if len(val) else train
-    fitted = np.unique(pack.sensors[np.concatenate([train, val])])
     right = pack.sensors[test]
     if len(np.unique(pack.sensors[train])) < 2 or not len(test) or not np.isin(right, pack.sensors[train]).all():
         return None
     z = [features(model, pack, "touch", rows) for rows in (train, val, test)]
     predict, _ = fit_linear(z[0], pack.sensors[train], z[1], pack.sensors[val])
     common = np.bincount(pack.sensors[train]).argmax()
-    return _record("which sensor", fitted[predict(z[2]).argmax(1)] == right, float((right == common).mean()))
+    return _record("which sensor", predict(z[2]).argmax(1) == right, float((right == common).mean()))
 
 
 def cross_sensor(model: Model, pack: Pack) -> dict[str, Any] | None:

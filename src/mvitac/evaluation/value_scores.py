@@ -19,15 +19,9 @@ NUM_POINTS = 200
 def score_values(y: np.ndarray, predicted: np.ndarray, groups: np.ndarray, targets: Sequence[Target]) -> dict[str, Any]:
     """Score predictions [N, T] against measured values ``y`` [N, T] in the units of ``targets``; NaN = not measured.
 
-    Args:
-        y: Measured values.
-        predicted: Predicted values.
-        groups: Group number of each row, for intervals.
-        targets: Names and units.
-
-    Returns:
-        "r2" (mean over targets), "targets" (R2, MAE and RMSE of each, with "ranges": error by range of the true value),
-        "group_sums" (``SUMS``), and "points": up to 200 pairs of true and predicted value per target, drawn at random.
+    ``groups`` [N] are group numbers, for intervals. Returns "r2" (mean over targets), "targets" (R2, MAE and RMSE of each,
+    with "ranges": error by range of the true value), "group_sums" (``SUMS``), and "points": up to 200 pairs of true and
+    predicted value per target, drawn at random.
     """
     num_groups = int(groups.max()) + 1
     sums: dict[str, list[list[float]]] = {name: [] for name in SUMS}

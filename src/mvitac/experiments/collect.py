@@ -24,7 +24,7 @@ from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
 from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
-from mvitac.experiments.jobs import Job, Work, pairs_per_second, seconds_of
+from mvitac.experiments.jobs import Job, Work, pairs_per_second
 from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
@@ -213,7 +213,7 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
         "pairs_of": pairs_of(run, method.views, pack),
         "images": steps * run.batch_size * method.views * len(method.encoders()),
         "trained_parameters": sum(p.numel() for p in method.parameters() if p.requires_grad),
-        "seconds": statistics.median(seconds_of(job.out) for job in jobs),
+        "seconds": statistics.median(job.seconds() for job in jobs),
         "peak_gpu_bytes": int(np.max(peaks)) if peaks else None,
     }
 
@@ -265,7 +265,7 @@ def _time_left(work: Work, todo: Sequence[Job], images: dict[str, int], measure:
         return "all runs are finished"
     speeds: dict[str, list[float]] = {}  # row -> images per second of its finished runs
     for job in work.jobs:
-        if job.done and not job.failure and (seconds := seconds_of(job.out)):
+        if job.done and not job.failure and (seconds := job.seconds()):
             speeds.setdefault(job.label, []).append(images[job.label] / seconds)
     told = "by the finished runs; a row without one is assumed to take as long per image as the others"
     if not speeds and measure:

@@ -77,17 +77,11 @@ def run_demo(run: Run, out: Path, num_seeds: int, console: Console) -> Path:
 
 
 def scores_on_new_sensor(paths: Sequence[Path], learn: Pack, score: Pack, known: dict[str, Any]) -> dict[str, Any]:
-    """What runs and their labels on ``learn`` are worth on the touch sensor of ``score``, which they never saw.
+    """What the runs at ``paths``, and labels of ``learn``, are worth on the touch sensor of ``score``, which they never saw.
 
-    Args:
-        paths: Folders of the runs.
-        learn: What probes are fitted on.
-        score: Touches with the new sensor.
-        known: The result of ``probe_runs`` on ``learn``.
-
-    Returns:
-        "data", "group_by", "notes" and "summary", as in that result; the sources are the first run's name there, the new
-        sensor as it is, and in the known sensors' colours unless it has too few images for that, which is then a note.
+    ``known`` is the result of ``probe_runs`` on ``learn``. Returns "data", "group_by", "notes" and "summary", as in that
+    result; the sources are the known sensors, the new sensor as it is, and in the known sensors' colours unless it has too
+    few images for that, which is then a note.
     """
     looks: dict[str, tuple[type[JoinedPack], tuple[Standardise, ...]]] = {
         "new sensor, as it is": (JoinedPack, ()),

@@ -29,12 +29,12 @@ from mvitac.registry import to_json
 from mvitac.run import Run
 from mvitac.system.console import Console
 from mvitac.system.device import pick_device
-from mvitac.system.files import brief, parse_json, read_json, write_json
+from mvitac.system.files import brief, read_json, write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.system.processes import my_device, side_by_side
 from mvitac.system.progress import Bars, shown
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
-from mvitac.training.log import Logger, in_a_bar, last_line
+from mvitac.training.log import Logger, in_a_bar, last_line, read_log, seconds_of
 from mvitac.training.loop import Diverged, Interrupted, train
 
 
@@ -70,6 +70,10 @@ class Job:
     def done(self) -> bool:
         kept = ["scores.json", *(["stress.json"] if self.stress else [])]
         return bool(self.failure) or all(_scored(self.out / name) == self.asked for name in kept)
+
+    def seconds(self) -> float:
+        """Seconds of training."""
+        return seconds_of(read_log(self.out), self.run.batch_size)
 
     def drop_checkpoint(self) -> None:
         """Delete the checkpoints. A scored run needs none, and one is four times as large as the weights."""
@@ -137,7 +141,7 @@ def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -
     scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
     write_json(job.out / "scores.json", scores, sealed=True)
     job.drop_checkpoint()
-    return f"{seconds_of(job.out):.0f} s of training"
+    return f"{job.seconds():.0f} s of training"
 
 
 class _Reporter:
@@ -320,15 +324,3 @@ def pairs_per_second(run: Run, pack: Pack) -> float:
         except _Measured as measured:
             return max(0.05, measured.args[0])  # logged with one decimal
     raise AssertionError("a run logs its first steps")
-
-
-def seconds_of(path: Path) -> float:
-    """Seconds of training by a run's log, over all resumptions. Steps lost to a kill are not counted."""
-    total, before = 0.0, 0
-    batch_size = read_json(path / "run.json", "a run's record")["run"]["batch_size"]
-    for line in (path / "log.jsonl").read_text().splitlines():
-        entry = parse_json(line)
-        if entry.get("pairs_per_s"):
-            total += (entry["step"] - before) * batch_size / entry["pairs_per_s"]
-        before = entry["step"]
-    return total

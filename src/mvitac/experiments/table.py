@@ -1,33 +1,21 @@
 """A comparison's result as the lines and cells of a table."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
-from mvitac.evaluation.intervals import interval, paired_difference
+from mvitac.evaluation.intervals import paired_difference
 from mvitac.evaluation.robustness import STRESSES
 from mvitac.evaluation.score_text import MODALITY_ORDER
-from mvitac.evaluation.scores import by_cell, leaks_in, targets_of
+from mvitac.evaluation.scores import by_cell, summarise
 from mvitac.evaluation.value_scores import one_target
 from mvitac.experiments.plan import ONE_ROW, Plan
 from mvitac.registry import from_json
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One score with its interval, the printed number and the difference to the reference; in 0 .. 1."""
-
-    mean: float
-    low: float
-    high: float
-    seeds: int
-    printed: float | None
-    difference: tuple[float, float, float, float | None] | None
-    """To the reference row: mean, low, high, p (``paired_difference``)."""
-    leak: str = ""  # which test rows were trained on (``evaluation.leaks``)
-    score: str = "accuracy"  # "accuracy", or "R2" of values
-    target: dict[str, Any] | None = None  # unit, MAE and RMSE of one target (``target_lines``)
+Cell = dict[str, Any]
+"""A cell of ``scores.summarise``, in 0 .. 1, with "printed" (the paper's number, or None) and "difference" to the reference
+row: mean, low, high, p (``paired_difference``), or None."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +41,7 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
     found = {source for _, _, source in records}
     own = sorted(found - set(rows) - set(CONTROLS))  # the data's own controls
     controls = [*(s for s in CONTROLS[:-2] if s in found), *own, *(s for s in CONTROLS[-2:] if s in found)]
+    summary = summarise(result["records"], probe)
     lines = []
     for source in (*rows, *controls):
         for modality in MODALITY_ORDER:
@@ -63,11 +52,8 @@ def lines_of(result: dict[str, Any], probe: str | None = None) -> list[Line]:
                     trained = (task, modality, source + END_TO_END) in records
                     # The paper printed the score of a supervised row's own classifier.
                     paper = None if trained or probe != "paper" else _printed(result, plan, task, modality, source)
-                    seeds = max(1, sum(record["seed"] is not None for record in mine))
-                    gap = paired_difference(mine, against) if against else None
-                    score = "R2" if "targets" in mine[0] else "accuracy"
-                    paper = None if paper is None else paper / 100
-                    cells[task] = Cell(*interval(mine), seeds, paper, gap, leaks_in(mine), score)
+                    beside = {"printed": paper, "difference": paired_difference(mine, against) if against else None}
+                    cells[task] = {**summary[task][modality][source], **beside}
             if cells:
                 lines.append(Line(source, modality, cells, control=source in controls))
     return lines
@@ -80,25 +66,22 @@ def target_lines(result: dict[str, Any], probe: str | None = None) -> dict[str, 
     for task in dict.fromkeys(record["task"] for record in values):
         mine = [record for record in values if record["task"] == task]
         split = [{**one_target(r, t), "task": each["name"]} for r in mine for t, each in enumerate(r["targets"])]
-        records = by_cell(split, probe or from_json(Plan, result["plan"], "plan").probes[0])
-        found[task] = []
-        for line in lines_of({**result, "records": split}, probe):
-            targets = {name: targets_of(records[name, line.modality, line.source])[0] for name in line.cells}
-            cells = {name: replace(cell, target=targets[name]) for name, cell in line.cells.items()}
-            found[task].append(replace(line, cells=cells))
+        found[task] = lines_of({**result, "records": split}, probe)
     return found
 
 
 def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, source: str) -> float | None:
-    """The paper's number in percent, if it has one for this split, of positives from the same image."""
+    """The paper's number, if it has one for this split, of positives from the same image."""
     if result["data"] != plan.printed_on:
         return None
-    if source == "majority":
-        return plan.printed_majority.get(task)
     label = source.removesuffix(END_TO_END)
-    printed = {row.label: row.printed for row in plan.rows}.get(label, {})
+    printed = {row.label: row.printed for row in plan.rows}.get(label, {}).get(modality, {})
     pairs = {cost["row"]: cost["pairs_of"] for cost in result["cost"]}
-    return printed.get(modality, {}).get(task) if pairs.get(label) == ONE_ROW else None
+    if source == "majority":
+        printed = plan.printed_majority
+    elif pairs.get(label) != ONE_ROW:
+        return None
+    return printed[task] / 100 if task in printed else None
 
 
 def stresses_of(result: dict[str, Any]) -> dict[str, list[Line]]:

@@ -36,21 +36,21 @@ def _plan(result: dict[str, Any]) -> Plan:
     return from_json(Plan, result["plan"], "plan")
 
 
-def _tasks(lines: Sequence[Line]) -> list[str]:
-    return list(dict.fromkeys(task for line in lines for task in line.cells))
-
-
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     """The whole comparison as Markdown: what was compared, the tables, stress tests, AUROC, retrieval and cost."""
     plan = _plan(result)
-    shown = any(cell.printed is not None for line in lines for cell in line.cells.values())
+    shown = any(cell["printed"] is not None for line in lines for cell in line.cells.values())
     text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, lines, shown), ""]
     text += _table(lines, plan.reference, shown)
     for task, each in target_lines(result).items():
-        text += [f"**{task}**: every target, and its mean absolute error", "", *_table(each, plan.reference, False)]
+        rows = _table(each, plan.reference, False, targets=True)
+        text += [f"**{task}**: every target, and its mean absolute error", "", *rows]
     for kind, worse in stresses_of(result).items():
         text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
-    text += [*_auroc(result, plan, lines), *_retrieval(result), *_cost(result)]
+    text += _auroc(result, plan, lines)
+    if rows := retrieval_rows(result["retrieval"]):
+        text += pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows)
+    text += _cost(result)
     return "\n".join(text).rstrip() + "\n"
 
 
@@ -59,39 +59,31 @@ def _first_cells(line: Line) -> list[str]:
     return [f"*{line.source}*" if line.control else line.source, "" if line.modality == "none" else line.modality]
 
 
-def _table(lines: Sequence[Line], reference: str, shown: bool) -> list[str]:
-    """Lines as a Markdown table, with the paper's numbers if ``shown``, and the error of targets."""
-    tasks, known = _tasks(lines), _columns(lines)
-    heads = ["", "modality"]
-    for task in tasks:
-        error = ["error"] if known[task].target else []
-        score = "R2 " * (known[task].score == "R2")
-        heads += [f"{task} {score}%", *error, *(["printed"] if shown else []), f"to {reference}"]
-    rows = []
-    for line in lines:
-        row = _first_cells(line)
-        for task in tasks:
-            cell = line.cells.get(task)
-            score = with_interval(cell.mean, cell.low, cell.high, cell.leak) if cell else ""
-            error = [error_text(cell.target) if cell and cell.target else ""] if known[task].target else []
-            row += [score, *error, *([_printed(cell)] if shown else []), _gap(cell)]
-        rows.append(row)
+def _table(lines: Sequence[Line], reference: str, shown: bool, *, targets: bool = False) -> list[str]:
+    """Lines as a Markdown table, with the paper's numbers if ``shown``, and the error of ``targets``."""
+    heads, rows = ["", "modality"], [_first_cells(line) for line in lines]
+    for task, score in _columns(lines).items():
+        heads += [f"{task} {'R2 ' * (score == 'R2')}%", *["error"] * targets, *["printed"] * shown, f"to {reference}"]
+        for line, row in zip(lines, rows, strict=True):
+            cell = line.cells.get(task, {})
+            row.append(with_interval(cell["mean"], cell["low"], cell["high"], cell.get("leak", "")) if cell else "")
+            if targets:
+                row.append(error_text(cell["targets"][0]) if cell else "")
+            if shown:
+                row.append("" if cell.get("printed") is None else percent(cell["printed"]))
+            row.append(_gap(cell))
     return pipes(heads, rows)
 
 
-def _columns(lines: Sequence[Line]) -> dict[str, Cell]:
-    """One cell of each column."""
-    return {task: cell for line in lines for task, cell in line.cells.items()}
+def _columns(lines: Sequence[Line]) -> dict[str, str]:
+    """What each column scores: task or target -> "accuracy" or "R2"."""
+    return {t: "R2" if "targets" in cell else "accuracy" for line in lines for t, cell in line.cells.items()}
 
 
-def _printed(cell: Cell | None) -> str:
-    return "" if cell is None or cell.printed is None else percent(cell.printed)
-
-
-def _gap(cell: Cell | None) -> str:
-    if cell is None or cell.difference is None:
+def _gap(cell: Cell) -> str:
+    if not cell or cell["difference"] is None:
         return ""
-    mean, _, _, p = cell.difference
+    mean, _, _, p = cell["difference"]
     return f"{100 * mean:+.1f}" if p is None else f"{100 * mean:+.1f} (p {_p(p)})"
 
 
@@ -135,7 +127,7 @@ def _probes(result: dict[str, Any], plan: Plan) -> str:
 
 def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> str:
     """What p is, and its smallest possible value for each task."""
-    if all(not cell.difference or cell.difference[3] is None for line in lines for cell in line.cells.values()):
+    if all((cell["difference"] or [None])[-1] is None for line in lines for cell in line.cells.values()):
         return f"Differences to {plan.reference} have no p, which needs several seeds."
     groups = {record["task"]: num_groups_of(record) for record in result["records"]}
     least = ", ".join(f"{task} {_p(least_p(num))} ({num} {result['group_by']}s)" for task, num in groups.items())
@@ -198,23 +190,16 @@ def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[st
     return pipes(["AUROC %", "modality", *tasks], rows)
 
 
-def _retrieval(result: dict[str, Any]) -> list[str]:
-    rows = retrieval_rows(result["retrieval"])
-    return pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows) if rows else []
-
-
 def _cost(result: dict[str, Any]) -> list[str]:
-    text = [
-        "| cost of one run | seeds | steps | pairs | from | images seen | trained weights | seconds | peak GPU MiB |",
-        "|---|---:|---:|---:|---|---:|---:|---:|---:|",
-    ]
+    heads = ["cost of one run", "from", "seeds", "steps", "pairs", "images seen", "trained weights", "seconds"]
+    rows = []
     for c in result["cost"]:
         peak = f"{c['peak_gpu_bytes'] / 2**20:.0f}" if c["peak_gpu_bytes"] else "not measured"
-        text.append(
-            f"| {c['row']} | {c['seeds']} | {c['steps']} | {c['pairs']} | {c['pairs_of']} | {c['images']} |"
-            f" {c['trained_parameters'] / 1e6:.2f} M | {c['seconds']:.0f} | {peak} |"
-        )
-    return [*text, "", *(f"- {line}" for line in about_lines(result.get("encoders", ())))]
+        numbers = [f"{c[key]}" for key in ("seeds", "steps", "pairs", "images")]
+        weights = f"{c['trained_parameters'] / 1e6:.2f} M"
+        rows.append([c["row"], c["pairs_of"], *numbers, weights, f"{c['seconds']:.0f}", peak])
+    text = pipes([*heads, "peak GPU MiB"], rows)
+    return [*text, *(f"- {line}" for line in about_lines(result.get("encoders", ())))]
 
 
 NAMES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "none": "-"}
@@ -228,9 +213,9 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     plan = _plan(result)
     text = _tabular(lines)
     for task, each in target_lines(result).items():
-        text += ["", f"% {_tex(task)}: every target, and its mean absolute error", *_tabular(each)]
+        text += ["", f"% {_tex(task)}: every target, and its mean absolute error", *_tabular(each, targets=True)]
     note = f"% {plan.title or plan.name}; data {result['data']}"
-    if any(cell.printed is not None for line in lines for cell in line.cells.values()):
+    if any(cell["printed"] is not None for line in lines for cell in line.cells.values()):
         note += f"; in parentheses: printed in the paper on {plan.printed_on}"
     intervals = f"% 95 % intervals: {covered(result['group_by'], result['records'])}"
     notes = [note, *(f"% Note: {note}." for note in _notes(result)), intervals]
@@ -239,13 +224,11 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     return "\n".join([*(" ".join(line.split()) for line in notes), *text]) + "\n"
 
 
-def _tabular(lines: Sequence[Line]) -> list[str]:
-    """Lines as one LaTeX table."""
-    known = _columns(lines)
+def _tabular(lines: Sequence[Line], *, targets: bool = False) -> list[str]:
+    """Lines as one LaTeX table, with the error of ``targets``."""
     heads = ["Method", "Modality"]
-    for task in _tasks(lines):
-        heads.append(f"{_tex(task)} ({'$R^2$, ' * (known[task].score == 'R2')}\\%)")
-        heads += ["error"] * bool(known[task].target)
+    for task, score in _columns(lines).items():
+        heads += [f"{_tex(task)} ({'$R^2$, ' * (score == 'R2')}\\%)", *["error"] * targets]
     text = [
         r"\begin{tabular}{ll" + "r" * (len(heads) - 2) + "}",
         r"\toprule",
@@ -255,16 +238,12 @@ def _tabular(lines: Sequence[Line]) -> list[str]:
     for number, line in enumerate(lines):
         if line.control and not any(earlier.control for earlier in lines[:number]):
             text.append(r"\midrule")
-        cells = [text for task in _tasks(lines) for text in _tex_cells(line, task, lines)]
-        text.append(" & ".join([_tex(line.source), NAMES[line.modality], *cells]) + r" \\")
+        row = [_tex(line.source), NAMES[line.modality]]
+        for task in _columns(lines):
+            error = _tex(error_text(line.cells[task]["targets"][0])) if targets and task in line.cells else ""
+            row += [_tex_cell(line, task, lines), *[error] * targets]
+        text.append(" & ".join(row) + r" \\")
     return [*text, r"\bottomrule", r"\end{tabular}"]
-
-
-def _tex_cells(line: Line, task: str, lines: Sequence[Line]) -> list[str]:
-    """The cells of one task or target: its score, and the error of a target."""
-    cell = line.cells.get(task)
-    error = [_tex(error_text(cell.target)) if cell and cell.target else ""] * bool(_columns(lines)[task].target)
-    return [_tex_cell(line, task, lines), *error]
 
 
 def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
@@ -272,11 +251,11 @@ def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
     cell = line.cells.get(task)
     if cell is None:
         return ""
-    best = max(x.cells[task].mean for x in lines if x.modality == line.modality and task in x.cells)
-    number, _, ends = with_interval(cell.mean, cell.low, cell.high).partition(" ")
-    number = rf"\textbf{{{number}}}" if not line.control and cell.mean == best else number
-    paper = f" ({percent(cell.printed)})" if cell.printed is not None else ""
-    return f"{number} {ends}{paper}{leak_mark(cell.leak)}"
+    best = max(x.cells[task]["mean"] for x in lines if x.modality == line.modality and task in x.cells)
+    number, _, ends = with_interval(cell["mean"], cell["low"], cell["high"]).partition(" ")
+    number = rf"\textbf{{{number}}}" if not line.control and cell["mean"] == best else number
+    paper = f" ({percent(cell['printed'])})" if cell["printed"] is not None else ""
+    return f"{number} {ends}{paper}{leak_mark(cell.get('leak', ''))}"
 
 
 _TEX = str.maketrans(
@@ -316,17 +295,19 @@ def comma(result: dict[str, Any]) -> str:
                 key = line.source, table if table in known else next(iter(known)), line.modality, task, name
                 if key not in written:
                     written.add(key)
-                    writer.writerow(_csv_row(key, cell, line.control)[: len(heads) + 5 + len(more)])
+                    writer.writerow(_csv_row(key, cell, line.control, bool(whole))[: len(heads) + 5 + len(more)])
     return buffer.getvalue()
 
 
-def _csv_row(key: Sequence[str], cell: Cell, control: bool) -> list[Any]:
+def _csv_row(key: Sequence[str], cell: Cell, control: bool, target: bool) -> list[Any]:
     """One line of the CSV. An interval without an end is empty."""
     source, probe, modality, task, name = key
-    numbers = [cell.mean, cell.low, cell.high, cell.seeds, cell.printed, *(cell.difference or ("",) * 4)]
+    seeds, gap = max(1, len(cell["seeds"])), cell["difference"] or ("",) * 4
+    numbers = [cell["mean"], cell["low"], cell["high"], seeds, cell["printed"], *gap]
     ends = ["" if value in (math.inf, -math.inf) else value for value in numbers]
-    target = [name, *(cell.target[key] for key in ("unit", "mae", "rmse"))] if cell.target else [""] * 4
-    return [source, int(control), probe, modality, task, *ends, cell.leak, cell.score, *target]
+    about = [name, *(cell["targets"][0][key] for key in ("unit", "mae", "rmse"))] if target else [""] * 4
+    score = "R2" if "targets" in cell else "accuracy"
+    return [source, int(control), probe, modality, task, *ends, cell.get("leak", ""), score, *about]
 
 
 def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
@@ -334,6 +315,5 @@ def figure(result: dict[str, Any], lines: Sequence[Line]) -> bytes:
     panels: dict[str, list[Dot]] = {}
     for line in lines:
         for task, cell in line.cells.items():
-            known = cell.mean, cell.low, cell.high, cell.printed, line.control, cell.score
-            panels.setdefault(task, []).append(Dot(line.source, line.modality, *known))
+            panels.setdefault(task, []).append(Dot(line.source, line.modality, line.control, cell))
     return to_png(comparison(panels), dpi=110)

@@ -73,31 +73,21 @@ class Method(nn.Module, ABC):
         return {}
 
     def prepare(self, rows: Tensor) -> None:
-        """Allocate memory that depends on the training rows, e.g. a memory bank.
+        """Allocate memory that depends on the pack ``rows`` [N] int64 (ascending) to train on, e.g. a memory bank.
 
         Called once, after the weights are initialised and before a checkpoint is loaded.
-
-        Args:
-            rows: [N] int64, the pack rows that training draws from, in ascending order.
         """
         return
 
     def learn_scale(self, values: dict[str, Tensor]) -> None:
-        """Take mean and standard deviation of the values that training learns from. Called once, after ``prepare``.
-
-        Args:
-            values: As ``Views.values``, of all training rows.
-        """
+        """Take mean and standard deviation of ``values``, those of all training rows. Called once, after ``prepare``."""
         return
 
     def after_step(self, progress: float) -> None:
         """Run the updates that follow the optimiser's step, e.g. of a momentum encoder.
 
         Values it needs from the batch are left by ``forward`` in the attribute ``pending``, which ``forward`` itself
-        never reads.
-
-        Args:
-            progress: Share of the run that is done, from 0 to 1.
+        never reads. ``progress`` is the share of the run that is done, from 0 to 1.
         """
         return
 
@@ -185,6 +175,10 @@ class MethodConfig(Registered, ABC):
         trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
         return self.build(spec, replace(encoder, trunk=trunk, weights=SCRATCH))
 
+    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
+        """Raise ValueError if the method cannot train ``encoder`` on views of ``size`` px."""
+        return
+
     def check_modalities(self, spec: DataSpec) -> None:
         """Raise ValueError if the method ``needs_pairs`` and the dataset lacks a modality."""
         if self.needs_pairs and len(spec.modalities) < 2:
@@ -211,6 +205,11 @@ class MethodConfig(Registered, ABC):
                 "lambda_sensor needs rows of one press (column press) and different sensors (column sensor) to train on:"
                 " simulate with --data.sensors-per-press 2"
             )
+
+    @property
+    def heads_from_probes(self) -> bool:
+        """Whether the heads start as linear probes of the start weights' features (``training.heads``)."""
+        return False
 
     @property
     def label_splits(self) -> tuple[str, ...]:

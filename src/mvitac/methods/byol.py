@@ -81,5 +81,5 @@ class BYOL(Contrastive):
 
     def after_step(self, progress: float) -> None:
         m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
-        for modality, tower in self.online.items():
-            self.target[modality].follow(tower, m)  # type: ignore[operator]
+        for target in self.target.values():
+            target.follow(m)  # type: ignore[operator]

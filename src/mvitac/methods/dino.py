@@ -129,5 +129,5 @@ class DINO(Contrastive):
         assert self.pending is not None, "call forward first"
         self.centre.lerp_(self.pending, 1 - self.config.centre_momentum)
         m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
-        for modality, tower in self.student.items():
-            self.teacher[modality].follow(tower, m)  # type: ignore[operator]
+        for teacher in self.teacher.values():
+            teacher.follow(m)  # type: ignore[operator]

@@ -81,6 +81,9 @@ class IJEPAConfig(MethodConfig):
                 raise ValueError(f"{name} {(low, high)}: give two rising numbers above 0, at most {top:g}")
         vit.check_predictor("predictor", self.predictor_width, self.predictor_depth)
 
+    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
+        vit.check_vit(encoder, self.name, size)
+
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> "IJEPA":
         return IJEPA(self, spec, encoder)
 
@@ -212,5 +215,5 @@ class IJEPA(Contrastive):
         return dict(self.trunks)
 
     def after_step(self, progress: float) -> None:
-        for modality, trunk in self.trunks.items():
-            self.teachers[modality].follow(vit.vit_of(trunk), self.config.ema_at(progress))  # type: ignore[operator]
+        for teacher in self.teachers.values():
+            teacher.follow(self.config.ema_at(progress))  # type: ignore[operator]

@@ -58,6 +58,9 @@ class MAEConfig(MethodConfig):
             raise ValueError(f"mask_ratio {self.mask_ratio}: give a share between 0 and 1")
         vit.check_predictor("decoder", self.decoder_width, self.decoder_depth)
 
+    def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
+        vit.check_vit(encoder, self.name, size)
+
     def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MAE":
         return MAE(self, spec, encoder)
 

@@ -103,7 +103,7 @@ class MoCo(Contrastive):
 
     def after_step(self, progress: float) -> None:
         m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
-        for modality, tower in self.query.items():
-            if modality in self.pending:
-                self.queues[modality].push(self.pending[modality])  # type: ignore[operator]
-            self.key[modality].follow(tower, m)  # type: ignore[operator]
+        for modality, keys in self.pending.items():
+            self.queues[modality].push(keys)  # type: ignore[operator]
+        for tower in self.key.values():
+            tower.follow(m)  # type: ignore[operator]

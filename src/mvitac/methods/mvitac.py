@@ -215,8 +215,8 @@ class MViTac(Contrastive):
 
     def after_step(self, progress: float) -> None:
         m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
-        for modality, key in self.key.items():
-            key.follow(self.query[modality], m)  # type: ignore[operator]  # eq. 1-3
+        for key in self.key.values():
+            key.follow(m)  # type: ignore[operator]  # eq. 1-3
 
 
 def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...], *, more: bool) -> Embeddings:

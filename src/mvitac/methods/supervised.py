@@ -142,6 +142,10 @@ class SupervisedConfig(LabelledConfig):
         if not 0 < self.share <= 1:
             raise ValueError(f"share {self.share}: give a share of the groups, above 0, at most 1")
 
+    @property
+    def heads_from_probes(self) -> bool:
+        return self.heads_from == "probe"
+
     def training_rows(self, pack: Pack) -> np.ndarray:
         rows = super().training_rows(pack)
         if self.share == 1 and not self.hold_out:

@@ -4,7 +4,6 @@ Shapes: B images, P places of a feature map, D features, O outputs of a layer an
 """
 
 import copy
-from collections.abc import Callable, Iterable
 from typing import Literal
 
 import torch
@@ -115,17 +114,3 @@ def merged(trunk: nn.Module) -> nn.Module:
             del module.parametrizations
             module.weight = nn.Parameter(weight)
     return trunk
-
-
-@torch.no_grad()
-def renew_norms(network: nn.Module, passes: Iterable[Callable[[], object]]) -> None:
-    """Replace the running statistics of every BatchNorm by their mean over ``passes``, forward passes of ``network``."""
-    norms = [module for module in network.modules() if isinstance(module, nn.modules.batchnorm._BatchNorm)]
-    momenta = [norm.momentum for norm in norms]
-    for norm in norms:
-        norm.reset_running_stats()
-        norm.momentum = None  # a plain mean
-    for forward in passes:
-        forward()
-    for norm, momentum in zip(norms, momenta, strict=True):
-        norm.momentum = momentum

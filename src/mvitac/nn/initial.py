@@ -43,11 +43,7 @@ class Init:
 
     @property
     def file(self) -> Path:
-        """The file with the weights.
-
-        Raises:
-            ValueError: If there is none.
-        """
+        """The file with the weights; ValueError if there is none."""
         assert self.path is not None
         if self.path.is_file():
             return self.path
@@ -60,11 +56,7 @@ class Init:
         return self.path / MODEL
 
     def resolved(self) -> "Init":
-        """The same with ``digest``.
-
-        Raises:
-            ValueError: If there are no such weights, or they are others than those of ``digest``.
-        """
+        """The same with ``digest``; ValueError if there are no such weights, or they are others than those of it."""
         if not self:
             return self
         found = _digest(self.file, self.file.stat().st_mtime_ns)
@@ -79,17 +71,10 @@ def _digest(file: Path, changed: int) -> str:
 
 
 def load_trunk(trunk: nn.Module, state: dict[str, Tensor]) -> None:
-    """Load the weights of a trunk from ``build_trunk`` or timm into another one.
+    """Load ``state``, the state dict of a trunk from ``build_trunk`` or timm, into another trunk.
 
     The first convolution is adapted to the number of channels. A trunk that sees a window's frames one by one, and one that
-    sees a single image, take each other's weights.
-
-    Args:
-        trunk: The trunk, changed in place.
-        state: State dict of the other one.
-
-    Raises:
-        ValueError: If they are different networks; ``trunk`` is then unchanged.
+    sees a single image, take each other's weights. ValueError if they are different networks; ``trunk`` is then unchanged.
     """
     inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
     if isinstance(trunk, AttentivePool) or "query" in state:  # a learned pooling starts anew
@@ -111,11 +96,8 @@ def _load_single(trunk: nn.Module, state: dict[str, Tensor]) -> None:
         own, other = expected.get(f"{name}.weight"), state.get(f"{name}.weight")
         if own is not None and other is not None and own.ndim == other.ndim == 4 and not other.shape[1] % 3:
             state[f"{name}.weight"] = adapt_stem(other, own.shape[1])
-    for name in sorted(expected.keys() ^ state.keys()):
-        raise ValueError(f"tensor {name!r} {'is missing' if name in expected else 'has no place in this trunk'}")
-    for name, value in expected.items():
-        if value.shape != state[name].shape:
-            raise ValueError(f"{name!r} is {tuple(state[name].shape)}, this trunk needs {tuple(value.shape)}")
+    if why := misfit(expected, state):
+        raise ValueError(why)
     trunk.load_state_dict(state)
 
 

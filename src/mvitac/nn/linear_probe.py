@@ -5,7 +5,6 @@ Shapes: B images, D features (a probe on both modalities reads vision, then touc
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +12,6 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import Target
 from mvitac.registry import LATER
-
-UNSEEN = -1e4  # logit of a class without training examples: probability 0 in fp32, and still finite in fp16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,27 +115,3 @@ class LinearProbe(nn.Module):
         """Probabilities [B, K] or values [B, T] of ``features`` [B, D]."""
         found = nn.functional.linear(features, self.weight, self.bias)
         return torch.softmax(found, dim=1) if isinstance(self.info, ProbeInfo) else found
-
-
-def from_logistic(info: ProbeInfo, model: Any, mean: np.ndarray, std: np.ndarray) -> LinearProbe:
-    """Convert a scikit-learn ``LogisticRegression`` fitted on (x - mean) / std; the scaling is folded into the weights."""
-    coef, intercept = np.asarray(model.coef_, float), np.asarray(model.intercept_, float)
-    if len(coef) == 1:  # with two classes scikit-learn has one logit, that of the second class
-        coef, intercept = np.concatenate([0 * coef, coef]), np.concatenate([0 * intercept, intercept])
-    num = len(info.classes)
-    weight, bias = np.zeros((num, coef.shape[1])), np.full(num, UNSEEN)
-    weight[model.classes_] = coef / std
-    bias[model.classes_] = intercept - (coef / std) @ mean
-    return LinearProbe(info, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())
-
-
-def constant(info: ProbeInfo, label: int, dim: int) -> LinearProbe:
-    """A probe that always predicts class ``label``, for training data with a single class."""
-    bias = torch.full((len(info.classes),), UNSEEN)
-    bias[label] = 0
-    return LinearProbe(info, torch.zeros(len(info.classes), dim), bias)
-
-
-def from_ridge(info: ValueInfo, weight: np.ndarray, bias: np.ndarray) -> LinearProbe:
-    """A probe of values with these weights [T, D] and biases [T]."""
-    return LinearProbe(info, torch.from_numpy(weight).float(), torch.from_numpy(bias).float())

@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 
 def momentum_at(progress: float, start: float, end: float | None) -> float:
@@ -35,13 +35,12 @@ class Momentum(nn.Module):
 
     def restart(self) -> None:
         """Copy the query module again, after other weights were loaded into it."""
-        self.follow(self._query[0], 0.0)
+        self.follow(0.0)
 
     @torch.no_grad()
-    def follow(self, query: nn.Module, m: float) -> None:
-        """Move all parameters and floating-point buffers towards ``query``'s. Copy integer buffers (counters)."""
-        mine: list[Tensor] = [*self.module.parameters(), *self.module.buffers()]
-        theirs: list[Tensor] = [*query.parameters(), *query.buffers()]
+    def follow(self, m: float) -> None:
+        """Move all parameters and floating-point buffers towards the query's. Copy integer buffers (counters)."""
+        mine, theirs = ([*module.parameters(), *module.buffers()] for module in (self.module, *self._query))
         floating = [(k, q) for k, q in zip(mine, theirs, strict=True) if k.is_floating_point()]
         torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage] - one call for all tensors
             [k for k, _ in floating], [q.detach() for _, q in floating], 1 - m

@@ -52,16 +52,10 @@ def safetensors_digest(tensors: dict[str, Tensor]) -> str:
     return total.hexdigest()
 
 
-def check_tensors(file: Path, expected: dict[str, Tensor], found: dict[str, Any]) -> None:
-    """Raise ValueError if the tensors ``found`` in ``file`` do not have the ``expected`` names and shapes."""
-    if why := misfit(expected, found):
-        raise ValueError(f"{file} holds other weights than its run describes: {why}")
-
-
 def misfit(expected: dict[str, Tensor], found: dict[str, Any]) -> str:
     """Say in which name or shape tensors differ from the ``expected`` ones; "" if in none."""
     for name in sorted(expected.keys() ^ found.keys()):
-        return f"tensor {name!r} {'is missing' if name in expected else 'does not belong'}"
+        return f"tensor {name!r} {'is missing' if name in expected else 'has no place in this network'}"
     for name, tensor in expected.items():
         if tensor.shape != found[name].shape:
             return f"{name!r} is {tuple(found[name].shape)}, expected {tuple(tensor.shape)}"

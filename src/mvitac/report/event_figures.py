@@ -17,8 +17,8 @@ def traces(title: str, event: dict[str, Any], hue: str) -> Figure:
 
     ``event`` is of ``evaluation.events.score_event``. Times in ms are drawn in seconds.
     """
-    figure = Figure(figsize=(WIDTH, 4.4), layout="constrained")
-    figure.suptitle(shorten(title, 44), color=colour("ink"), fontsize=10, fontweight="bold", x=0.02, ha="left")
+    figure = Figure(figsize=(WIDTH, 4.4))
+    figure.suptitle(shorten(title, 44), fontsize=10, fontweight="bold", x=0.02, ha="left")
     scale, unit = (1000, "s") if event["unit"] == "ms" else (1, event["unit"])
     onset: dict[str, Any] = {"marker": "v", "linestyle": "", "color": colour("ink"), "markersize": 6}
     alarm: dict[str, Any] = {"marker": "o", "linestyle": "", "color": colour("ink"), "markersize": 4.5}
@@ -36,13 +36,9 @@ def traces(title: str, event: dict[str, Any], hue: str) -> Figure:
             if trace["onset"] is not None:
                 axes.plot(trace["onset"] / scale, 1.0, clip_on=False, zorder=3, **onset)
         axes.axhline(event["threshold"], **line)
-        axes.set_ylim(0, 1)
-        axes.set_ylabel("with it" if with_it else "without it", color=colour("soft"), fontsize=9)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[["left", "bottom"]].set_color(colour("rule"))
-        axes.tick_params(colors=colour("soft"), length=0)
+        axes.set(ylim=(0, 1), ylabel="with it" if with_it else "without it")
         axes.xaxis.set_major_locator(MaxNLocator(5))
-    panels[1].set_xlabel(f"time, {unit}", color=colour("soft"), fontsize=9)
+    panels[1].set_xlabel(f"time, {unit}")
     handles = [Line2D([], [], **look) for look in (line, alarm, onset)]
     legend_below(figure, handles, ["threshold", "alarm", "onset or end"], 3)
     return figure

@@ -35,23 +35,35 @@ LEAST = -0.5  # where figures cut off R2, which has no lower limit
 WIDTH = 3.8  # inches. In the report's columns of about 360 px, 9 pt letters are then about 12 px high.
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # class names may contain a dollar sign
+    "text.color": colour("ink"),
     "font.size": 9,
     "svg.fonttype": "none",  # keep text as text, in the page's font
+    "figure.constrained_layout.use": True,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.labelcolor": colour("soft"),
+    "axes.edgecolor": colour("rule"),
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    **{f"{axis}tick.color": colour("soft") for axis in "xy"},
+    **{f"{axis}tick.major.size": 0 for axis in "xy"},
+    "grid.color": colour("rule"),
+    "grid.linewidth": 0.7,
     "legend.frameon": False,
+    "legend.fontsize": 9,
+    "legend.handlelength": 1.4,
+    "legend.handletextpad": 0.5,
+    "legend.columnspacing": 1.2,
 }
 
 
 def new_figure(title: str, height: float) -> tuple[Figure, Axes]:
     """Axes ``WIDTH`` wide."""
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(WIDTH, height))
     axes = figure.subplots()
-    axes.set_title(shorten(title, 40), color=colour("ink"))
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(colour("rule"))
-    axes.tick_params(colors=colour("soft"), length=0)
+    axes.set_title(shorten(title, 40))
     return figure, axes
 
 
@@ -62,8 +74,7 @@ def shorten(text: str, length: int) -> str:
 
 def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
     """Put a legend below the axes, where it hides nothing."""
-    options: dict[str, Any] = {"handlelength": 1.4, "columnspacing": 1.2, "fontsize": 9, "handletextpad": 0.5}
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, labelcolor=colour("ink"), **options)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
 @matplotlib.rc_context(STYLE)
@@ -96,9 +107,8 @@ def bars(
     axes.set_ylim(y - 0.6, -0.7)
     axes.set_xlim(100 * least, max(1.0, 100 * (top + 0.15 * (top - least))))
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.set_xlabel(what, color=colour("soft"), fontsize=9)
+    axes.grid(axis="x")
+    axes.set_xlabel(what)
     axes.spines["left"].set_visible(False)
     labels, handles = [], []
     for number, (name, value) in enumerate(lines.items()):
@@ -120,7 +130,7 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, l
     if low < high:
         axes.plot([low, high], [y, y], color=colour("ink"), linewidth=1.1, solid_capstyle="butt")
         axes.plot([low, high], [y, y], "|", color=colour("ink"), markersize=5, markeredgewidth=1.1)
-    look: dict[str, Any] = {"va": "center", "fontsize": 9, "color": colour("ink"), "textcoords": "offset points"}
+    look: dict[str, Any] = {"va": "center", "textcoords": "offset points"}
     look["fontweight"] = "normal" if source in CONTROL_GREYS else "bold"
     look["bbox"] = {"facecolor": colour("card"), "edgecolor": "none", "pad": 0.5}  # no line runs through the value
     axes.annotate(percent(cell["mean"]), (high, y), xytext=(5, 0), **look)
@@ -128,16 +138,12 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, l
 
 @dataclass(frozen=True)
 class Dot:
-    """A score, "accuracy" or "R2", of one source at one modality ("none" = a control without features), at most 1."""
+    """A score of one source at one modality ("none" = a control without features)."""
 
     source: str
     modality: str
-    mean: float
-    low: float
-    high: float
-    printed: float | None
     control: bool
-    score: str = "accuracy"
+    cell: Mapping[str, Any]  # mean, low, high, printed (may be None); "targets" if the score is R2
 
 
 @matplotlib.rc_context({**STYLE, "font.size": 10})
@@ -150,25 +156,22 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
     best: dict[tuple[bool, str], float] = {}
     for dot in dots:
         key = dot.control, dot.source
-        best[key] = max(best.get(key, -math.inf), dot.mean if dot in next(iter(panels.values())) else -math.inf)
+        best[key] = max(best.get(key, -math.inf), dot.cell["mean"] if dot in next(iter(panels.values())) else -math.inf)
     rows = [source for _, source in sorted(best, key=lambda key: (not key[0], best[key]))]  # from below
     names = [textwrap.fill(name, 40, max_lines=2, placeholder=" …") for name in rows]
-    size = (3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows))
-    figure = Figure(figsize=size, layout="constrained")
-    for axes, (task, panel) in zip(
-        figure.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels.items(), strict=True
-    ):
-        axes.set_title(task, color=colour("ink"))
+    figure = Figure(figsize=(3.4 + 3.2 * len(panels), 1.5 + 0.42 * len(rows)))
+    each = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (task, panel) in zip(each, panels.items(), strict=True):
+        axes.set_title(task)
         for dot in panel:
             _dot(axes, dot, rows)
-        axes.set_yticks(range(len(rows)), names)
+        axes.set_yticks(range(len(rows)), names, color=colour("ink"))
         axes.set_ylim(-0.7, len(rows) - 0.3)
         controls = sum(control for control, _ in best)
         axes.axhline(controls - 0.5, color=colour("soft"), linewidth=0.7)
-        axes.set_xlabel(f"{panel[0].score} %")
-        axes.grid(axis="x", color=colour("rule"), linewidth=0.7)
-        axes.tick_params(length=0)
-        axes.spines[["top", "right", "left"]].set_visible(False)
+        axes.set_xlabel(f"{'R2' if 'targets' in panel[0].cell else 'accuracy'} %")
+        axes.grid(axis="x")
+        axes.spines["left"].set_visible(False)
     entries = {t: h for axes in figure.axes for h, t in zip(*axes.get_legend_handles_labels(), strict=True)}
     order = [name for name in ("touch", "vision", "both", "printed", *ONE_ANSWER) if name in entries]
     legend_below(figure, [entries[name] for name in order], order, 5)
@@ -176,19 +179,20 @@ def comparison(panels: Mapping[str, Sequence[Dot]]) -> Figure:
 
 
 def _dot(axes: Axes, dot: Dot, rows: Sequence[str]) -> None:
+    mean, low = dot.cell["mean"], dot.cell["low"]
     if dot.modality == "none":
         if dot.source in ONE_ANSWER:
-            at = 100 * max(LEAST, dot.mean)
+            at = 100 * max(LEAST, mean)
             axes.axvline(at, color=colour("soft"), linewidth=1, linestyle=ONE_ANSWER[dot.source], label=dot.source)
         return
     hue = colour(MODALITY_HUES[dot.modality])
     y = rows.index(dot.source) + {"touch": 0.22, "vision": 0.0, "both": -0.22}[dot.modality]
-    if math.isfinite(dot.low):
-        axes.plot([100 * max(LEAST, v) for v in (dot.low, dot.high)], [y, y], color=hue, linewidth=1.6)
-    marker = "o" if dot.mean >= LEAST else "<"  # R2 may be lower than the axis goes
-    axes.plot(100 * max(LEAST, dot.mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
-    if dot.printed is not None:
-        axes.plot(100 * dot.printed, y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
+    if low is not None:
+        axes.plot([100 * max(LEAST, v) for v in (low, dot.cell["high"])], [y, y], color=hue, linewidth=1.6)
+    marker = "o" if mean >= LEAST else "<"  # R2 may be lower than the axis goes
+    axes.plot(100 * max(LEAST, mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
+    if dot.cell.get("printed") is not None:
+        axes.plot(100 * dot.cell["printed"], y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
 
 
 @dataclass(frozen=True)
@@ -219,13 +223,13 @@ def curves(title: str, lines: Sequence[Line], references: Mapping[str, float] | 
     for number, (name, value) in enumerate((references or {}).items()):
         look = {"color": colour("soft"), "linestyle": DASHES[1 + number % 3], "linewidth": 1.1}
         handles[name] = axes.axhline(value, zorder=0.9, **look)
-    axes.grid(axis="y", color=colour("rule"), linewidth=0.7)
+    axes.grid(axis="y")
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.margins(y=0.12)
     axes.set_xlim(0, 1.04 * max(max(line.x) for line in lines))
-    axes.set_xlabel("step", color=colour("soft"), fontsize=9)
+    axes.set_xlabel("step")
     labels = [shorten(label, 30) for label in handles]
     legend_below(figure, list(handles.values()), labels, 2 if max(map(len, labels)) > 18 else 3)
     return figure
@@ -249,7 +253,7 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
         axes.add_patch(Rectangle(box, 1 - 2 * gap, 1 - 2 * gap, facecolor=hue, alpha=alpha, edgecolor="none"))
         if num <= 8:
             percent = f"{100 * share:.0f} %" if num <= 4 else f"{100 * share:.0f}"
-            axes.text(guess, true, percent, ha="center", va="center", color=colour("ink"))
+            axes.text(guess, true, percent, ha="center", va="center")
     axes.set_xlim(-0.5, num - 0.5)
     axes.set_ylim(num - 0.5, -0.5)
     axes.set_aspect("equal")
@@ -262,8 +266,7 @@ def confusion(title: str, counts: np.ndarray, classes: Sequence[str]) -> Figure:
     else:
         axes.set_xticks([])
         axes.set_yticks([])
-    axes.set_xlabel("predicted", color=colour("soft"), fontsize=9)
-    axes.set_ylabel("true", color=colour("soft"), fontsize=9)
+    axes.set(xlabel="predicted", ylabel="true")
     return figure
 
 
@@ -289,8 +292,6 @@ def feature_map(title: str, points: np.ndarray, labels: np.ndarray, classes: Seq
     axes.set_xticks([])
     axes.set_yticks([])
     axes.spines[["top", "right"]].set_visible(True)
-    for spine in axes.spines.values():
-        spine.set_color(colour("rule"))
     if classes or len(shown) > 1:
         legend_below(figure, handles, names, columns)
     return figure
@@ -307,7 +308,7 @@ def _print(figure: Figure, canvas: type[FigureCanvasAgg | FigureCanvasSVG], face
         warnings.filterwarnings("ignore", "Glyph .* missing")  # class names in other scripts
         if (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)
-            figure.set_layout_engine(None)
+            figure.set_layout_engine("none")
         printed = canvas(figure)
         (printed.print_svg if isinstance(printed, FigureCanvasSVG) else printed.print_png)(buffer, **options)
     return buffer.getvalue()

@@ -31,15 +31,10 @@ CONTROL_GREYS = {"imagenet": "grey1", "untrained": "grey2", "pixels": "grey3", "
 
 def ramp(num: int) -> list[tuple[str, str]]:
     """``num`` colours from low to high (viridis), each for a light and a dark page, without the ends that vanish there."""
-    import matplotlib  # imported here: it is slow, and few pages need it
+    from matplotlib import colormaps, colors  # imported here: it is slow, and few pages need it
 
-    scale = matplotlib.colormaps["viridis"]
-    light, dark = (scale(np.linspace(*ends, num), bytes=True)[:, :3].tolist() for ends in ((0.0, 0.92), (0.15, 1.0)))
-    return [(_hex(a), _hex(b)) for a, b in zip(light, dark, strict=True)]
-
-
-def _hex(rgb: list[int]) -> str:
-    return "#" + "".join(f"{level:02x}" for level in rgb)
+    light, dark = (colormaps["viridis"](np.linspace(*ends, num)) for ends in ((0.0, 0.92), (0.15, 1.0)))
+    return [(colors.to_hex(a), colors.to_hex(b)) for a, b in zip(light, dark, strict=True)]
 
 
 def colour(name: str) -> str:

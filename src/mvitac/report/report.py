@@ -27,8 +27,9 @@ from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
 from mvitac.run import load_run, precision_of
 from mvitac.system.console import Console
-from mvitac.system.files import parse_json, read_json, write_atomic
+from mvitac.system.files import read_json, write_atomic
 from mvitac.system.progress import duration, shown, work
+from mvitac.training.log import read_log, seconds_of
 
 
 def write_report(
@@ -83,20 +84,9 @@ def open_runs(paths: Sequence[Path]) -> list[Finished]:
         if not (path / "model.safetensors").exists():
             again = shlex.join(["mvitac", "pretrain", "--from", str(path / "run.json"), "--resume", "--out", str(path)])
             raise ValueError(f"the run in {path} is not finished: continue it with `{again}`")
-    opened = [(path, *load_run(path), read_log(path / "log.jsonl"), load(path)) for path in paths]
+    opened = [(path, *load_run(path), read_log(path), load(path)) for path in paths]
     names = names_of([path for path, *_ in opened], [model for *_, model in opened])
     return [Finished(*each, name) for each, name in zip(opened, names, strict=True)]
-
-
-def read_log(path: Path) -> list[dict[str, Any]]:
-    """Entries of a log.jsonl. A missing file is an empty log; an incomplete line ends it."""
-    lines = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            lines.append(parse_json(line))
-        except ValueError:
-            break
-    return lines
 
 
 def _events(run: Path, tasks: Sequence[str]) -> ProbeConfig:
@@ -266,23 +256,11 @@ def _plain(value: Any) -> str:
     return ", ".join(_plain(v) for v in value) if isinstance(value, list) else str(value)
 
 
-def wall_seconds(run: Finished) -> float | None:
-    """Seconds of training from the logged speeds (steps x batch size / pairs per second); None without a usable log."""
-    seconds, before = 0.0, 0
-    for entry in run.log:
-        if "loss" in entry:
-            if not entry["pairs_per_s"] > 0:
-                return None
-            seconds += (entry["step"] - before) * run.run.batch_size / entry["pairs_per_s"]
-            before = entry["step"]
-    return seconds or None
-
-
 def _cost(study: Study) -> str:
     rows: dict[str, list[str]] = {}
     for r in study.runs:
         lines = [entry for entry in r.log if "loss" in entry]
-        steps, seconds = lines[-1]["step"] if lines else 0, wall_seconds(r)
+        steps, seconds = lines[-1]["step"] if lines else 0, seconds_of(r.log, r.run.batch_size)
         trunks = sum(p.numel() for p in r.model.encoders.parameters())
         heads = sum(p.numel() for p in r.model.projectors.parameters())
         known: dict[str, str] = {

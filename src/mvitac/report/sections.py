@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
 from mvitac.evaluation.intervals import interval
-from mvitac.evaluation.retrieval import MIN_GALLERY
+from mvitac.evaluation.retrieval import MIN_GALLERY, retrieved_rows
 from mvitac.evaluation.score_text import columns_of, sources_of
 from mvitac.model import Model
 from mvitac.report import figures, html, tables
@@ -55,10 +55,8 @@ class Study:
 
     def rows(self) -> tuple[str, np.ndarray]:
         """The split to show and its rows: test, as scored by the first task and by retrieval, else another."""
-        only = self.pack.spec.tasks[0].only if self.pack.spec.tasks else None
         for split in ("test", "val", "train", "unlabelled"):
-            rows = self.pack.rows(split, only=only, having=self.pack.spec.modalities)
-            if len(rows):
+            if len(rows := retrieved_rows(self.pack, split)):
                 return split, rows
         raise ValueError(f"no rows to show in {self.pack.path}: give a pack with samples")
 

@@ -52,15 +52,13 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         seeds = max((len(v["seeds"]) for m in task.values() for v in m.values()), default=0)
         about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
         title = f"{result['data']}: {name} ({about})"
-        table = _table(title, f"{score} %", *modalities)
-        for source in sources_of(task):
-            # LEAK on a line of its own, else the table is too wide.
-            table.add_row(source, *(cell_text(task, source, m).replace(" LEAK", "\nLEAK") for m in modalities))
-        console.print(table)
+        # LEAK on a line of its own, else the table is too wide.
+        cells = [[s, *(cell_text(task, s, m).replace(" LEAK", "\nLEAK") for m in modalities)] for s in sources_of(task)]
+        console.print(_table(title, [f"{score} %", *modalities], cells))
         if score == "R2":
             console.print(_targets(name, task))
         if events := event_rows(task):
-            console.print(_filled(event_title(name, task), EVENT, events))
+            console.print(_table(event_title(name, task), EVENT, events, words=2))
     console.print(f"95 % intervals: {covered(result['group_by'], trained)}.", style="dim")
     for note in result.get("notes", ()):
         console.print(f"note: {note}", markup=False, highlight=False)
@@ -70,7 +68,7 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
 
 def _targets(name: str, task: dict[str, Any]) -> Table:
     """R2 in percent and mean absolute error of each target."""
-    table = _table(f"{name}: R2 % and mean absolute error", "", *columns_of(task))
+    table = _table(f"{name}: R2 % and mean absolute error", ["", *columns_of(task)])
     rows = target_rows(task)
     above = "" if len({target for target, _, _ in rows}) > 1 else rows[0][0]  # the only target needs no row of its own
     for target, source, cells in rows:
@@ -118,21 +116,20 @@ def print_retrieval(result: dict[str, Any], console: Console) -> None:
         return
     unseen = unseen_groups(result["group_by"], result["retrieval"])
     columns = ("", "query -> found", *(f"{column} %" for column in RETRIEVAL))
-    console.print(_filled(f"retrieval over {unseen}", columns, retrieval_rows(result["retrieval"])))
+    console.print(_table(f"retrieval over {unseen}", columns, retrieval_rows(result["retrieval"]), words=2))
 
 
 def print_sensors(result: dict[str, Any], console: Console) -> None:
     """Print which touch sensors are new, which statistics were used, and what features tell of the sensor, if known."""
     for line in result.get("statistics", ()):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    if not result.get("sensors"):
-        return
-    table = Table("", "", "%", "chance %", title="touch sensors", title_justify="left", title_style="bold")
-    for source, name in dict.fromkeys((r["source"], r["name"]) for r in result["sensors"]):
+    rows = []
+    for source, name in dict.fromkeys((r["source"], r["name"]) for r in result.get("sensors", ())):
         found = [r for r in result["sensors"] if (r["source"], r["name"]) == (source, name)]
         shown = [percent(sum(r[key] for r in found) / len(found)) for key in ("score", "chance")]
-        table.add_row(source, "R@5: " * (name != "which sensor") + name, *shown)
-    console.print(table)
+        rows.append([source, "R@5: " * (name != "which sensor") + name, *shown])
+    if rows:
+        console.print(_table("touch sensors", ["", "", "%", "chance %"], rows, words=2))
 
 
 def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
@@ -169,9 +166,9 @@ def print_finetuning(result: dict[str, Any], console: Console) -> None:
     for task, cells in tasks.items():
         (_, ours), *others = cells.items()
         score = "R2" if "r2" in next(iter(ours.values()))[0] else "accuracy"
-        table = _table(f"{result['data']}: {task}", f"{score} %", *(f"{f:g} % of {result['group_by']}s" for f in ours))
-        for source, found in cells.items():
-            table.add_row(source, *map(_score_text, found.values()))
+        columns = [f"{score} %", *(f"{f:g} % of {result['group_by']}s" for f in ours)]
+        rows = [[source, *map(_score_text, found.values())] for source, found in cells.items()]
+        table = _table(f"{result['data']}: {task}", columns, rows)
         table.add_section()
         for source, found in others:
             table.add_row(f"gain over {source}", *(_gain_text(ours[f], found[f]) for f in ours))
@@ -191,28 +188,19 @@ def print_adaptation(result: dict[str, Any], console: Console) -> None:
     for record in result["records"]:
         found.setdefault(record["data"], {}).setdefault(f"{record['task']}, {record['modality']}", []).append(record)
     for name, rows in found.items():
-        table = _table(f"{name}: test {result['group_by']}s", "score %", "before", "after", "change")
-        for what, (before, after) in rows.items():
-            table.add_row(what, _score_text([before]), _score_text([after]), _gain_text([after], [before]))
-        console.print(table)
+        cells = [[w, _score_text([a]), _score_text([b]), _gain_text([b], [a])] for w, (a, b) in rows.items()]
+        console.print(_table(f"{name}: test {result['group_by']}s", ["score %", "before", "after", "change"], cells))
     if not found:
         console.print("nothing to score: the data has no labels and no shared space of two modalities")
     about = f"95 % intervals: over test {result['group_by']}s only, for this one run; R2 of values, else accuracy."
     console.print(about, style="dim")
 
 
-def _table(title: str, first: str, *columns: str) -> Table:
-    table = Table(first, title=title, title_justify="left", title_style="bold")
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
-    return table
-
-
-def _filled(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A table whose columns from the third on are numbers."""
-    table = Table(*columns[:2], title=title, title_justify="left", title_style="bold")
-    for column in columns[2:]:
-        table.add_column(column, justify="right")
+def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]] = (), words: int = 1) -> Table:
+    """A table whose first columns are ``words`` and the others numbers, which wrap only beside two columns of words."""
+    table = Table(*columns[:words], title=title, title_justify="left", title_style="bold")
+    for column in columns[words:]:
+        table.add_column(column, justify="right", no_wrap=words == 1)
     for row in rows:
         table.add_row(*row)
     return table

@@ -26,15 +26,10 @@ def predicted(title: str, points: Sequence[Sequence[float]], unit: str, hue: str
     limits = low - margin, high + margin
     axes.plot(limits, limits, color=colour("soft"), linewidth=1.1, linestyle=DASHES[1], zorder=0.9)
     axes.scatter(true, np.clip(guess, *limits), s=11, alpha=0.6, linewidths=0, color=colour(hue))
-    axes.set_xlim(*limits)
-    axes.set_ylim(*limits)
-    axes.set_aspect("equal")
+    axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel=f"true, {unit}", ylabel=f"predicted, {unit}")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5))
-    axes.grid(color=colour("rule"), linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.set_xlabel(f"true, {unit}", color=colour("soft"), fontsize=9)
-    axes.set_ylabel(f"predicted, {unit}", color=colour("soft"), fontsize=9)
+    axes.grid()
     exact = Line2D([], [], color=colour("soft"), linestyle=DASHES[1], linewidth=1.1)
     legend_below(figure, [exact], ["exact"], 1)
     return figure
@@ -61,10 +56,8 @@ def error_ranges(title: str, ranges: Mapping[str, Sequence[Mapping[str, Any]]], 
     axes.margins(y=0.12)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.grid(axis="y", color=colour("rule"), linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.set_xlabel(f"true, {unit}", color=colour("soft"), fontsize=9)
-    axes.set_ylabel(f"mean absolute error, {unit}", color=colour("soft"), fontsize=9)
+    axes.grid(axis="y")
+    axes.set(xlabel=f"true, {unit}", ylabel=f"mean absolute error, {unit}")
     legend_below(figure, list(handles.values()), list(handles), 3)
     return figure
 
@@ -88,7 +81,7 @@ def over_time(predictions: Iterable[Mapping[str, Any]]) -> Figure:
         raise ValueError(
             "these predictions have no values to draw: no touch was seen, or the model predicts classes only"
         )
-    figure = Figure(figsize=(7, 0.8 + 1.7 * len(panels)), layout="constrained")
+    figure = Figure(figsize=(7, 0.8 + 1.7 * len(panels)))
     hue = colour(MODALITY_HUES["touch"])
     each = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, ((_, label), touches) in zip(each, panels.items(), strict=True):
@@ -96,11 +89,7 @@ def over_time(predictions: Iterable[Mapping[str, Any]]) -> Figure:
             times, values, spreads = np.array(points, float).T
             axes.fill_between(times, values - spreads, values + spreads, color=hue, alpha=0.2, linewidth=0)
             axes.plot(times, values, color=hue, linewidth=1.4, marker="o" if len(times) == 1 else None, markersize=3)
-        axes.set_ylabel(shorten(label, 28), color=colour("ink"), fontsize=9)
-        axes.grid(axis="y", color=colour("rule"), linewidth=0.7)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[["left", "bottom"]].set_color(colour("rule"))
-        axes.tick_params(colors=colour("soft"), length=0)
-    each[-1].set_xlabel("time, s", color=colour("soft"), fontsize=9)
+        axes.set_ylabel(shorten(label, 28), color=colour("ink"))
+        axes.grid(axis="y")
+    each[-1].set_xlabel("time, s")
     return figure

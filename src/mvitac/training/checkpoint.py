@@ -82,13 +82,8 @@ def restore(
 ) -> int:
     """Load the checkpoint in the run's folder ``out`` into ``method`` and ``optimiser``, and what it kept into ``kept``.
 
-    If it is damaged, it is deleted and the one before it is used, with a message on stderr.
-
-    Returns:
-        The number of steps that are done; 0 without a checkpoint.
-
-    Raises:
-        ValueError: If the checkpoint and the one before it are damaged, or belong to another run.
+    If it is damaged, it is deleted and the one before it is used, with a message on stderr. Returns the number of steps
+    that are done, 0 without a checkpoint; ValueError if both are damaged, or belong to another run.
     """
     found = [path for path in (out / CHECKPOINT, out / PREVIOUS) if path.exists()]
     damage: Damaged | None = None

@@ -7,16 +7,16 @@ from torch import nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.evaluation.classifiers import fit_linear
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.regressors import fit_ridge
-from mvitac.methods.supervised import Supervised, ValueHead
+from mvitac.methods.base import Method
+from mvitac.methods.supervised import ValueHead
 from mvitac.model import Model
-from mvitac.nn.linear_probe import ProbeInfo, from_logistic
 from mvitac.run import Run
 
 
 @torch.no_grad()
-def fit_heads(method: Supervised, run: Run, pack: Pack, rows: np.ndarray) -> None:
+def fit_heads(method: Method, run: Run, pack: Pack, rows: np.ndarray) -> None:
     """Set each head of ``method`` to a linear probe fitted on features of ``rows``, as the head sees them.
 
     C or alpha is chosen on the groups of split val among ``rows``, or on a fifth of their groups. A task with labels of one
@@ -50,15 +50,13 @@ def _fit_head(head: nn.Module, x: np.ndarray, pack: Pack, task: AnyTask, rows: n
         if len(set(y[:num])) < 2:
             return
         chosen_on = slice(num, None) if num_val else slice(None)
-        fitted, _ = fit_linear(x[:num], y[:num], x[chosen_on], y[chosen_on])
-        about = ProbeInfo(task=task.name, modality="both", classes=task.classes, accuracy=0, majority=0, num_test=0)
-        probe = from_logistic(about, fitted.model, fitted.mean, fitted.std)
-        weight, bias = probe.weight, probe.bias
+        fitted, _ = fit_linear(x[:num], y[:num], x[chosen_on], y[chosen_on], len(task.classes))
     else:
-        assert isinstance(head, ValueHead)
-        weights, biases = fit_ridge(x, pack.values(task)[rows], num_val)[0].weights()
+        fitted, _ = fit_ridge(x, pack.values(task)[rows], num_val)
+    weight, bias = map(torch.from_numpy, fitted.weights())
+    if isinstance(head, ValueHead):
         mean, std = head.mean.cpu(), head.std.cpu()
-        weight, bias = torch.from_numpy(weights) / std[:, None], (torch.from_numpy(biases) - mean) / std
+        weight, bias = weight / std[:, None], (bias - mean) / std
         head = head.layers
     assert isinstance(head, nn.Linear)
     head.weight.copy_(weight)

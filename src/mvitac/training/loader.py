@@ -3,9 +3,9 @@
 Shapes: images are uint8 [N, H, W, C] in the pack and are returned as [B, C, H, W] (channels-last).
 """
 
-import queue
-import threading
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
@@ -74,36 +74,12 @@ def ahead(batches: Iterator[Views], device: torch.device) -> Iterator[Views]:
 
 def prefetch(items: Iterator[T], depth: int = 2) -> Iterator[T]:
     """Prepare up to ``depth`` of the next ``items`` in a thread. Errors are raised in place of the item."""
-    made: queue.Queue[tuple[bool, T | BaseException | None]] = queue.Queue(depth)
-    stop = threading.Event()
-
-    def put(entry: tuple[bool, T | BaseException | None]) -> None:
-        while not stop.is_set():
-            try:
-                return made.put(entry, timeout=0.1)
-            except queue.Full:
-                continue
-
-    def work() -> None:
+    end: Any = object()
+    with ThreadPoolExecutor(1, "prefetch") as thread:
+        coming = deque(thread.submit(next, items, end) for _ in range(depth))
         try:
-            for item in items:
-                put((True, item))
-                if stop.is_set():
-                    return
-            put((False, None))
-        except BaseException as error:
-            put((False, error))
-
-    thread = threading.Thread(target=work, name="prefetch", daemon=True)
-    thread.start()
-    try:
-        while True:
-            more, item = made.get()
-            if not more:
-                if item is not None:
-                    raise item  # type: ignore[misc]
-                return
-            yield item  # type: ignore[misc]
-    finally:
-        stop.set()
-        thread.join()
+            while (item := coming.popleft().result()) is not end:
+                coming.append(thread.submit(next, items, end))
+                yield item
+        finally:
+            thread.shutdown(cancel_futures=True)

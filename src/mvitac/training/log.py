@@ -3,7 +3,7 @@
 import importlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,21 +26,12 @@ class Log:
     def __init__(
         self, out: Path, start: int, num_steps: int, batch_size: int, *, quiet: bool, loggers: tuple[Logger, ...]
     ) -> None:
-        path = out / "log.jsonl"
-        kept, self.first = [], {}
-        if path.exists() and start:  # a run that starts again writes all lines again
-            for line in path.read_text(errors="replace").splitlines():
-                try:
-                    entry = parse_json(line)
-                    early = entry["step"] <= start
-                except (ValueError, TypeError, KeyError):
-                    break  # an incomplete line, written when the run was killed
-                if early:
-                    kept.append(line + "\n")
-                    if entry["step"] == 0:
-                        self.first = entry.get("eval", {})
-        write_atomic(path, lambda file: file.write("".join(kept).encode()))
-        self.path, self.file = path, path.open("a")
+        self.path = out / "log.jsonl"
+        kept = [entry for entry in read_log(out) if entry["step"] <= start] if start else []
+        self.first = next((entry["eval"] for entry in kept if entry["step"] == 0 and "eval" in entry), {})
+        text = "".join(json.dumps(entry) + "\n" for entry in kept)
+        write_atomic(self.path, lambda file: file.write(text.encode()))
+        self.file = self.path.open("a")
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
         self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, batch_size, quiet, ExitStack()
 
@@ -101,6 +92,27 @@ class Log:
         flat = {k: v for k, v in {**entry, **entry.get("eval", {})}.items() if isinstance(v, float)}
         for logger in self.loggers:
             logger(entry["step"], flat)
+
+
+def read_log(run: Path) -> list[dict[str, Any]]:
+    """Entries of the log.jsonl in a run's folder. An incomplete line, written when the run was killed, ends them."""
+    path, entries = run / "log.jsonl", []
+    for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
+        try:
+            entries.append(parse_json(line))
+        except ValueError:
+            break
+    return entries
+
+
+def seconds_of(entries: Iterable[dict[str, Any]], batch_size: int) -> float:
+    """Seconds of training by the speeds in a log, over all resumptions. Steps lost to a kill are not counted."""
+    total, before = 0.0, 0
+    for entry in entries:
+        if entry.get("pairs_per_s"):
+            total += (entry["step"] - before) * batch_size / entry["pairs_per_s"]
+            before = entry["step"]
+    return total
 
 
 def last_line(run: Path) -> dict[str, Any]:

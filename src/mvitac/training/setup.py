@@ -3,12 +3,12 @@
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch.optim.swa_utils import update_bn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
@@ -17,10 +17,8 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
-from mvitac.methods.supervised import Supervised, SupervisedConfig
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.nn.finetuning import renew_norms
 from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.nn.momentum import Momentum
 from mvitac.registry import to_json
@@ -31,7 +29,6 @@ from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.heads import fit_heads
 from mvitac.training.sampler import check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
@@ -223,12 +220,13 @@ def _before_first_step(setup: Setup) -> None:
         if setup.world.size > 1:
             raise ValueError("renew_norms works on one process only: leave it out, or start without torchrun")
         steps = setup.chunks(0, run.renew_norms)
-        renew_norms(method.train(), (partial(method, chunk()) for chunks in steps for chunk in chunks))
+        update_bn((chunk() for chunks in steps for chunk in chunks), method)
         for module in method.modules():
             if isinstance(module, Momentum):
                 module.restart()
-    if isinstance(run.method, SupervisedConfig) and run.method.heads_from == "probe":
-        assert isinstance(method, Supervised)
+    if run.method.heads_from_probes:
+        from mvitac.training.heads import fit_heads  # few runs need scikit-learn
+
         fit_heads(method, run, setup.pack, setup.rows)
 
 

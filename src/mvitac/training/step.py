@@ -24,16 +24,10 @@ Chunk = Callable[[], Views]
 
 
 class Step:
-    """Takes one optimiser step when called.
-
-    Args:
-        run: Settings of the optimiser, precision, chunks, recomputation and compilation.
-        method: The method to train, on ``device``.
-        device: Device of the method.
-        world: The processes that train together. Default: this one only.
+    """Takes one optimiser step of ``method``, which is on ``device``, when called.
 
     Raises:
-        ValueError: If the method or the trunk does not support these settings.
+        ValueError: If the method or the trunk does not support the settings of ``run``.
     """
 
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
@@ -53,16 +47,10 @@ class Step:
         self.forward = torch.compile(method, fullgraph=True) if run.compile else method
 
     def __call__(self, chunks: Sequence[Chunk], *, lr: float, seed: int, progress: float) -> dict[str, Tensor]:
-        """Take one step.
+        """Take one step on the ``chunks`` that this process embeds; returns the losses, detached, on the device.
 
-        Args:
-            chunks: The chunks of the batch that this process embeds.
-            lr: Learning rate.
-            seed: Random seed of dropout and of random draws in losses.
-            progress: Share of the run that is done after this step, from 0 to 1.
-
-        Returns:
-            The losses, detached, on the device.
+        ``seed`` is that of dropout and of random draws in losses. ``progress`` is the share of the run that is done after
+        this step, from 0 to 1.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group.get("lr_scale", 1.0)

@@ -16,7 +16,7 @@ from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.evaluation import diagnostics
-from mvitac.evaluation.features import pack_features
+from mvitac.evaluation.pack_features import pack_features
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import BEST
@@ -67,18 +67,13 @@ class Validation:
         return text
 
 
-def evaluate(model: Model, pack: Pack, run: Run) -> dict[str, float]:
-    """Scores on held-out groups (split val, never test). Only rows with both modalities are used.
-
-    Without rows of val that are not trained on, the scores are computed on training rows, and there are no probes.
-    Returns name -> value, e.g. "touch/linear category", "touch/knn category", "vision/rankme", "vision->touch R@5". Of
-    a mix, the scores of each part, named "<part> <name>".
-    """
-    return validate(model, pack, run)[0]
-
-
 def validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cells]:
-    """Scores as of ``evaluate``, and the linear probes' errors by group, to compare two evaluations of one pack."""
+    """Scores on held-out groups (split val, never test), and the linear probes' errors by group, to compare evaluations.
+
+    Only rows with both modalities are used. Without rows of val that are not trained on, the scores are computed on
+    training rows, and there are no probes. Scores are by name, e.g. "touch/linear category", "touch/knn category",
+    "vision/rankme", "vision->touch R@5"; of a mix, those of each part, named "<part> <name>".
+    """
     if not isinstance(pack, MixedPack):
         return _validate(model, pack, run)
     values: dict[str, float] = {}
