@@ -28,14 +28,9 @@ import numpy as np
 
 from mvitac.sim import camera, gel, objects, physics, skin
 from mvitac.sim.contact import contact
-from mvitac.sim.objects import object_name
-from mvitac.sim.physics import PHASES
-
-__all__ = ["NUM_GRASPS", "NUM_OBJECTS", "PHASES", "VERSION", "grasp", "object_name"]
 
 VERSION = 2
 NUM_OBJECTS = 106
-NUM_GRASPS = 50  # grasps per object as in the original; larger indices are allowed
 
 FIELD_MM = 22.0  # width of a gel's field of view
 
@@ -82,14 +77,12 @@ def grasp(
     *,
     size: int,
     held_out_sensor: bool = False,
-    phases: tuple[str, ...] = PHASES,
     measured: bool = False,
 ) -> list[dict[str, Any]]:
     """Simulate grasp number ``index`` of object number ``obj``.
 
     Args:
         held_out_sensor: Use the sensor that is not used otherwise.
-        phases: Phases to render; fewer are faster.
         measured: Also return what physics knows of the contact of each gel: ``contact.KNOWN`` and the shear force in N,
             right and down in the gel's picture, with names such as ``depth_left_mm`` and ``shear_x_right_n``.
 
@@ -105,15 +98,13 @@ def grasp(
         raise ValueError(f"obj must be in 0..{NUM_OBJECTS - 1}, got {obj}")
     if index < 0 or seed < 0:
         raise ValueError(f"seed and index must be 0 or larger, got seed {seed} and index {index}")
-    if unknown := set(phases) - set(PHASES):
-        raise ValueError(f"phases must be among {PHASES}, got {sorted(unknown)}")
     if not 16 <= size <= 1024:
         raise ValueError(f"size must be in 16..1024 pixels, got {size}")
     bench = _bench(seed, obj)
     rng = np.random.default_rng([_PLAN, seed, obj, index])
     patch = skin.draw_patch(rng)
-    plan, what = draw_plan(bench.thing, patch, rng), {"phases": phases, "measured": measured}
-    return _record(bench, patch, plan, (seed, obj, index), size=size, held_out_sensor=held_out_sensor, **what)
+    plan, which = draw_plan(bench.thing, patch, rng), {"held_out_sensor": held_out_sensor, "measured": measured}
+    return _record(bench, patch, plan, (seed, obj, index), size=size, **which)
 
 
 @lru_cache(maxsize=4)
@@ -129,8 +120,7 @@ def _record(
     *,
     size: int,
     held_out_sensor: bool,
-    phases: tuple[str, ...],
-    measured: bool = False,
+    measured: bool,
 ) -> list[dict[str, Any]]:
     """Simulate a plan and render it; ``key`` is (seed, object, grasp), which determines view and sensor."""
     thing = bench.thing
@@ -138,11 +128,8 @@ def _record(
     gels = _draw_gels(np.random.default_rng([_TOUCH, *key]), held_out_sensor)
     known = {"object": thing.name, "sensor": gels.sensor.name, **_latents(thing, patch, plan)}
     rows = []
-    moment = None
+    outcome: dict[str, float] = {}
     for order, moment in enumerate(bench.moments(plan), 1):
-        if moment.phase not in phases:
-            continue
-        # One noise stream per phase, so that leaving one out does not change the others.
         touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
         row: dict[str, Any] = {"phase": moment.phase, **known}
         for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
@@ -153,9 +140,8 @@ def _record(
             row |= {side_name(known_as, name): value for known_as, value in contacts.items()}
         row["vision"] = camera.photograph(bench.model, moment.data, thing, view, view_rng, size=size)
         rows.append(row)
-    assert moment is not None, "there are three phases"
-    outcome = {"success": moment.success, "lift_mm": 1000 * moment.rise_m, "unstable": float(moment.unstable)}
-    return [{**row, **outcome} for row in rows]
+        outcome = {"success": moment.success, "lift_mm": 1000 * moment.rise_m, "unstable": float(moment.unstable)}
+    return [{**row, **outcome} for row in rows]  # the outcome of the last moment
 
 
 @dataclass(frozen=True)
@@ -186,7 +172,7 @@ def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dic
     low, high = thing.bounds
     grip = (low + high) / 2 + plan.offset_m
     return {
-        "mass_kg": thing.mass * plan.mass_scale,
+        "mass_kg": thing.mass,
         "friction": plan.friction,
         "force_n": plan.force_n,
         "offset_mm": 1000 * float(grip[1] - thing.center_of_mass[1]),

@@ -84,8 +84,7 @@ class Part:
 class Thing:
     """An object; it is the same in all its grasps."""
 
-    name: str
-    kind: str
+    name: str  # shape kind and number, such as box_010
     parts: tuple[Part, ...]
     finish: Finish
     density: float  # kilograms per cubic metre (objects are mostly hollow)
@@ -119,12 +118,6 @@ class Thing:
         center = np.array([part.center for part in self.parts])
         half = np.array([part.half() for part in self.parts])
         return (center - half).min(0), (center + half).max(0)
-
-
-def object_name(seed: int, index: int) -> str:
-    """Return the name of an object (shape kind and index), e.g. ``box_010``. It does not depend on the seed."""
-    del seed
-    return f"{KINDS[index % len(KINDS)]}_{index:03d}"
 
 
 def _mm(rng: np.random.Generator, *ranges: tuple[float, float]) -> list[float]:
@@ -207,12 +200,10 @@ def make_thing(seed: int, index: int) -> Thing:
     rng = np.random.default_rng([OBJECT_TAG, seed, index])
     kind = KINDS[index % len(KINDS)]
     parts = _DRAW[kind](rng)
-    finish = draw_finish(rng)
     return Thing(
-        name=object_name(seed, index),
-        kind=kind,
+        name=f"{kind}_{index:03d}",
         parts=parts,
-        finish=finish,
+        finish=draw_finish(rng),
         density=rng.uniform(*MASS_KG) / sum(part.volume() * part.density for part in parts),
         softness=float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.0)])),
     )
