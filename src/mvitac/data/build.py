@@ -2,7 +2,7 @@
 
 ``build`` writes to ``<pack>.partial`` (see ``data/partial_pack.py``). A killed build resumes there and gives the same
 bytes. The finished folder is renamed, so a folder with a pack.json is a complete pack. If several processes want the same
-pack, one builds it and the others wait. This module does not import torch.
+pack, one builds it and the others wait.
 """
 
 import contextlib

@@ -1,7 +1,4 @@
-"""Two packs as one: train probes on the first and test them on the second (another sensor, room or robot).
-
-This module does not import torch.
-"""
+"""Two packs as one: train probes on the first and test them on the second (another sensor, room or robot)."""
 
 from dataclasses import replace
 

@@ -2,7 +2,6 @@
 
 One file holds the JPEGs of all rows, one after another; the pack's table has the length of each. Stacked sensors are
 placed below each other in one JPEG of three channels. A black image, which also represents a missing one, has length 0.
-This module does not import torch.
 """
 
 import functools

@@ -1,7 +1,4 @@
-"""Several packs as one: other datasets, sensors, image sizes and missing modalities. Images are not copied.
-
-This module does not import torch.
-"""
+"""Several packs as one: other datasets, sensors, image sizes and missing modalities. Images are not copied."""
 
 import copy
 import functools

@@ -1,4 +1,4 @@
-"""What every reader of a pack's table relies on, checked. This module does not import torch."""
+"""What every reader of a pack's table relies on, checked."""
 
 from typing import Any
 

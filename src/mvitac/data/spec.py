@@ -1,4 +1,4 @@
-"""Description of a dataset: modalities, tasks, groups, owner. Packing workers import it, so it does not import torch."""
+"""Description of a dataset: modalities, tasks, groups, owner."""
 
 import math
 from collections.abc import Sequence

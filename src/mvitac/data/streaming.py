@@ -6,7 +6,7 @@
           shard-00000.touch.npy     ...
 
 Touch groups are in random order and each in one shard (if it fits), so any few shards are a random sample
-(``data/sharding.py`` writes them). A ``StreamedPack`` has the interface of ``Pack``. This module does not import torch.
+(``data/sharding.py`` writes them). A ``StreamedPack`` has the interface of ``Pack``.
 """
 
 import functools

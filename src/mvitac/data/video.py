@@ -2,7 +2,7 @@
 
 Frame i is the i-th in display order, from 0. Its position is read from the container's packet table, not computed from a
 nominal frame rate. The decoder starts at the last key frame before a run of wanted frames and skips the packets between
-runs, so a few touches in an hour of video are cheap. Packing workers import this module, so it does not import torch.
+runs, so a few touches in an hour of video are cheap.
 """
 
 import contextlib

@@ -1,7 +1,7 @@
 """Windows: a row that shows several frames of its touch, the current one and earlier ones, stacked on channels.
 
 A pack stores every frame once. ``windowed`` opens it so that ``pack.images`` gives windows, found by index when they are
-read. A window never crosses the edge of a touch (column touch_group, else group). This module does not import torch.
+read. A window never crosses the edge of a touch (column touch_group, else group).
 """
 
 import copy

@@ -4,17 +4,10 @@
 
 The format is that of "The Feeling of Success" (Calandra et al., CoRL 2017): about 106 objects with 50 grasps each, one
 camera picture and two tactile pictures before the fingers close, during the grip (closed, not lifted) and after the lift.
-Results are not comparable with those on real data. 'after' shows the outcome and 'before' shows no contact, so probes use
-'during'. Split by object, never by grasp.
 
 The outcome is computed by physics and has two factors: the distance of the grip from the centre of mass (camera), and
-whether the skin under the fingers grips or slides (gels: `mvitac.sim.skin.Patch`). Size and brightness of the imprint carry
-no information, because the hand knows the weight and presses as hard as a medium friction needs. Shape, mass, sensor copy,
-lamp, colours, table, wall, clutter and viewpoint are random.
-
-The generator was designed by one rule: on unseen objects, with touch and vision, a supervised model is at least 20 points
-above an untrained trunk and below 97 % (docs/simulator.md). It is frozen: every change of a picture or label increases
-VERSION.
+whether the skin under the fingers grips or slides (gels: `mvitac.sim.skin.Patch`). What else is random, and by which rule
+the generator was designed, is in docs/simulator.md. It is frozen: every change of a picture or label increases VERSION.
 
 Every item is a function of (seed, object, grasp).
 """

@@ -3,8 +3,7 @@
 A class gives ranges; an instance is one object with its own relief, colour and physics; a touch is one press of it with its
 own pose, force, sensor, lamp and background. Split by instance.
 
-The generator was designed by one rule (benchmarks/difficulty.py): on every task, a supervised reference is far above an
-untrained trunk, and below 97 %. Therefore:
+The generator was designed by one rule (docs/simulator.md). Therefore:
 - "soft" is a threshold on the instance's stiffness, not on its class. Soft objects fold along curves and have lumpy outlines
   and rolled edges; hard ones crack along straight lines and have corners. Number and size of marks carry no information.
 - "rough" is the sign of the height skewness: raised peaks or sunk pits. Pictures of both have the same spectrum.
