@@ -69,7 +69,7 @@ def test_every_kind_of_thing_rests_still_before_the_grip():
     for index in range(2 * len(objects.KINDS)):
         bench = physics.Bench(objects.make_thing(1, index))
         before = next(bench.moments(plan()))
-        assert np.abs(before.data.qvel).max() < 0.2, bench.thing.name
+        assert np.abs(bench.data.qvel).max() < 0.2, bench.thing.name
         assert not before.unstable
 
 
@@ -185,13 +185,13 @@ def test_peaks_and_pits_differ_in_the_sign_of_their_skewness_and_nothing_else():
         assert np.mean((peaks - peaks.mean()) ** 3) > 0.2 * peaks.std() ** 3
 
 
-def test_the_camera_does_not_see_what_the_fingers_slide_on():
+def test_the_camera_does_not_see_what_the_fingers_slide_on(monkeypatch):
     """Before the fingers close, the picture is the same whether the patch grips or slides."""
-    bench, seen = physics.Bench(thing("rod")), {}
+    some, seen = skin.draw_patch(np.random.default_rng(0)), {}
     for peaks in (True, False):
-        patch = dataclasses.replace(skin.draw_patch(np.random.default_rng(0)), peaks=peaks)
-        key = {"size": SIZE, "held_out_sensor": False, "measured": False}
-        seen[peaks] = grasps._record(bench, patch, plan(friction=0.85 if peaks else 0.3), (0, 2, 0), **key)
+        patch = dataclasses.replace(some, peaks=peaks, friction=0.85 if peaks else 0.3)
+        monkeypatch.setattr(skin, "draw_patch", lambda rng, patch=patch: patch)
+        seen[peaks] = grasps.grasp(0, 2, 0, size=SIZE)
     assert np.array_equal(seen[True][0]["vision"], seen[False][0]["vision"])
     assert not np.array_equal(seen[True][1]["touch_left"], seen[False][1]["touch_left"])
 
@@ -215,7 +215,7 @@ def test_a_lost_solver_is_a_failed_grasp_and_leaves_no_nan():
     last = list(bench.moments(plan()))[-1]
     assert last.unstable == 1
     assert last.success == 0
-    assert np.isfinite(last.data.qpos).all()
+    assert np.isfinite(bench.data.qpos).all()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 Shapes: H, W pixels of a height map, row 0 at the top, x to the right, y down; heights and imprints in mm, forces in N.
 
     press()       object relief [H, W] mm  ->  imprint [H, W] mm (displacement of the gel towards the camera)
+    contact()     object relief [H, W] mm  ->  depth, place and size of the contact
     render()      imprint [H, W] mm        ->  picture [H, W, 3] uint8 of one `Sensor`
 
 The gel is a Winkler foundation, independent springs (Johnson, Contact Mechanics, 1985, section 4.3), under a membrane.
@@ -11,6 +12,7 @@ per side. A Lambertian model with an overhead term is much too grey (compare Joh
 and dots of `SENSORS` were set by eye, by comparison with pictures of real sensors; no real picture is used.
 """
 
+import math
 from functools import lru_cache
 from typing import Any
 
@@ -20,7 +22,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 
 from mvitac.sim.sensors import SENSORS, Pair, Sensor
 
-__all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "press", "pressure", "relax", "render"]
+__all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "contact", "press", "pressure", "relax", "render"]
 
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
 GEL_STIFFNESS = 0.06  # Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm
@@ -30,6 +32,9 @@ MEMBRANE_MM = (0.12, 0.35, 0.9)
 
 MEMBRANE_SAG = 0.8
 """Relative height of the bridge: the gel behind pushes the membrane into the gap, so shallow grooves remain visible."""
+
+KNOWN = ("depth_mm", "contact_x_mm", "contact_y_mm", "patch_mm2")
+"""What ``contact`` returns."""
 
 _TAG = 0x6E1
 
@@ -84,6 +89,24 @@ def relax(indent_mm: F, *, pixel_mm: float) -> F:
     for radius in MEMBRANE_MM:
         surface = np.maximum(surface, np.float32(MEMBRANE_SAG) * _blur(surface, radius / pixel_mm))
     return gaussian_filter(surface, 0.07 / pixel_mm, mode="nearest")  # the paint layer smooths the rest
+
+
+def contact(
+    relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float
+) -> dict[str, float]:
+    """Measure the contact that ``gel.press`` renders with these arguments, before the membrane smooths it.
+
+    Returns "depth_mm", the deepest indentation of the gel; "contact_x_mm" and "contact_y_mm", the centre of pressure,
+    right and down from the middle of the picture (NaN without contact); "patch_mm2", the area under pressure.
+    """
+    p = pressure(
+        relief_mm, force_n=force_n, stiffness=stiffness, pixel_mm=pixel_mm, dome_radius_mm=dome_radius_mm
+    ).astype(np.float64)
+    if not (total := float(p.sum())):
+        return dict(zip(KNOWN, (0.0, math.nan, math.nan, 0.0), strict=True))
+    x, y = ((np.arange(n) - (n - 1) / 2) * pixel_mm for n in (p.shape[1], p.shape[0]))
+    centre = float(p.sum(0) @ x) / total, float(p.sum(1) @ y) / total
+    return dict(zip(KNOWN, (float(p.max()) / GEL_STIFFNESS, *centre, float((p > 0).sum()) * pixel_mm**2), strict=True))
 
 
 def render(

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mvitac.sim.contact import contact
-from mvitac.sim.coordinates import Motion, grid, outline, turn
-from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
+from mvitac.sim.coordinates import Motion, Place, grid, outline, turn
+from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, contact, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS, Sensor
 
@@ -148,7 +147,7 @@ def touch(
     Args:
         background: Also return "background", the same copy of the sensor before contact.
         moment: 0, or the number of a later moment of the same press (`motion.Motion`).
-        measured: Also return depth, position and size of the contact (`contact.KNOWN`).
+        measured: Also return depth, position and size of the contact (`gel.KNOWN`).
         sensors: Sensors to choose from; all else is the same. Default: all that are not held out.
         through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs
             from those of smaller numbers; the camera takes another picture.
@@ -198,12 +197,7 @@ def _check_request(seed: int, category: int, instance: int, touch: int, size: in
 
 
 def _look(
-    thing: Instance,
-    rng: np.random.Generator,
-    angle: float,
-    place: NDArray[np.float64],
-    size: int,
-    motion: Motion | None,
+    thing: Instance, rng: np.random.Generator, angle: float, place: Place, size: int, motion: Motion | None
 ) -> NDArray[np.uint8]:
     """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
     x, y, pixel = grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
@@ -278,7 +272,7 @@ def _feel(
     thing: Instance,
     rng: np.random.Generator,
     angle: float,
-    place: NDArray[np.float64],
+    place: Place,
     size: int,
     choice: Sequence[Sensor],
     background: bool,

@@ -48,10 +48,9 @@ class Touch:
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """The scene at one moment. Read ``data`` before the next moment is requested, which overwrites it."""
+    """The forces at one moment. The scene, ``Bench.data``, stays until the next moment is requested."""
 
     phase: str
-    data: mujoco.MjData
     left: Touch
     right: Touch
     success: int  # valid at 'after'
@@ -144,7 +143,7 @@ class Bench:
 
     def _moment(self, phase: str, rise: float, unstable: int) -> Moment:
         left, right = self._touch(0), self._touch(1)
-        return Moment(phase=phase, data=self.data, left=left, right=right, success=0, rise_m=rise, unstable=unstable)
+        return Moment(phase=phase, left=left, right=right, success=0, rise_m=rise, unstable=unstable)
 
     def _touch(self, side: int) -> Touch:
         """Return the sum of contact forces on a pad's dome."""

@@ -203,14 +203,6 @@ class Relief:
     """-1: plateaus with pits and grooves; +1: separate peaks. Skewness R_sk of surface metrology (ISO 21920-2)."""
     tables: F  # random numbers [4, 64, 64] of this instance
 
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"unknown kind {self.kind!r}: choose one of {', '.join(KINDS)}")
-        if self.tables.shape != (4, _SIDE, _SIDE):
-            raise ValueError(
-                f"tables must be [4, {_SIDE}, {_SIDE}], got {self.tables.shape}: draw them with draw_tables()"
-            )
-
     def __call__(self, x: F, y: F) -> F:
         """Return heights [H, W]."""
         wave = np.float32(self.wavelength_mm)
