@@ -162,6 +162,11 @@ class DataSpec:
         """Tasks with classes, then tasks with values."""
         return (*self.tasks, *self.values)
 
+    @property
+    def split_columns(self) -> tuple[str, ...]:
+        """The columns with the splits of pre-training and of all tasks."""
+        return tuple(dict.fromkeys(("split", *(task.split for task in self.all_tasks))))
+
     def channels(self, modality: str) -> int:
         """Channels of an image as encoders get it: of all frames of a window together."""
         return self.frames(modality) * {"vision": self.vision_channels, "touch": self.touch_channels}[modality]

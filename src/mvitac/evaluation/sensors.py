@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from mvitac.data.joined_pack import JoinedPack
-from mvitac.data.jpeg import Lazy
+from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.data.spec import listed
 from mvitac.evaluation import diagnostics
