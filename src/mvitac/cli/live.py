@@ -18,15 +18,7 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse
 from mvitac.data.spec import task_title
-from mvitac.deploy.engine import (
-    FORMAT_VERSION,
-    MANIFEST,
-    Engine,
-    about_sensor,
-    frame_shapes,
-    import_openvino,
-    lists_bf16,
-)
+from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, about_sensor, frame_shapes
 from mvitac.live.cameras import source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.display import Window, draw
@@ -249,6 +241,7 @@ def sources(
 def _engine(model: str, threads: int, console: Any) -> Engine:
     """The engine of an export; a run or an artifact is exported first, once, into the cache."""
     from mvitac.deploy.artifact import load
+    from mvitac.deploy.engine import import_openvino, lists_bf16
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_probes
     from mvitac.nn.weights import safetensors_digest
