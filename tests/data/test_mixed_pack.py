@@ -263,4 +263,4 @@ def test_a_mix_is_described_shown_and_checked(
     assert "2 of 2 strips" in capsys.readouterr().out
     assert main(["data", "check", *parts, "--json", str(tmp_path / "check.json")]) in (0, 1)
     assert main(["data", "pack", "--data", "mix", "--out", str(tmp_path / "p")]) == 2
-    assert "a mix is not packed" in capsys.readouterr().err
+    assert "--data mix reads packs" in capsys.readouterr().err

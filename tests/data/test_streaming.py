@@ -485,7 +485,7 @@ TRAIN = ["pretrain", "--recipe", "smoke", "--data", "stream", "--data.cache", "{
         (["data", "shard", "{pack}", "{tmp}/new", "--shard-mb", "0"], "shard_mb 0.0: give"),
         (["data", "shard", "{pack}", "{tmp}/new", "--shard-mb", "inf"], "shard_mb inf: give"),
         (["data", "shard", "{pack}", "odd://place"], "odd://place cannot be opened"),
-        (["data", "pack", "--data", "stream", "--out", "{tmp}/o"], "use it with --data stream"),
+        (["data", "pack", "--data", "stream", "--out", "{tmp}/o"], "--data stream reads packs"),
     ],
 )
 def test_refused_in_one_line(

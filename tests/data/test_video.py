@@ -15,7 +15,6 @@ from PIL import Image
 
 from mvitac.data import video
 from mvitac.data.video import frames, num_frames
-from mvitac.datasets.table import video_times
 from support.videos import edited, numbered, read_number, write_video
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "touch_and_go_sample"
@@ -100,7 +99,7 @@ def test_a_trim_without_encoding_anew_counts_what_is_shown(
         shown = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
     assert [read_number(image)[0] for _, image in shown] == [*range(first, first + num)]
     assert num_frames(path) == num
-    assert np.allclose(video_times.timestamps(path), [time for time, _ in shown])
+    assert np.allclose(video.frame_times(path), [time for time, _ in shown])
     for wanted in ([0], [1, 2, 30], range(num)):
         found = list(frames(path, wanted))
         assert [number for number, _ in found] == list(wanted)

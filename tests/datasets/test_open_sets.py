@@ -18,13 +18,12 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.images import decode, shrink
 from mvitac.data.pack import Pack
-from mvitac.data.video import num_frames
+from mvitac.data.video import num_frames, spread
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.physiclear import PhysiclearConfig
 from mvitac.datasets.slip_grasp import SlipGraspConfig
 from mvitac.datasets.slip_gsmini import SlipGSMiniConfig
 from mvitac.datasets.table.splits import folds
-from mvitac.datasets.table.video_times import spread
 from mvitac.datasets.vt60 import VT60Config
 from support.films import film, shade
 

@@ -8,8 +8,8 @@ from benchmarks.calibration import rates_of_error, value_rates_of_error
 from scipy.stats import t as student
 from sklearn.metrics import confusion_matrix, f1_score
 
+from mvitac.evaluation import score_text
 from mvitac.evaluation.intervals import interval, least_p, paired_difference
-from mvitac.evaluation.score_text import tested_on
 from mvitac.evaluation.scores import score
 
 
@@ -149,7 +149,7 @@ def test_groups_without_rows_do_not_count() -> None:
 
 def test_a_table_says_how_many_test_groups_its_scores_have() -> None:
     def told(*groups: int) -> str:
-        return tested_on({"touch": {str(i): {"groups": num} for i, num in enumerate(groups)}}, "object")
+        return score_text.tested_on({"touch": {str(i): {"groups": num} for i, num in enumerate(groups)}}, "object")
 
     assert told(24, 24) == "24 test objects" and told(24, 12, 18) == "12 to 24 test objects"
     assert told(1) == "1 test object, so no interval"

@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from av.error import FFmpegError
 from PIL import Image
 
 from mvitac.cli.live import _engine, _print_touch, _run, sources, view
@@ -27,7 +29,7 @@ from mvitac.datasets.lerobot.reader import LeRobotConfig
 from mvitac.deploy.artifact import seal
 from mvitac.deploy.engine import Engine
 from mvitac.deploy.search import neighbours
-from mvitac.live.cameras import Camera, Folder, Simulated, source
+from mvitac.live.cameras import Camera, Ended, Folder, Simulated, source
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.display import Window, draw
 from mvitac.live.predictor import Live, Reading
@@ -37,6 +39,7 @@ from mvitac.model import Model
 from mvitac.report.value_figures import over_time
 from mvitac.system.console import Console
 from support.faults import Clock, Rig, World, faulty
+from support.films import film, shade
 
 
 @pytest.fixture(scope="module")
@@ -326,12 +329,32 @@ def test_files_that_cannot_be_read_are_named_at_once(tmp_path: Path) -> None:
             source(str(tmp_path / name), "touch")
 
 
-def test_opencv_is_asked_for_where_it_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "a.mp4").touch()
+def test_opencv_is_asked_for_where_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    for text in ("0", "serial:D20345", str(tmp_path / "a.mp4")):
+    for text in ("0", "serial:D20345"):
         with pytest.raises(ValueError, match=r"needs OpenCV: pip install -e '.\[live\]'"):
             source(text, "touch")
+
+
+def test_a_video_is_read_to_its_end_without_opencv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    file = source(str(film(tmp_path / "a.mp4", 3, rate=20)), "touch")
+    file.open()
+    frames = [file.read() for _ in range(3)]
+    assert file.fps == 20 and not file.paced
+    for i, frame in enumerate(frames):
+        assert frame.shape == (48, 64, 3) and np.abs(frame.mean((0, 1)) - shade(i, 0)).max() < 3
+    with pytest.raises(Ended):
+        file.read()
+    file.close()
+
+    def damaged() -> Iterator[Any]:
+        yield from ()
+        raise FFmpegError(1, "a damaged part")
+
+    file.frames = damaged()
+    with pytest.raises(ValueError, match="a damaged part"):  # skipped, unlike a lost camera
+        file.read()
 
 
 def test_a_camera_is_asked_for_a_mode(monkeypatch: pytest.MonkeyPatch) -> None:

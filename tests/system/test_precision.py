@@ -285,7 +285,7 @@ def test_a_bf16_export_runs_in_fp32_where_openvino_lists_no_bf16(
             return SimpleNamespace(create_infer_request=lambda: None)
 
     monkeypatch.setattr(openvino, "Core", Core)
-    monkeypatch.setattr("mvitac.deploy.engine.Engine", lambda *_, **__: SimpleNamespace(meta={"precision": "bf16"}))
+    monkeypatch.setattr(live, "Engine", lambda *_, **__: SimpleNamespace(meta={"precision": "bf16"}))
     said = []
     for capabilities in (["FP32"], ["BF16", "FP32"]):
         listed = capabilities

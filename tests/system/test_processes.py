@@ -18,7 +18,8 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.model_files import load
-from mvitac.system.processes import in_threads, side_by_side
+from mvitac.system.processes import side_by_side
+from mvitac.system.threads import in_threads
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import numpy as np
 
 from mvitac.bench.result import trimmed
 from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
-from mvitac.data.jpeg import Lazy
+from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, label_controls, pixel_controls

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, check_json, console, parse, save_json, selectors, short
 from mvitac.data.build import build
+from mvitac.data.checks.finding import some
 from mvitac.data.notebook import measured
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
@@ -103,12 +104,8 @@ def _groups(pack: Pack) -> str:
     return (
         f"{text}.\nNo --group was given, so every row is a group of its own. If rows show the same object or recording,"
         " train and test then share it: scores are too high and intervals too narrow. In that case pack again with"
-        f" --group COLUMN{f' (this table has {_some(repeated)})' if repeated else ''}."
+        f" --group COLUMN{f' (this table has {some(repeated, 6)})' if repeated else ''}."
     )
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:6]) + ", ..." * (len(names) > 6)
 
 
 @dataclass(frozen=True)
@@ -191,11 +188,10 @@ def info(argv: list[str]) -> None:
     found, say = _describe(pack), console(options.json)
     stored = "" if pack.store == "raw" else f", JPEG of quality {pack.meta['quality']}"
     title = f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px{stored}"
-    table = Table(title=title, title_justify="left")
     groups = "groups" if pack.spec.group_by == "row" else f"{pack.spec.group_by}s"
     values = [f"{v['target']}, {v['unit']}" for v in next(iter(found["splits"].values()), {}).get("values", ())]
-    for column in ("split", "rows", groups, *(f"{t.name}: majority" for t in pack.spec.tasks), *values):
-        table.add_column(column)
+    heads = ("split", "rows", groups, *(f"{t.name}: majority" for t in pack.spec.tasks), *values)
+    table = Table(*heads, title=title, title_justify="left")
     for name, split in found["splits"].items():
         cells = [f"{m['class']} {100 * m['share']:.1f} %" if m else "" for m in split["majority"].values()]
         cells += [f"{v['low']:.3g} to {v['high']:.3g}" if v["rows"] else "" for v in split.get("values", ())]
@@ -221,7 +217,7 @@ def _describe(pack: Pack) -> dict[str, Any]:
             majority = {task.name: _majority(pack, task, split) for task in pack.spec.tasks}
             splits[split] = {"rows": len(rows), "groups": groups, "majority": majority}
             if pack.spec.values:
-                splits[split]["values"] = _values(pack, rows)
+                splits[split]["values"] = measured(pack, rows)
     has = {m: pack.has(m) for m in pack.spec.modalities}
     return {
         "path": str(pack.path),
@@ -240,16 +236,6 @@ def _describe(pack: Pack) -> dict[str, Any]:
         "notes": list(pack.spec.notes),
         "digest": pack.digest,
     }
-
-
-def _values(pack: Pack, rows: np.ndarray) -> list[dict[str, Any]]:
-    """Each target with its unit, the number of measured rows, and their lowest and highest value."""
-    targets = [(task.name, target) for task in pack.spec.values for target in task.targets]
-    found = []
-    for (task, target), (num, low, high) in zip(targets, measured(pack, rows), strict=True):
-        ends = {"low": low, "high": high} if num else {"low": None, "high": None}
-        found.append({"task": task, "target": target.name, "unit": target.unit, "rows": num, **ends})
-    return found
 
 
 def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:

@@ -70,9 +70,9 @@ def check(argv: list[str]) -> int:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
         _check_places(options)
         window = Window(frames=options.num_frames, stride=options.stride, order=options.order)
-        if len(options.pack) == 1:
-            return _report(options.pack[0], *examine_pack(options.pack[0], window), options)
-        return _report(" + ".join(options.pack), *examine_open(open_packs(options.pack), window), options)
+        single = len(options.pack) == 1
+        found = examine_pack(options.pack[0], window) if single else examine_open(open_packs(options.pack), window)
+        return _report(" + ".join(options.pack), *found, options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
     rest = short(rest)

@@ -2,33 +2,33 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from mvitac.cli.options import parse, selectors
+from mvitac.experiments.demo import run_demo
+from mvitac.recipes import RECIPES, recipe
+from mvitac.run import Run
+from mvitac.system.console import Console
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    out: Path = Path("runs/demo")
+    """Folder of the demo: one run per seed, summary.json, report."""
+    seeds: int = 1
+    """How many times to pre-train, each from its own seed."""
+    run: Annotated[Run, tyro.conf.arg(name="")]
 
 
 def demo(argv: list[str]) -> None:
     """mvitac demo [--recipe R] [--out DIR] [--seeds N] [fields]"""
     chosen, rest = selectors(argv, ("--recipe",))
-    from typing import Annotated
-
-    import tyro
-
-    from mvitac.experiments.demo import run_demo
-    from mvitac.recipes import RECIPES, recipe
-    from mvitac.run import Run
-    from mvitac.system.console import Console
-
-    @dataclass(frozen=True, kw_only=True)
-    class Options:
-        out: Path = Path("runs/demo")
-        """Folder of the demo: one run per seed, summary.json, report."""
-        seeds: int = 1
-        """How many times to pre-train, each from its own seed."""
-        run: Annotated[Run, tyro.conf.arg(name="")] = recipe(chosen.get("--recipe", "quick"))
-
-    Options.__doc__ = f"""Simulate materials, pre-train, probe and write a report. A second call resumes the first.
+    about = f"""Simulate materials, pre-train, probe and write a report. A second call resumes the first.
 
       --recipe {"|".join(RECIPES)}  (default quick; demo: the recipe of the published tables)
     """
-    options = parse(Options, rest, "demo")
+    usual = _Options(run=recipe(chosen.get("--recipe", "quick")))
+    options = parse(_Options, rest, "demo", default=usual, description=about)
     run_demo(options.run, options.out, options.seeds, Console(markup=False))

@@ -52,7 +52,7 @@ def publish(argv: list[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ExportOptions:
+class _ExportOptions(exports.ExportConfig):
     """Write a model for another engine: uint8 in, embeddings, probabilities and values out. The result is compared with the
     model on real inputs; nothing is written if it differs."""
 
@@ -61,14 +61,7 @@ class _ExportOptions:
     out: Path
     """The new folder."""
     kind: Annotated[exports.Kind, tyro.conf.arg(name="format")] = "onnx"
-    """torch (torch.export), onnx (ONNX Runtime) or openvino."""
-    precision: Literal["fp32", "bf16"] = "fp32"
-    """Arithmetic of openvino; bf16 only on a CPU that computes it, where it can be checked."""
-    int8: bool = False
-    """8-bit weights and activations; their ranges come from train rows of the pack (onnx, openvino)."""
-    target: exports.Target = "auto"
-    """CPU that --int8 is for. avx2: any CPU (7-bit weights). vnni: x86 with VNNI or AMX, or ARM (8-bit weights). auto:
-    this machine's, as measured."""
+    """Engine: torch (torch.export), onnx (ONNX Runtime) or openvino."""
     on: Path | None = None
     """Pack whose test rows check the export, and on which the probes of a run are fitted; an artifact keeps its own
     (default: the data the model was trained on)."""
@@ -77,18 +70,11 @@ class _ExportOptions:
     new_sensor: Path | None = None
     """Pack with 64 to 400 unlabelled images of a touch sensor that the model never met, such as a recording of mvitac
     live: the export is for that sensor, and shows its images in the colours of the known ones."""
+    modalities: tyro.conf.Suppress[tuple[str, ...] | None] = None
     modality: Literal["both", "vision", "touch"] = "both"
     """Inputs of the export; both = all the model has."""
-    min_cosine: float | None = None
-    """Lowest cosine allowed (default: .9999 for fp32, .99 for bf16, .95 for int8)."""
-    accuracy_loss: float = 0.5
-    """Points of accuracy that a task may lose."""
-    value_loss: float = 0.1
-    """Change that a value may have (root mean square), in standard deviations of that value."""
     num_rows: Annotated[int, tyro.conf.arg(name="rows")] = 512
     """Maximum number of test rows to check on."""
-    threads: int = 0
-    """CPU threads while measuring latency; 0 = all cores."""
 
 
 def export(argv: list[str]) -> None:
@@ -108,10 +94,8 @@ def export(argv: list[str]) -> None:
 
 
 def _table(out: Path, report: dict[str, Any], new: Path | None) -> Table:
-    rows = f"rows of {new}" if new else "test rows"
-    table = Table(title=f"{out}: checked on {report['num_rows']} {rows}", title_justify="left")
-    for column in ("", "original", "export"):
-        table.add_column(column)
+    title = f"{out}: checked on {report['num_rows']} {f'rows of {new}' if new else 'test rows'}"
+    table = Table("", "original", "export", title=title, title_justify="left")
     for task, values in report["accuracy"].items():
         table.add_row(f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}")
     for target in (target for targets in report.get("values", {}).values() for target in targets):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Group
@@ -18,14 +18,16 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse
 from mvitac.data.spec import task_title
+from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, about_sensor, frame_shapes
+from mvitac.live.cameras import source
 from mvitac.live.contact import LiveConfig
+from mvitac.live.display import Window, draw
+from mvitac.live.predictor import Live
+from mvitac.live.recorder import Recorder, finish
+from mvitac.live.streams import CaptureThread, Stream
+from mvitac.registry import to_json
 from mvitac.system.console import Console
-from mvitac.system.files import write_json
-
-if TYPE_CHECKING:
-    from mvitac.deploy.engine import Engine
-    from mvitac.live.display import Window
-    from mvitac.live.predictor import Live
+from mvitac.system.files import cache_dir, digest, write_atomic, write_json
 
 _REDRAW = 0.1  # seconds between two pictures of the terminal or the window
 
@@ -76,11 +78,6 @@ class _Options:
 
 def live(argv: list[str]) -> None:
     """mvitac live MODEL [--vision SOURCE] [--touch SOURCE...] [--index DIR] [--record DIR]"""
-    from mvitac.deploy.engine import about_sensor, frame_shapes
-    from mvitac.live.display import Window
-    from mvitac.live.predictor import Live
-    from mvitac.live.recorder import Recorder, finish
-
     if argv[:1] == ["--finish"] and len(argv) == 2:
         print(f"{argv[1]}: {finish(Path(argv[1]))} pairs")
         return
@@ -136,7 +133,6 @@ def _plot(predictions: list[Any], path: Path) -> None:
     """Draw the values of ``predictions`` over time, if there are any."""
     from mvitac.report.figures import to_png
     from mvitac.report.value_figures import over_time
-    from mvitac.system.files import write_atomic
 
     if not any(said["contact"] for said in predictions):
         print("nothing was drawn: no touch was seen")
@@ -146,7 +142,7 @@ def _plot(predictions: list[Any], path: Path) -> None:
     print(f"values over time: {path}")
 
 
-def _nearest(options: _Options, engine: "Engine") -> Any:
+def _nearest(options: _Options, engine: Engine) -> Any:
     """The search for known touches, if there is an index; ValueError if it was made with another model."""
     from mvitac.deploy.search import Index, neighbours
 
@@ -158,12 +154,8 @@ def _nearest(options: _Options, engine: "Engine") -> Any:
     return neighbours(index, options.live.neighbours, engine.inputs)
 
 
-def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
+def _streams(options: _Options, engine: Engine) -> dict[str, list[Any]]:
     """The streams by modality, not yet open; several of one modality are numbered from 1."""
-    from mvitac.deploy.engine import frame_shapes
-    from mvitac.live.cameras import source
-    from mvitac.live.streams import Stream
-
     streams = {}
     for modality, texts in sources(frame_shapes(engine), options.vision, options.touch).items():
         names = [modality] if len(texts) == 1 else [f"{modality} {i + 1}" for i in range(len(texts))]
@@ -173,15 +165,13 @@ def _streams(options: _Options, engine: "Engine") -> dict[str, list[Any]]:
 
 
 def _run(
-    loop: "Live",
+    loop: Live,
     console: Console,
-    window: "Window | None",
+    window: Window | None,
     seconds: float | None,
     write: Callable[[Any], object] = lambda said: None,
 ) -> None:
     """Predict until all streams ended, ``seconds`` are over, or the user stops it; ``write`` gets every prediction."""
-    from mvitac.live.display import draw
-
     start = loop.clock()
     end = time.monotonic() + seconds if seconds else float("inf")
     printed, drawn = 0, 0.0
@@ -209,10 +199,8 @@ def _run(
 
 
 @contextmanager
-def _capture(loop: "Live", window: "Window | None", console: Console) -> Iterator[threading.Event]:
+def _capture(loop: Live, window: Window | None, console: Console) -> Iterator[threading.Event]:
     """Read every stream in a thread of its own; the event is set by each new frame. Ctrl-C ends the ``with``."""
-    from mvitac.live.streams import CaptureThread
-
     news = threading.Event()
     threads = [CaptureThread(stream, news.set) for stream in loop.all]
     for thread in threads:
@@ -250,15 +238,13 @@ def sources(
     return given
 
 
-def _engine(model: str, threads: int, console: Any) -> "Engine":
+def _engine(model: str, threads: int, console: Any) -> Engine:
     """The engine of an export; a run or an artifact is exported first, once, into the cache."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, import_openvino, lists_bf16
+    from mvitac.deploy.engine import import_openvino, lists_bf16
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_probes
     from mvitac.nn.weights import safetensors_digest
-    from mvitac.registry import to_json
-    from mvitac.system.files import cache_dir, digest
 
     if (Path(model) / MANIFEST).is_file():
         engine = Engine(model, threads=threads)
@@ -277,7 +263,7 @@ def _engine(model: str, threads: int, console: Any) -> "Engine":
     return Engine(folder, threads=threads)
 
 
-def _print_touch(loop: "Live", console: Any, printed: int) -> int:
+def _print_touch(loop: Live, console: Any, printed: int) -> int:
     """Print one line for a touch that has ended; the number of the last touch printed."""
     touch = loop.last
     if touch is None or touch.number <= printed or touch.end is None:
@@ -297,13 +283,13 @@ def _say(console: Console, text: str, style: str = "") -> None:
     console.print(text, style=style, soft_wrap=True, highlight=False, markup=False)
 
 
-def _answer(loop: "Live", task: str, answer: tuple[str, float]) -> str:
+def _answer(loop: Live, task: str, answer: tuple[str, float]) -> str:
     name, confidence = answer
     sure = "" if confidence >= loop.config.min_confidence else ", unsure"
     return f"{task_title(task, loop.engine.classes[task])}: {name} ({100 * confidence:.0f} %{sure})"
 
 
-def view(loop: "Live") -> Any:
+def view(loop: Live) -> Any:
     """The terminal's picture of ``loop``: streams, contact, answers, ages; 80 columns wide."""
     lines: list[Any] = [_stream_table(loop)]
     for s in loop.streams.get("touch", ()):
@@ -329,7 +315,7 @@ def view(loop: "Live") -> Any:
     return Group(*lines)
 
 
-def _stream_table(loop: "Live") -> Table:
+def _stream_table(loop: Live) -> Table:
     table = Table(box=None, pad_edge=False)
     for column in ("stream", "fps", "age ms", "dropped", "state"):
         table.add_column(column, justify="left" if column in ("stream", "state") else "right")

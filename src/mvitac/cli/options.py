@@ -12,6 +12,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import tyro
+
+from mvitac.registry import unknown
+from mvitac.system.console import Console
+from mvitac.system.files import check_place, write_json
+
 T = TypeVar("T")
 STDOUT = Path("-")  # the --json FILE that means stdout
 
@@ -28,8 +34,6 @@ def parse(
         default: instance of ``kind`` with other defaults than its own.
         description: text of ``--help`` above the options, instead of the docstring of ``kind``.
     """
-    import tyro
-
     argv = [re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", w) for w in argv]
     argv = [re.sub(r"^(--[\w.-]+=)(~.*)", lambda m: m[1] + os.path.expanduser(m[2]), w) for w in argv]  # no shell does
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
@@ -105,25 +109,19 @@ def asks_help(argv: Sequence[str]) -> bool:
 
 def check_json(path: Path | None, option: str = "--json") -> None:
     """ValueError if the file of ``option`` cannot be written; called before the work begins."""
-    from mvitac.system.files import check_place
-
     if path and path != STDOUT:
         check_place(path)
         if path.is_dir():
             raise ValueError(f"{option} {path} is a folder: give another place, the name of a file")
 
 
-def console(json_file: Path | None) -> Any:
+def console(json_file: Path | None) -> Console:
     """Where a command prints: stdout, or stderr if its JSON goes to stdout."""
-    from mvitac.system.console import Console
-
     return Console(markup=False, highlight=False, stderr=json_file == STDOUT)
 
 
 def save_json(path: Path | None, value: Any, *, sealed: bool = False) -> None:
     """Write ``value`` to the file of a ``--json`` option, if it was given, and say so."""
-    from mvitac.system.files import write_json
-
     if path == STDOUT:
         print(json.dumps(value, indent=1, allow_nan=False))
     elif path:
@@ -133,8 +131,6 @@ def save_json(path: Path | None, value: Any, *, sealed: bool = False) -> None:
 
 def _one_line(text: str, prog: str) -> str:
     """A boxed error of tyro in our words, e.g. ``--batch-size: 'x' is not an int (see mvitac probe --help)``."""
-    from mvitac.registry import unknown
-
     whole = _unframed(text)
     see = f"(see mvitac {prog} --help)"
     if found := re.match(r"Error parsing (?!-)[\w.]*: (.*)", whole):

@@ -37,8 +37,11 @@ def pretrain(argv: list[str]) -> None:
         chosen.setdefault("--logger", chosen["--sink"])
     rest = [re.sub(r"^--init(?==|$)", "--init.path", word) for word in rest]
     base = _chosen_run(chosen, phased=False)
-    if not asks_help(rest):
-        _check_data_is_named(chosen)
+    if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():
+        raise ValueError(
+            f"name the data to learn from: --data {'|'.join(DatasetConfig.choices)} (or --from RUN.JSON); without data of"
+            " your own: mvitac demo, or mvitac pretrain --data materials --recipe demo, which simulates"
+        )
     description = f"""Pre-train encoders without labels.
 
     First choose, then change single fields below (defaults are those of the chosen recipe):
@@ -73,11 +76,3 @@ def _chosen_run(chosen: dict[str, str], phased: bool) -> Run:
     data = default(DatasetConfig, chosen.get("--data", "materials"))
     base = recipe(chosen.get("--recipe", "demo"), data, phased if data.phased is None else data.phased)
     return with_method(base, chosen.get("--method", base.method.name))
-
-
-def _check_data_is_named(chosen: dict[str, str]) -> None:
-    if "--data" not in chosen and "--from" not in chosen:
-        raise ValueError(
-            f"name the data to learn from: --data {'|'.join(DatasetConfig.choices)} (or --from RUN.JSON); without data of"
-            " your own: mvitac demo, or mvitac pretrain --data materials --recipe demo, which simulates"
-        )

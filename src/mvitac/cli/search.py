@@ -154,9 +154,8 @@ def find(argv: list[str]) -> None:
         }
         for row, score in zip(rows[0].tolist(), scores[0], strict=True)
     ]
-    table = Table(title=f"{options.source} -> {options.target} in {options.index}", title_justify="left")
-    for column in ("cosine", "id", "group", *index.meta["classes"]):
-        table.add_column(column)
+    title = f"{options.source} -> {options.target} in {options.index}"
+    table = Table("cosine", "id", "group", *index.meta["classes"], title=title, title_justify="left")
     for one in found:
         labels = (one["labels"].get(task, "") for task in index.meta["classes"])
         table.add_row(f"{one['cosine']:.3f}", one["id"], one["group"], *labels)

@@ -2,7 +2,7 @@
 
 ``build`` writes to ``<pack>.partial`` (see ``data/partial_pack.py``). A killed build resumes there and gives the same
 bytes. The finished folder is renamed, so a folder with a pack.json is a complete pack. If several processes want the same
-pack, one builds it and the others wait. This module does not import torch.
+pack, one builds it and the others wait.
 """
 
 import contextlib
@@ -19,14 +19,15 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from rich.filesize import decimal
 
 from mvitac.data.build_parts import Work, make_parts
-from mvitac.data.jpeg import QUALITY
-from mvitac.data.pack import FORMAT, FORMAT_VERSIONS, SUFFIXES, Pack, Store
+from mvitac.data.pack import FORMAT, Pack
 from mvitac.data.pack_table import check_table
 from mvitac.data.partial_pack import JpegFile, Part, RowFile
 from mvitac.data.source import Source
-from mvitac.registry import to_json, unknown
+from mvitac.data.storage import FORMAT_VERSIONS, QUALITY, SUFFIXES, Store, check_request, stored_as
+from mvitac.registry import to_json
 from mvitac.system.console import Console
 from mvitac.system.files import brief, digest, digest_file, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
@@ -35,27 +36,6 @@ from mvitac.system.progress import work as progress
 from mvitac.system.provenance import provenance
 
 NUM_PART_ITEMS = 32  # samples per part: the most that an interruption costs each process
-
-
-def check_request(
-    size: int, workers: int, max_damaged: float = 0.0, *, store: str = "raw", quality: int = QUALITY
-) -> None:
-    """Raise ValueError for invalid packing options."""
-    if not 8 <= size <= 1024:
-        raise ValueError(f"size {size} is not possible: give the stored side in pixels, 8 to 1024")
-    if not 0 <= workers <= 1024:
-        raise ValueError(f"workers {workers} is not possible: give 1 to 1024 processes, or 0 for one per core")
-    if not 0 <= max_damaged <= 1:
-        raise ValueError(f"max_damaged {max_damaged} is not possible: give a fraction of the items, 0 to 1")
-    if store not in SUFFIXES:
-        raise unknown("store", str(store), SUFFIXES)
-    if not 1 <= quality <= 100:
-        raise ValueError(f"quality {quality} is not possible: give a JPEG quality from 1 to 100")
-
-
-def stored_as(store: Store, quality: int) -> dict[str, Any]:
-    """Return the storage options that identify a pack; none for raw pixels, to keep old digests valid."""
-    return {} if store == "raw" else {"store": store, "quality": quality}
 
 
 def build(
@@ -198,12 +178,8 @@ def _check_disk(out: Path, files: Sequence[RowFile | JpegFile]) -> str:
     parent = next(p for p in [out.absolute().parent, *out.absolute().parents] if p.exists())
     free = shutil.disk_usage(parent).free
     if need > free:
-        raise ValueError(f"packing needs about {_bytes(need)}, {parent} has {_bytes(free)} free")
-    return f"needs about {_bytes(need)} of disk, {_bytes(free)} are free"
-
-
-def _bytes(num: int) -> str:
-    return f"{num / 1e9:.1f} GB" if num >= 1e8 else f"{num / 1e6:.1f} MB"
+        raise ValueError(f"packing needs about {decimal(need)}, {parent} has {decimal(free)} free")
+    return f"needs about {decimal(need)} of disk, {decimal(free)} are free"
 
 
 @dataclass

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
@@ -60,10 +60,7 @@ def draw(
         head = _row([_text(text, cell, 13, SOFT) for text in heads], cell)
         drawn[:across] = [_stack([head, first]) for first in drawn[:across]]
     rows = [_row(drawn[i : i + across], room, GAP) for i in range(0, len(drawn), across)]
-    whole = _stack([_text(title, (room + GAP) * across - GAP, 13, SOFT), *rows], GAP)
-    sheet = Image.new("RGB", (whole.width + 2 * GAP, whole.height + 2 * GAP), "white")
-    sheet.paste(whole, (GAP, GAP))
-    return sheet
+    return ImageOps.expand(_stack([_text(title, (room + GAP) * across - GAP, 13, SOFT), *rows], GAP), GAP, "white")
 
 
 def _block(block: Block, cell: int, columns: int, room: int) -> Image.Image:
@@ -76,11 +73,7 @@ def _block(block: Block, cell: int, columns: int, room: int) -> Image.Image:
 
 def _framed(tile: Tile) -> Image.Image:
     image = Image.fromarray(np.ascontiguousarray(tile.image))
-    if not tile.frame:
-        return image
-    framed = Image.new("RGB", (image.width + 2 * EDGE, image.height + 2 * EDGE), tile.frame)
-    framed.paste(image, (EDGE, EDGE))
-    return framed
+    return ImageOps.expand(image, EDGE, tile.frame) if tile.frame else image
 
 
 def _row(images: Sequence[Image.Image], step: int, gap: int = GAP) -> Image.Image:

@@ -1,14 +1,11 @@
-"""Two packs as one: train probes on the first and test them on the second (another sensor, room or robot).
-
-This module does not import torch.
-"""
+"""Two packs as one: train probes on the first and test them on the second (another sensor, room or robot)."""
 
 from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 
-from mvitac.data.mixed_pack import MixedImages
+from mvitac.data.lazy import Pieces
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.registry import unknown
@@ -43,8 +40,9 @@ class JoinedPack(Pack):
             controls={name: given for name, given in learn.spec.controls.items() if theirs.get(name) == given},
             notes=tuple(dict.fromkeys((*learn.spec.notes, *score.spec.notes))),
         )
+        starts = np.array([0, learn.num, self.num])
         self.images: dict[str, Images] = {
-            m: MixedImages([learn.images[m], score.images[m]], self.size, self.spec.channels(m))
+            m: Pieces(self._shape(m, self.num), starts, [learn.images[m], score.images[m]].__getitem__)
             for m in self.spec.modalities
         }
         group = self.column("group").astype(str)

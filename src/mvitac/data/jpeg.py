@@ -2,23 +2,20 @@
 
 One file holds the JPEGs of all rows, one after another; the pack's table has the length of each. Stacked sensors are
 placed below each other in one JPEG of three channels. A black image, which also represents a missing one, has length 0.
-This module does not import torch.
 """
 
 import functools
 import io
 import os
-from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from mvitac.data.lazy import Lazy
 from mvitac.system.files import brief
 
-QUALITY = 95
 FEW = 8  # up to this number of images, one thread is faster than several
 
 
@@ -49,38 +46,6 @@ def decode(jpeg: bytes, shape: tuple[int, int, int]) -> np.ndarray:
             raise ValueError(f"it is {image.mode} of {image.width} x {image.height}")
         sensors = np.asarray(image).reshape(-1, size, size, 3)
     return sensors.transpose(1, 2, 0, 3).reshape(shape)
-
-
-class Lazy(ABC):
-    """An array uint8 [N, S, S, C] whose rows are computed when indexed. Threads may share it.
-
-    Indexing is numpy's: first the rows (number, slice, array or mask), then any index of an image's axes.
-    """
-
-    dtype = np.dtype(np.uint8)
-
-    def __init__(self, shape: tuple[int, int, int, int]) -> None:
-        self.shape = shape
-        self._numbers = np.arange(shape[0])
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all images in memory."""
-        return int(np.prod(self.shape, dtype=np.int64))
-
-    def __getitem__(self, index: Any) -> np.ndarray:
-        """Return a new array; ValueError names the file and the row if it is damaged."""
-        rows, *within = index if isinstance(index, tuple) else (index,)
-        rows = np.asarray(self._numbers[rows])
-        images = self._made(rows.ravel()).reshape(*rows.shape, *self.shape[1:])
-        return images[(..., *within, *[slice(None)] * (3 - len(within)))] if within else images
-
-    @abstractmethod
-    def _made(self, rows: np.ndarray) -> np.ndarray:
-        """Return the images uint8 [n, S, S, C] of ``rows`` [n], which are valid row numbers."""
 
 
 class Jpegs(Lazy):

@@ -1,20 +1,16 @@
-"""Several packs as one: other datasets, sensors, image sizes and missing modalities. Images are not copied.
-
-This module does not import torch.
-"""
+"""Several packs as one: other datasets, sensors, image sizes and missing modalities. Images are not copied."""
 
 import copy
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
-from mvitac.data.images import fit
-from mvitac.data.jpeg import Lazy
+from mvitac.data.lazy import Pieces
 from mvitac.data.mixed_table import MixedTasks, mixed_spec, mixed_table, renamed_columns
 from mvitac.data.pack import Images, Pack, has_difference
 from mvitac.data.row_hashes import number_hint, row_hashes
@@ -71,8 +67,9 @@ class MixedPack(Pack):
                 raise ValueError(f"{found}: pack them with splits that agree, leave a part out, or give allow_leak")
             notes.append(found)
         self.spec = mixed_spec(self.parts, tasks, channels, notes)
-        pieces = {m: [pack.images.get(m, pack.num) for pack in packs] for m in self.spec.modalities}
-        self.images: dict[str, Images] = {m: MixedImages(each, self.size, channels[m]) for m, each in pieces.items()}
+        starts = np.cumsum([0, *(pack.num for pack in packs)])
+        pieces = {m: [pack.images.get(m) for pack in packs].__getitem__ for m in self.spec.modalities}
+        self.images: dict[str, Images] = {m: Pieces(self._shape(m, self.num), starts, pieces[m]) for m in pieces}
 
     def has(self, modality: str) -> np.ndarray:
         return self._has[modality]
@@ -125,42 +122,6 @@ class MixedPack(Pack):
         return made
 
 
-class MixedImages(Lazy):
-    """uint8 [N, S, S, C]: the images of several packs, one after another, resized to one side.
-
-    Args:
-        pieces: Images of each pack; a number stands for so many rows without an image, which are zeros.
-        size: Side S in pixels.
-        channels: C.
-    """
-
-    def __init__(self, pieces: Sequence[Images | int], size: int, channels: int) -> None:
-        self.pieces = pieces
-        lengths = [piece if isinstance(piece, int) else len(piece) for piece in pieces]
-        self.starts = np.cumsum([0, *lengths])
-        super().__init__((int(self.starts[-1]), size, size, channels))
-
-    def _made(self, rows: np.ndarray) -> np.ndarray:
-        numbers = np.searchsorted(self.starts, rows, side="right") - 1
-        found = np.unique(numbers)
-        if len(found) == 1:
-            return self._of(int(found[0]), rows)
-        images = np.empty((len(rows), *self.shape[1:]), np.uint8)
-        for number in found.tolist():
-            here = numbers == number
-            images[here] = self._of(number, rows[here])
-        return images
-
-    def _of(self, number: int, rows: np.ndarray) -> np.ndarray:
-        """The images of ``rows``, all of the pack ``number``."""
-        piece = self.pieces[number]
-        if isinstance(piece, int):
-            return np.zeros((len(rows), *self.shape[1:]), np.uint8)
-        images = piece[rows - self.starts[number]]
-        size = self.shape[1]
-        return images if images.shape[1] == size else np.stack([fit(image, size) for image in images])
-
-
 def _check(parts: Mapping[str, Pack]) -> dict[str, int]:
     """Check that the parts fit together; return the channels of each modality."""
     digests: dict[str, str] = {}
@@ -192,9 +153,10 @@ def _check(parts: Mapping[str, Pack]) -> dict[str, int]:
 
 def _shared(parts: Mapping[str, Pack]) -> str:
     """Say what train (or val) of one part and test of another have in common; "" if nothing."""
-    sides = {name: _sides(pack) for name, pack in parts.items()}
+    learn = {name: pack.rows("train", "val", "unlabelled") for name, pack in parts.items()}
+    tests = {name: [p.column(c) == "test" for c in p.spec.split_columns] for name, p in parts.items()}
     for (a, one), (b, other) in itertools.permutations(parts.items(), 2):
-        learned, scored = sides[a][0], sides[b][1]
+        learned, scored = learn[a], np.flatnonzero(np.any(tests[b], axis=0))
         hashes = list(zip(("id", "group"), row_hashes(one), row_hashes(other), strict=True))
         for column, ours, theirs in hashes[::-1]:
             both = scored[np.isin(theirs[scored], ours[learned])]
@@ -212,13 +174,6 @@ def _shared(parts: Mapping[str, Pack]) -> str:
                     f" test of part {b}, one of {num}"
                 )
     return ""
-
-
-def _sides(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that are learned from, and rows that are scored by at least one task."""
-    columns = {"split", *(task.split for task in pack.spec.all_tasks)}
-    scored = np.any([np.isin(pack.column(name), ["test"]) for name in columns], axis=0)
-    return pack.rows("train", "val", "unlabelled"), np.flatnonzero(scored)
 
 
 def _same_image(

@@ -1,4 +1,4 @@
-"""The table and the tasks of several packs as one (``data/mixed_pack.py``). This module does not import torch."""
+"""The table and the tasks of several packs as one (``data/mixed_pack.py``)."""
 
 import re
 from collections.abc import Iterable, Mapping

@@ -27,7 +27,7 @@ def pack_html(pack: "Pack") -> str:
     for split in dict.fromkeys(pack.column("split").tolist()):
         chosen = pack.rows(split)
         labelled = [int((pack.labels(task.name)[chosen] >= 0).sum()) for task in tasks]
-        ranges = [f"{low:.3g} to {high:.3g}" if num else "" for num, low, high in measured(pack, chosen)]
+        ranges = [f"{v['low']:.3g} to {v['high']:.3g}" if v["rows"] else "" for v in measured(pack, chosen)]
         rows.append((split, len(chosen), len(np.unique(pack.column("group")[chosen])), *labelled, *ranges))
     head = ["split", "rows", "groups", *(f"{task.name} ({len(task.classes)} classes), labelled" for task in tasks)]
     head += [f"{target.name}, {target.unit}" for task in pack.spec.values for target in task.targets]
@@ -36,13 +36,14 @@ def pack_html(pack: "Pack") -> str:
     return f"<p>{escape(repr(pack))}</p>{table(rows, head)}{pictures}"
 
 
-def measured(pack: "Pack", rows: np.ndarray) -> list[tuple[int, float, float]]:
-    """Number, lowest and highest value of each target of each task among ``rows``; NaN without any."""
+def measured(pack: "Pack", rows: np.ndarray) -> list[dict[str, Any]]:
+    """Each target with its task, its unit, the number of ``rows`` with a value, and the lowest and highest one."""
     found = []
     for task in pack.spec.values:
-        for values in pack.values(task)[rows].T:
+        for target, values in zip(task.targets, pack.values(task)[rows].T, strict=True):
             have = values[np.isfinite(values)]
-            found.append((len(have), *((float(have.min()), float(have.max())) if len(have) else (np.nan, np.nan))))
+            ends = {"low": float(have.min()), "high": float(have.max())} if len(have) else {"low": None, "high": None}
+            found.append({"task": task.name, "target": target.name, "unit": target.unit, "rows": len(have), **ends})
     return found
 
 

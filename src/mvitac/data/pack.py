@@ -7,13 +7,13 @@
            touch.npy         uint8 [N, size, size, 3 or 6]
 
 A pack stored as JPEG has ``vision.jpegs`` and ``touch.jpegs`` instead (``data/jpeg.py``) and columns bytes_<modality>.
-This module opens and checks packs; ``data/build.py`` builds them. It does not import torch.
+This module opens and checks packs; ``data/build.py`` builds them.
 """
 
 import functools
 import warnings
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
@@ -23,18 +23,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mvitac.data import notebook
-from mvitac.data.jpeg import Jpegs, Lazy
+from mvitac.data.jpeg import Jpegs
+from mvitac.data.lazy import Lazy
 from mvitac.data.pack_table import check_table
 from mvitac.data.spec import PHASES, AnyTask, DataSpec, ValueTask
+from mvitac.data.storage import FORMAT_VERSIONS, SUFFIXES, Store
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json
 
 FORMAT = "mvitac-pack"
 SHARDED = "mvitac-shards"
-FORMAT_VERSIONS = {"raw": 1, "jpeg": 2}  # format version by how images are stored
-SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}
 
-Store = Literal["raw", "jpeg"]
 Images = np.ndarray | Lazy
 
 
@@ -133,28 +132,28 @@ class Pack:
 
         With ``splits``, labels of rows in other splits (column ``Task.split``) are -1, too.
         """
-        if (task, *splits) not in self._answers:
-            about = next(t for t in self.spec.tasks if t.name == task)
-            known = self.column(f"label_{task}").astype(np.int64)
-            for name, value in about.only.items():
-                known[self.column(name).astype(str) != value] = -1
-            if splits:
-                known[~np.isin(self.column(about.split), splits)] = -1
-            self._answers[task, *splits] = known
-        return self._answers[task, *splits]
+        about = next(t for t in self.spec.tasks if t.name == task)
+        return self._known(about, splits, lambda: self.column(f"label_{task}").astype(np.int64), -1)
 
     def values(self, task: ValueTask, *splits: str) -> np.ndarray:
         """Return float64 values [N, T] of the targets of ``task``; NaN if not measured or excluded by ``task.only``.
 
         With ``splits``, values of rows in other splits (column ``ValueTask.split``) are NaN, too.
         """
+        names = [target.name for target in task.targets]
+        return self._known(task, splits, lambda: np.stack([self.column(n).astype(float) for n in names], 1), np.nan)
+
+    def _known(
+        self, task: AnyTask, splits: tuple[str, ...], read: Callable[[], np.ndarray], nothing: float
+    ) -> np.ndarray:
+        """What ``read`` returns, with ``nothing`` in rows that are not of the task or not in ``splits``, if any."""
         if (key := (repr(task), *splits)) not in self._answers:
-            found = np.stack([self.column(target.name).astype(float) for target in task.targets], axis=1)
+            known = read()
             for name, value in task.only.items():
-                found[self.column(name).astype(str) != value] = np.nan
+                known[self.column(name).astype(str) != value] = nothing
             if splits:
-                found[~np.isin(self.column(task.split), splits)] = np.nan
-            self._answers[key] = found
+                known[~np.isin(self.column(task.split), splits)] = nothing
+            self._answers[key] = known
         return self._answers[key]
 
     def answered(self, task: AnyTask, *splits: str) -> np.ndarray:

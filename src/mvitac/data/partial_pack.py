@@ -2,7 +2,7 @@
 
 Raw images are written directly to their final position. The position of a JPEG depends on the length of all before it, so
 each part writes its JPEGs to a file of its own, and these are joined in order. The part's own file is written last: a
-resumed build (``data/build.py``) verifies the checksums and repeats the parts that fail. This module does not import torch.
+resumed build (``data/build.py``) verifies the checksums and repeats the parts that fail.
 """
 
 import io

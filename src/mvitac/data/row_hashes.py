@@ -1,4 +1,4 @@
-"""Hashes of ids and groups of rows, by which packs find rows of each other. This module does not import torch."""
+"""Hashes of ids and groups of rows, by which packs find rows of each other."""
 
 import hashlib
 

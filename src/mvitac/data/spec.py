@@ -1,4 +1,4 @@
-"""Description of a dataset: modalities, tasks, groups, owner. Packing workers import it, so it does not import torch."""
+"""Description of a dataset: modalities, tasks, groups, owner."""
 
 import math
 from collections.abc import Sequence
@@ -161,6 +161,11 @@ class DataSpec:
     def all_tasks(self) -> tuple[AnyTask, ...]:
         """Tasks with classes, then tasks with values."""
         return (*self.tasks, *self.values)
+
+    @property
+    def split_columns(self) -> tuple[str, ...]:
+        """The columns with the splits of pre-training and of all tasks."""
+        return tuple(dict.fromkeys(("split", *(task.split for task in self.all_tasks))))
 
     def channels(self, modality: str) -> int:
         """Channels of an image as encoders get it: of all frames of a window together."""

@@ -6,13 +6,12 @@
           shard-00000.touch.npy     ...
 
 Touch groups are in random order and each in one shard (if it fits), so any few shards are a random sample
-(``data/sharding.py`` writes them). A ``StreamedPack`` has the interface of ``Pack``. This module does not import torch.
+(``data/sharding.py`` writes them). A ``StreamedPack`` has the interface of ``Pack``.
 """
 
 import functools
 import gc
 import itertools
-import os
 import shutil
 import threading
 from collections.abc import Callable, Iterable
@@ -24,8 +23,9 @@ import fsspec
 import numpy as np
 from filelock import FileLock, Timeout
 
-from mvitac.data.jpeg import Lazy
-from mvitac.data.pack import SHARDED, SUFFIXES, Images, Pack
+from mvitac.data.lazy import Pieces
+from mvitac.data.pack import SHARDED, Images, Pack
+from mvitac.data.storage import SUFFIXES
 from mvitac.registry import from_json
 from mvitac.system.files import brief, check_place, digest_file
 
@@ -119,7 +119,7 @@ class StreamedPack(Pack):
 
         self._cache = Cache(self.path, sizes, self._limit, lambda name: self._load(name, files[name], rows[name]))
         return {
-            m: Shards(self._shape(m, self.num), starts, functools.partial(self._shard, m)) for m in self.spec.modalities
+            m: Pieces(self._shape(m, self.num), starts, functools.partial(self._shard, m)) for m in self.spec.modalities
         }
 
     def _lengths(self, modality: str, starts: np.ndarray) -> np.ndarray:
@@ -162,22 +162,6 @@ class StreamedPack(Pack):
         except Exception as error:  # each kind of store raises its own
             raise ValueError(f"{self.url}/{name} cannot be read ({brief(error)})") from None
         part.replace(path)
-
-
-class Shards(Lazy):
-    """The images of one modality in all shards. Rows of the same shard are read together."""
-
-    def __init__(self, shape: tuple[int, int, int, int], starts: np.ndarray, shard: Callable[[int], Images]) -> None:
-        super().__init__(shape)
-        self._starts, self._shard = starts, shard
-
-    def _made(self, rows: np.ndarray) -> np.ndarray:
-        images = np.empty((len(rows), *self.shape[1:]), np.uint8)
-        numbers = np.searchsorted(self._starts, rows, side="right") - 1
-        for number in np.unique(numbers).tolist():
-            here = numbers == number
-            images[here] = self._shard(number)[rows[here] - self._starts[number]]
-        return images
 
 
 class Cache:
@@ -271,8 +255,3 @@ def _own_folder(cache: Path) -> tuple[Path, FileLock]:
             folder.mkdir(exist_ok=True)
             own = folder, lock
     raise AssertionError("unreachable: the numbers are unlimited")
-
-
-def share_of(cache_gb: float) -> int:
-    """Return this process's part of ``cache_gb`` in bytes (torchrun sets the number of processes per machine)."""
-    return int(cache_gb * 1e9) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))

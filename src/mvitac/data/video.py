@@ -2,7 +2,7 @@
 
 Frame i is the i-th in display order, from 0. Its position is read from the container's packet table, not computed from a
 nominal frame rate. The decoder starts at the last key frame before a run of wanted frames and skips the packets between
-runs, so a few touches in an hour of video are cheap. Packing workers import this module, so it does not import torch.
+runs, so a few touches in an hour of video are cheap.
 """
 
 import contextlib
@@ -24,6 +24,8 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from av.video.stream import VideoStream
 
 from mvitac.system.files import brief
+
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,20 @@ def frame_shape(path: str | Path) -> tuple[int, int]:
     return _packets(path).shape
 
 
+def frame_times(path: str | Path) -> np.ndarray:
+    """Return the display times in seconds [N], ascending; ValueError or OSError if it cannot be read as a video."""
+    with _opened(path) as (container, stream):
+        # As elsewhere here, frames cut off by an edit list do not count.
+        shown = [p.pts for p in container.demux(stream) if p.size and not p.is_discard and p.pts is not None]
+        return np.sort(np.array(shown, float)) * float(stream.time_base or 0)
+
+
+def spread(num: int, length: int, start: float = 0.0, end: float = 1.0) -> list[int]:
+    """Return at most ``num`` distinct frame numbers, evenly spaced between fractions ``start`` and ``end`` of ``length``."""
+    places = np.linspace(start * (length - 1), end * (length - 1), num)
+    return sorted({int(place) for place in np.rint(places)})
+
+
 def frames(
     path: str | Path, wanted: Iterable[int], size: int | None = None, *, lost: dict[int, str] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
@@ -82,7 +98,10 @@ def frames(
                 run = _Run(container, stream, pending.packets, key - 1)
             for number, frame in run.frames():
                 if pending.take(number, run.trouble):
-                    yield number, _rgb(reformatter, frame, size)
+                    # Bilinear as Pillow's resize (every source pixel counts), but directly from the decoder's planes.
+                    shape = {"width": size or frame.width, "height": size or frame.height}
+                    rgb = reformatter.reformat(frame, format="rgb24", interpolation=Interpolation.BILINEAR, **shape)
+                    yield number, rgb.to_ndarray()
                 if not pending or pending.is_nearer_from(key, run.fed):
                     break
             else:
@@ -132,18 +151,6 @@ class _Pending:
         if self._lost is None:
             raise ValueError(f"{self._path}: frame {frame} {why}")
         self._lost[frame] = why
-
-
-def _rgb(reformatter: VideoReformatter, frame: VideoFrame, size: int | None) -> np.ndarray:
-    """Resize bilinearly as Pillow does (every source pixel counts), but directly from the decoder's planes."""
-    made = reformatter.reformat(
-        frame,
-        width=size or frame.width,
-        height=size or frame.height,
-        format="rgb24",
-        interpolation=Interpolation.BILINEAR,
-    )
-    return made.to_ndarray()
 
 
 class _Run:

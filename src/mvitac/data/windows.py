@@ -1,17 +1,18 @@
 """Windows: a row that shows several frames of its touch, the current one and earlier ones, stacked on channels.
 
 A pack stores every frame once. ``windowed`` opens it so that ``pack.images`` gives windows, found by index when they are
-read. A window never crosses the edge of a touch (column touch_group, else group). This module does not import torch.
+read. A window never crosses the edge of a touch (column touch_group, else group).
 """
 
 import copy
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 
 from mvitac.data.images import difference
-from mvitac.data.jpeg import Lazy
+from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import Window
 from mvitac.registry import unknown
@@ -37,16 +38,16 @@ def windowed(pack: Pack, window: Window) -> Pack:
     for modality in window.of:
         if modality not in pack.spec.modalities:
             raise unknown("modality of windows", modality, pack.spec.modalities)
-    index, whole = frames_of(pack, window)
+    index, whole, first = frames_of(pack, window)
     made = copy.copy(pack)
     made.spec = replace(pack.spec, window=replace(window, order=places(pack, window)[0]))
     for name in ("_answers", "hidden"):
         made.__dict__.pop(name, None)  # kept from before rows were left out
     made.digests = {**pack.digests, "window": digest([window.frames, window.stride, *window.of, window.minus_first])}
-    first = _first_rows(pack, window) if window.minus_first else None
-    made.images = {m: Windows(pack.images[m], index, first) if m in window.of else pack.images[m] for m in pack.images}
+    rest = first if window.minus_first else None
+    made.images = {m: Windows(pack.images[m], index, rest) if m in window.of else pack.images[m] for m in pack.images}
     if window.short == "leave-out":
-        for name in dict.fromkeys(("split", *(task.split for task in pack.spec.all_tasks))):
+        for name in pack.spec.split_columns:
             kept = [split if full else "hidden" for split, full in zip(pack.column(name), whole, strict=True)]
             made.table = made.table.set_column(made.table.schema.get_field_index(name), name, pa.array(kept))
     return made
@@ -73,14 +74,22 @@ class Windows(Lazy):
         return found.transpose(0, 2, 3, 1, 4).reshape(num, height, width, frames * channels)
 
 
-def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Row numbers of each row's frames [N, F], newest first, and bool [N]: whether its touch is long enough for all."""
+def recordings(pack: Pack, place: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the rows of each touch in the order of ``place`` [N]."""
+    for group in range(int(pack.touch_groups.max()) + 1):
+        rows = pack.rows_of(group)
+        yield rows[np.argsort(place[rows], kind="stable")]
+
+
+def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row numbers of each row's frames [N, F], newest first; bool [N], whether its touch is long enough for all; and the
+    number [N] of the first row of its touch.
+    """
     name, place = places(pack, window)
     back = window.stride * np.arange(window.frames)
     index, whole = np.zeros((pack.num, window.frames), np.int64), np.zeros(pack.num, bool)
-    for group in range(int(pack.touch_groups.max()) + 1):
-        rows = pack.rows_of(group)
-        rows = rows[np.argsort(place[rows], kind="stable")]
+    first = np.zeros(pack.num, np.int64)
+    for rows in recordings(pack, place):
         times = place[rows]
         if (same := np.diff(times) == 0).any():
             at = times[int(np.flatnonzero(same)[0])]
@@ -97,12 +106,13 @@ def frames_of(pack: Pack, window: Window) -> tuple[np.ndarray, np.ndarray]:
         asked = times[:, None] - back  # the newest frame that is old enough, else the first
         index[rows] = rows[np.maximum(np.searchsorted(times, asked + 1e-9, side="right") - 1, 0)]
         whole[rows] = asked[:, -1] >= times[0] - 1e-9
+        first[rows] = rows[0]
     if not whole.any():
         raise ValueError(
             f"frames {window.frames} at stride {window.stride:g} are longer than every touch of {pack.spec.name!r}: give"
             " fewer frames or a smaller stride"
         )
-    return index, whole
+    return index, whole, first
 
 
 def _touch(pack: Pack, rows: np.ndarray) -> str:
@@ -127,11 +137,3 @@ def places(pack: Pack, window: Window) -> tuple[str, np.ndarray]:
         row = int(np.flatnonzero(~np.isfinite(place))[0])
         raise ValueError(f"frames: column {name!r} is not a number in row {row}: give all rows one, or another order")
     return name, place
-
-
-def _first_rows(pack: Pack, window: Window) -> np.ndarray:
-    """int64 [N]: the first row of each row's touch."""
-    _, place = places(pack, window)
-    order = np.lexsort((place, pack.touch_groups))
-    _, start = np.unique(pack.touch_groups[order], return_index=True)
-    return order[start][pack.touch_groups]

@@ -1,7 +1,4 @@
-"""Datasets, one file (or folder) each. Importing this package imports and registers all of them.
-
-Packing workers import this package, so it does not import torch.
-"""
+"""Datasets, one file (or folder) each. Importing this package imports and registers all of them."""
 
 from mvitac.datasets.base import DatasetConfig
 from mvitac.registry import import_all

@@ -1,18 +1,18 @@
 """The base class of dataset configs. A config gives a source of samples; all other code reads the pack made from it."""
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from mvitac.data.build import build, check_request, stored_as
-from mvitac.data.jpeg import QUALITY
-from mvitac.data.pack import Pack, Store
-from mvitac.data.source import Source
+from mvitac.data.pack import Pack
 from mvitac.data.spec import Window
+from mvitac.data.storage import QUALITY, Store, check_request, stored_as
 from mvitac.data.windows import windowed
 from mvitac.registry import LATER, Registered
 from mvitac.system.files import cache_dir, check_place, digest
+
+if TYPE_CHECKING:
+    from mvitac.data.source import Source
 
 WINDOW = ("num_frames", "stride", "frames_of", "order", "short", "minus_first")
 """Options that say which frames a row shows. A pack stores every frame once, whatever they are."""
@@ -21,7 +21,7 @@ KEEPING = ("size", "workers", "store", "quality", *WINDOW)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DatasetConfig(Registered, ABC):
+class DatasetConfig(Registered):
     """Base class of dataset configs. A new dataset is one file with a ``Source`` and a config."""
 
     local: ClassVar[tuple[str, ...]] = ("workers",)
@@ -72,15 +72,15 @@ class DatasetConfig(Registered, ABC):
         """Fields that do not change the outcome of a run: local options, and how raw pixels would be compressed."""
         return (*self.local, "store", "quality") if self.store == "raw" else self.local
 
-    @abstractmethod
-    def source(self) -> Source:
-        """Return the source of samples; ValueError if the data does not exist."""
+    def source(self) -> "Source":
+        """Return the source of samples; ValueError if the data does not exist, or is packed already."""
+        raise ValueError(f"--data {self.name} reads packs: there is nothing to pack, use it to train and to probe")
 
     def on_new_sensor(self) -> "DatasetConfig | None":
         """Some of the same groups, touched with a sensor that this dataset never shows; None if there is none."""
         return None
 
-    def place(self, source: Source | None = None) -> Path:
+    def place(self, source: "Source | None" = None) -> Path:
         """Return the folder in the cache where ``open`` builds the pack of ``source``, by default of this dataset."""
         source = source or self.source()
         kept = stored_as(self.store, self.quality)
@@ -110,4 +110,6 @@ class DatasetConfig(Registered, ABC):
             check_place(path)
         except ValueError as error:
             raise ValueError(f"the cache of packs: {error} with MVITAC_CACHE") from None
+        from mvitac.data.build import build  # what is packed already needs no builder
+
         return build(source, path, quiet=quiet, exist_ok=True, **self.build_options())

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from mvitac.data.build import check_request
 from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import SHARDED, Pack
-from mvitac.data.source import Source
+from mvitac.data.storage import check_request
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
+from mvitac.datasets.table.manifest import number_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +63,6 @@ class MixConfig(DatasetConfig):
             found.append((name or Path(folder).resolve().name, Path(folder), weighs))
         return found
 
-    def source(self) -> Source:
-        raise ValueError("a mix is not packed: its parts are packs already, and are read where they are")
-
     def _frames(self, quiet: bool) -> Pack:
         given = self.named_parts()
         if len(given) < 2:
@@ -93,10 +90,7 @@ def open_packs(folders: Sequence[str]) -> Pack:
 
 
 def _weight(text: str, part: str) -> float:
-    try:
-        weight = float(text)
-    except ValueError:
-        weight = math.nan
-    if not 0 < weight < math.inf:
+    weight = number_of(text)
+    if weight is None or weight <= 0:
         raise ValueError(f"part {part!r} has weight {text!r}: give a positive number, or leave the part out")
     return weight

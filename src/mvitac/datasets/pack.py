@@ -1,5 +1,6 @@
 """Packs as datasets: a folder on disk (``pack``) or shards at a URL (``stream``)."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -7,7 +8,6 @@ from typing import ClassVar, Literal
 import pyarrow as pa
 
 from mvitac.data.pack import Pack
-from mvitac.data.source import Source
 from mvitac.datasets.base import DatasetConfig
 from mvitac.system.files import cache_dir
 
@@ -25,15 +25,12 @@ class PackConfig(DatasetConfig):
     """val: use split val as the test split and hide test, to choose a recipe by `mvitac compare` without its test
     scores."""
 
-    def source(self) -> Source:
-        raise ValueError(f"{self.path} is a pack already: use it with --data pack, there is nothing to pack")
-
     def _frames(self, quiet: bool) -> Pack:
         pack = Pack(self.path)
         if self.score_on == "val":
             if not len(pack.rows("val")):
                 raise ValueError(f"{self.path} has no split val to score on: leave out --data.score-on")
-            for name in {"split", *(task.split for task in pack.spec.all_tasks)}:
+            for name in pack.spec.split_columns:
                 column = [{"test": "hidden", "val": "test"}.get(split, split) for split in pack.column(name)]
                 pack.table = pack.table.set_column(pack.table.schema.get_field_index(name), name, pa.array(column))
         return pack
@@ -62,11 +59,9 @@ class StreamConfig(DatasetConfig):
         if not 0 < self.cache_gb < float("inf"):
             raise ValueError(f"cache_gb {self.cache_gb}: give a positive number of gigabytes")
 
-    def source(self) -> Source:
-        raise ValueError(f"{self.url} holds a pack in shards: use it with --data stream, there is nothing to pack")
-
     def _frames(self, quiet: bool) -> Pack:
-        from mvitac.data.streaming import StreamedPack, share_of
+        from mvitac.data.streaming import StreamedPack
 
         cache = self.cache or cache_dir() / "shards"
-        return StreamedPack(self.url, cache, limit=share_of(self.cache_gb), window=self.window)
+        limit = int(self.cache_gb * 1e9) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # torchrun sets it
+        return StreamedPack(self.url, cache, limit=limit, window=self.window)

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from mvitac.data.video import num_frames
+from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.datasets.table.video_times import spread
 from mvitac.system.files import brief
 
 LABELS = {

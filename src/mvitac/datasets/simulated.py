@@ -4,7 +4,7 @@ They are the default data: every experiment runs without a download. Results are
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Annotated, Any, ClassVar
 
@@ -15,7 +15,7 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import LATER, LATER_IN_DIGEST, unknown
+from mvitac.registry import LATER, LATER_IN_DIGEST, to_json, unknown
 from mvitac.sim import grasps, materials
 from mvitac.sim.sensors import SENSORS, Sensor, random_sensors
 
@@ -55,10 +55,10 @@ class SimulatedConfig(DatasetConfig):
             raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
 
     def _fingerprint(self, version: int) -> dict[str, Any]:
-        own = {key: value for key, value in asdict(self).items() if key == "size" or key not in KEEPING}
-        if not self.contact:  # omitted, to keep old digests valid
-            del own["contact"]
-        return {"simulator": self.name, "version": version, **own}
+        own = {
+            key: value for key, value in to_json(self, for_digest=True).items() if key == "size" or key not in KEEPING
+        }
+        return {"simulator": own.pop("name"), "version": version, **own}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +83,10 @@ class MaterialsConfig(SimulatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_sensors()
         if self.touches < 1:
             raise ValueError(f"touches {self.touches}: give touches per instance, at least 1")
         if not 1 <= self.moments <= 1000:
             raise ValueError(f"moments {self.moments}: give moments per touch, 1 to 1000")
-
-    def _check_sensors(self) -> None:
         for name in self.makes:
             if name not in SENSORS:
                 raise unknown("sensor", name, SENSORS)
@@ -152,9 +149,9 @@ class Materials(Source):
 
     def fingerprint(self) -> dict[str, Any]:
         known = self.config._fingerprint(materials.VERSION)
-        # omitted at their defaults, to keep old digests valid
-        later = {"difference": False, "moments": 1, "makes": (), "sensors": 0, "sensors_per_press": 1}
-        return {k: v for k, v in known.items() if k not in later or v != later[k]}
+        if not self.config.difference:  # omitted, to keep old digests valid
+            del known["difference"]
+        return known
 
     def samples_per_item(self) -> list[int]:
         return [self.config.moments * self.config.sensors_per_press] * self.config.num

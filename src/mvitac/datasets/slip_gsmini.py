@@ -14,11 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from mvitac.data.video import num_frames
+from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.splits import add_folds
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.datasets.table.video_times import spread
 from mvitac.system.files import digest_file
 
 FINGERS = {"left": "camera_0.avi", "right": "camera_2.avi"}

@@ -30,8 +30,8 @@ from mvitac.model import Model
 from mvitac.model_files import fresh
 from mvitac.nn.encoders import SCRATCH
 from mvitac.run import Run
-from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
+from mvitac.system.threads import in_threads
 
 CONTROLS = ("imagenet", "untrained", "pixels", "border", "majority", "mean")
 """Names of the controls in the order of a table. The dataset's own controls come before the last two, of which a task has

@@ -31,8 +31,8 @@ from mvitac.nn.encoders import build_trunk
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.run import Run, load_run
 from mvitac.system.files import check_place, digest_file, read_json, write_json
-from mvitac.system.processes import in_threads
 from mvitac.system.progress import work
+from mvitac.system.threads import in_threads
 
 Probed = tuple[Path, Model, str, list[Source] | None]  # a run: folder, model, name, and what it learned from
 END_TO_END = ", end to end"

@@ -14,7 +14,7 @@ from torch import nn
 from torch.optim.swa_utils import update_bn
 
 from mvitac.data.joined_pack import JoinedPack
-from mvitac.data.jpeg import Lazy
+from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.data.spec import listed
 from mvitac.evaluation import diagnostics

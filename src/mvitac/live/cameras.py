@@ -9,16 +9,15 @@ import re
 from abc import ABC, abstractmethod
 from collections import deque
 from pathlib import Path
-from typing import Any
 
+import av
 import numpy as np
+from av.error import FFmpegError
 
-from mvitac.data.images import decode
+from mvitac.data.images import IMAGES, decode
+from mvitac.data.video import VIDEOS
 from mvitac.sim.sensors import SENSORS
 from mvitac.system.files import brief
-
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 
 
 class Ended(Exception):
@@ -42,27 +41,7 @@ class Source(ABC):
         pass
 
 
-class _Capture(Source):
-    """Frames that OpenCV reads; ``open`` makes ``capture``."""
-
-    capture: Any
-
-    def read(self) -> np.ndarray:
-        good, image = self.capture.read()
-        if not good:
-            raise self.ended()
-        return np.ascontiguousarray(image[..., ::-1])  # OpenCV's frames are BGR
-
-    @abstractmethod
-    def ended(self) -> Exception:
-        """The error if there is no frame."""
-
-    def close(self) -> None:
-        if hasattr(self, "capture"):
-            self.capture.release()
-
-
-class Camera(_Capture):
+class Camera(Source):
     """A UVC camera by index, device path or USB serial number; DIGIT and GelSight Mini are such cameras."""
 
     def __init__(self, which: str, size: tuple[int, int] | None = None, fps: float | None = None) -> None:
@@ -98,11 +77,18 @@ class Camera(_Capture):
             )
         self.fps = given[2] or 30.0
 
-    def ended(self) -> Exception:
-        return OSError(f"camera {self.which} gives no frames")
+    def read(self) -> np.ndarray:
+        good, image = self.capture.read()
+        if not good:
+            raise OSError(f"camera {self.which} gives no frames")
+        return np.ascontiguousarray(image[..., ::-1])  # OpenCV's frames are BGR
+
+    def close(self) -> None:
+        if hasattr(self, "capture"):
+            self.capture.release()
 
 
-class Video(_Capture):
+class Video(Source):
     """A video file, at its own frame rate."""
 
     paced = False
@@ -111,15 +97,24 @@ class Video(_Capture):
         self.path = path
 
     def open(self) -> None:
-        import cv2
+        try:
+            self.file = av.open(str(self.path))
+            self.fps = float(self.file.streams.video[0].average_rate or 30)
+        except (FFmpegError, IndexError) as error:
+            raise OSError(f"{self.path} cannot be read as a video ({brief(error)})") from None
+        self.frames = self.file.decode(video=0)
 
-        self.capture = cv2.VideoCapture(str(self.path))
-        if not self.capture.isOpened():
-            raise OSError(f"{self.path} cannot be read as a video")
-        self.fps = self.capture.get(cv2.CAP_PROP_FPS) or 30.0
+    def read(self) -> np.ndarray:
+        try:
+            for frame in self.frames:
+                return frame.to_ndarray(format="rgb24")
+        except FFmpegError as error:  # the file is damaged here, and ends
+            raise ValueError(brief(error)) from None
+        raise Ended
 
-    def ended(self) -> Exception:
-        return Ended()
+    def close(self) -> None:
+        if hasattr(self, "file"):
+            self.file.close()
 
 
 class Folder(Source):
@@ -131,9 +126,9 @@ class Folder(Source):
         self.path, self.fps = path, fps
 
     def open(self) -> None:
-        self.left = deque(sorted(p for p in self.path.iterdir() if p.suffix.lower() in PICTURES))
+        self.left = deque(sorted(p for p in self.path.iterdir() if p.suffix.lower() in IMAGES))
         if not self.left:
-            raise OSError(f"{self.path} holds no pictures ({', '.join(PICTURES)})")
+            raise OSError(f"{self.path} holds no pictures ({', '.join(IMAGES)})")
 
     def read(self) -> np.ndarray:
         if not self.left:
@@ -198,7 +193,8 @@ def source(text: str, modality: str) -> Source:
         return Simulated(modality, int(seed))
     mode = MODE.fullmatch(text)
     if mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
-        _need_opencv(text)
+        if importlib.util.find_spec("cv2") is None:
+            raise ValueError(f"source {text!r} needs OpenCV: pip install -e '.[live]' in mvitac's clone")
         size = (int(mode["width"]), int(mode["height"])) if mode["width"] else None
         return Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
     name, at, rate = text.rpartition("@")
@@ -211,7 +207,6 @@ def source(text: str, modality: str) -> Source:
             raise ValueError(f"source {text!r}: {fps!r} is no frame rate, give e.g. {path}@30") from None
         return _readable(Folder(path, float(fps)), text)
     if path.is_file() and path.suffix.lower() in VIDEOS:
-        _need_opencv(text)
         return _readable(Video(path), text)
     what = "" if path.exists() else f"there is no {path} here; "
     raise ValueError(
@@ -228,8 +223,3 @@ def _readable(files: Source, text: str) -> Source:
         raise ValueError(f"source {text!r}: {brief(error)}, give another") from None
     files.close()
     return files
-
-
-def _need_opencv(text: str) -> None:
-    if importlib.util.find_spec("cv2") is None:
-        raise ValueError(f"source {text!r} needs OpenCV: pip install -e '.[live]' in mvitac's clone")

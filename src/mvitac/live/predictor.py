@@ -109,8 +109,9 @@ class Live:
         self.all = [s for several in streams.values() for s in several]
         self.leading = (streams.get("touch") or streams["vision"])[0]  # the stream whose new frames start predictions
         _check_window(engine)
-        self.minus_rest = engine.difference or _minus_first(engine)
-        """Whether the learned background is subtracted from touch."""
+        window = engine.window or {"minus_first": False}
+        self.minus_rest = engine.difference or (window["minus_first"] and "touch" in window["of"])
+        """Whether the learned background is subtracted from touch. It also stands for the first frame of a touch."""
         side = engine.inputs["touch"][0] if self.minus_rest and "touch" in streams else 0
         self._since: dict[str, float] = {}
         self.contacts = {s.name: Contact(config, side) for s in streams.get("touch", ())}
@@ -279,7 +280,13 @@ class Live:
         """The values of a touch by task: of its newest frame, with the range over the touch."""
         if touch is None or not touch.num_frames:
             return {}
-        return {task: _readings(targets, *touch.values[task]) for task, targets in self.engine.values.items()}
+        return {
+            task: [
+                Reading(target["name"], target["unit"], new, spread_at(target, new), low, high)
+                for target, (new, low, high) in zip(targets, np.stack(touch.values[task], 1).tolist(), strict=True)
+            ]
+            for task, targets in self.engine.values.items()
+        }
 
     def prediction(self) -> dict[str, Any]:
         """The newest prediction of the current touch, JSON-ready; without contact, that alone."""
@@ -307,20 +314,6 @@ class Live:
             },
             "events": dict(self.counts),
         }
-
-
-def _readings(targets: Sequence[dict[str, Any]], *found: np.ndarray) -> list[Reading]:
-    """One reading per target, of its newest, lowest and highest value ``found``."""
-    readings = []
-    for target, new, low, high in zip(targets, *(values.tolist() for values in found), strict=True):
-        spread = spread_at(target, new)
-        readings.append(Reading(target["name"], target["unit"], new, spread, low, high))
-    return readings
-
-
-def _minus_first(engine: Engine) -> bool:
-    """Whether windows of touch are minus the first frame of their touch, for which the learned background stands."""
-    return bool(engine.window and engine.window["minus_first"] and "touch" in engine.window["of"])
 
 
 def _check_window(engine: Engine) -> None:

@@ -37,8 +37,6 @@ class Recorder:
     ) -> None:
         """Record into the new folder ``out``; ``channels``: modality -> C of its images, uint8 [S, S, C].
 
-        ``tell`` is called when recording ends early.
-
         ``fps`` is the maximum number of pairs per second, a whole number for lerobot. ``sensor`` is the name of the touch
         sensor, if it is known (column sensor).
         """

@@ -31,7 +31,7 @@ from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_nu
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum, momentum_at
 from mvitac.registry import LATER_IN_DIGEST
-from mvitac.system.processes import in_branches
+from mvitac.system.threads import in_branches
 
 PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
 """loss -> (modality of its queries, modality of its keys)."""

@@ -6,6 +6,7 @@ import numpy as np
 from PIL import Image
 
 from mvitac.data.image_grid import Block, Tile, draw
+from mvitac.data.spec import PHASES
 from mvitac.report.palette import colour
 from mvitac.sim import grasps, materials, objects
 
@@ -32,12 +33,12 @@ def grasps_sheet(seed: int, side: int) -> Image.Image:
         tiles = []
         for success, frame in enumerate(("vermilion", "green")):
             phases = found.get(success)
-            for phase in range(len(grasps.PHASES)):
+            for phase in range(len(PHASES)):
                 blank = np.full((side, 3 * side, 3), 255, np.uint8)
                 parts = [phases[phase][k] for k in ("vision", "touch_left", "touch_right")] if phases else [blank]
                 tiles.append(Tile(np.concatenate(parts, axis=1), frame=colour(frame)))
         blocks.append(Block(name, tiles))
-    heads = [f"{outcome}: {phase}" for outcome in ("failed", "held") for phase in grasps.PHASES]
+    heads = [f"{outcome}: {phase}" for outcome in ("failed", "held") for phase in PHASES]
     title = (
         "Simulated grasps of every shape, before, during and after the lift; each time: camera, left touch, right touch"
     )

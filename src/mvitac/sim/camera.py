@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from mvitac.sim import objects
+from mvitac.sim.physics import Bench
 
 SAMPLES = 2  # rays per pixel along each axis
 
@@ -102,23 +103,22 @@ def _pair(rng: np.random.Generator) -> np.ndarray:
     return np.clip([color, color * rng.uniform(0.7, 1.3) + rng.normal(0, 0.03, 3)], 0.02, 0.95)
 
 
-def photograph(
-    model: mujoco.MjModel, data: mujoco.MjData, thing: objects.Thing, view: View, rng: np.random.Generator, *, size: int
-) -> np.ndarray:
+def photograph(bench: Bench, view: View, rng: np.random.Generator, *, size: int) -> np.ndarray:
     """Return the picture, uint8 [size, size, 3]. Moves the clutter; ``rng`` is used for pixel noise only."""
-    data.mocap_pos[:], data.mocap_quat[:] = view.clutter_poses[:, :3], view.clutter_poses[:, 3:]
-    mujoco.mj_kinematics(model, data)
+    poses = view.clutter_poses
+    bench.data.mocap_pos[:], bench.data.mocap_quat[:] = poses[:, :3], poses[:, 3:]
+    mujoco.mj_kinematics(bench.model, bench.data)
     rays = _rays(view, size * SAMPLES)
-    geom, distance, normal = cast(model, data, view.position, rays)
+    geom, distance, normal = cast(bench, view.position, rays)
     points = view.position + rays * distance[:, None]
     hit = geom >= 0
-    albedo, gloss, glow = _surface(model, data, thing, view, geom, points, rays)
+    albedo, gloss, glow = _surface(bench, view, geom, points, rays)
 
     to_lamp = view.lamp - points
     to_lamp /= np.linalg.norm(to_lamp, axis=1, keepdims=True)
     facing = np.sum(normal * to_lamp, axis=1)
     lit = hit & (facing > 0)
-    shadowed = _shadow(model, data, view.lamp, points, lit)
+    shadowed = _shadow(bench, view.lamp, points, lit)
     direct = np.clip(facing, 0, None) * ~shadowed
     half = to_lamp - rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -148,55 +148,44 @@ def _rays(view: View, side: int) -> np.ndarray:
 
 
 def cast(
-    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray, groups: np.ndarray = VISIBLE
+    bench: Bench, origin: np.ndarray, rays: np.ndarray, groups: np.ndarray = VISIBLE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return geom [P] (-1: none), distance [P] (0 if none) and normal [P, 3] of the first hit of each ray."""
-    count = len(rays)
-    geom, distance = np.full(count, -1, np.int32), np.zeros(count)
-    normal = np.zeros(3 * count)
-    mujoco.mj_multiRay(
-        model, data, origin, np.ascontiguousarray(rays).ravel(), groups, True, -1, geom, distance, normal, count, 10.0
-    )
+    count, flat = len(rays), np.ascontiguousarray(rays).ravel()
+    geom, distance, normal = np.full(count, -1, np.int32), np.zeros(count), np.zeros(3 * count)
+    scene = bench.model, bench.data
+    mujoco.mj_multiRay(*scene, origin, flat, groups, True, -1, geom, distance, normal, count, 10.0)
     return geom, np.where(geom >= 0, distance, 0.0), normal.reshape(-1, 3)
 
 
-def _shadow(
-    model: mujoco.MjModel, data: mujoco.MjData, lamp: np.ndarray, points: np.ndarray, lit: np.ndarray
-) -> np.ndarray:
+def _shadow(bench: Bench, lamp: np.ndarray, points: np.ndarray, lit: np.ndarray) -> np.ndarray:
     """Return which of the points [P, 3] are in shadow; only those in ``lit`` are tested."""
     away = points[lit] - lamp
     length = np.linalg.norm(away, axis=1)
-    geom, distance, _ = cast(model, data, lamp, away / length[:, None])
+    geom, distance, _ = cast(bench, lamp, away / length[:, None])
     shadowed = np.zeros(len(points), bool)
     shadowed[lit] = (geom >= 0) & (distance < length - 1e-3)
     return shadowed
 
 
 def _surface(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    thing: objects.Thing,
-    view: View,
-    geom: np.ndarray,
-    points: np.ndarray,
-    rays: np.ndarray,
+    bench: Bench, view: View, geom: np.ndarray, points: np.ndarray, rays: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return colour [P, 3], gloss [P] and emitted light [P] of the surface that each ray hits."""
-    albedo, gloss, glow = (values[geom] for values in _finishes(model, view))
-    body = model.body("thing").id
-    for part, i in zip(thing.parts, np.flatnonzero(model.geom_bodyid == body), strict=True):
+    albedo, gloss, glow = (values[geom] for values in _finishes(bench.model, view))
+    finish, data = bench.thing.finish, bench.data
+    for part, i in zip(bench.thing.parts, bench.parts, strict=True):
         seen = geom == i
         if not seen.any():
             continue
         if part.density > 1.2:
             albedo[seen], gloss[seen] = [0.42, 0.43, 0.45], 1.0
             continue
-        finish = thing.finish
-        local = (points[seen] - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+        local = (points[seen] - data.xpos[bench.body]) @ data.xmat[bench.body].reshape(3, 3)
         mix = 0.5 + 0.5 * np.tanh(3 * finish.printed(1000 * local))
         albedo[seen] = finish.color + (finish.accent - finish.color) * mix[:, None]
         gloss[seen] = finish.gloss
-    table = geom == model.geom("table").id
+    table = geom == bench.model.geom("table").id
     albedo[table] = _table(view, points[table])
     wall = geom < 0
     albedo[wall] = _wall(view, rays[wall])

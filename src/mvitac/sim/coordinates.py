@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from mvitac.sim.gel import F
 
+Place = NDArray[np.float64]  # (x, y), in mm unless said otherwise
+
 
 def grid(size: int, width_mm: float) -> tuple[F, F, float]:
     """Return x, y [n, n] in mm and mm per pixel of the internal picture, which is twice as fine if `size` is small."""
@@ -17,7 +19,7 @@ def grid(size: int, width_mm: float) -> tuple[F, F, float]:
     return x, y, pixel
 
 
-def turn(x: F, y: F, angle: float, place: NDArray[np.float64]) -> tuple[F, F]:
+def turn(x: F, y: F, angle: float, place: Place) -> tuple[F, F]:
     """Turn x, y [n, n] by ``angle`` in radians, then shift them by ``place`` (x, y) in mm."""
     cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
     return cos * x + sin * y + np.float32(place[0]), cos * y - sin * x + np.float32(place[1])
@@ -50,9 +52,9 @@ class Motion:
     """
 
     turn: float  # rotation of the camera in radians
-    shift: NDArray[np.float64]  # shift of the camera picture (x, y) in parts of its width
+    shift: Place  # shift of the camera picture (x, y) in parts of its width
     zoom: float  # factor of the camera's field of view
-    slip: NDArray[np.float64]  # movement of the object over the gel (x, y) in mm
+    slip: Place  # movement of the object over the gel (x, y) in mm
     force: float  # factor of the force, at least 1
     noise: np.random.Generator  # source of the pixel noise of both pictures
 
@@ -75,7 +77,7 @@ class Motion:
         dx, dy = (np.float32(part * width) for part in self.shift)
         return cos * x + sin * y + dx, cos * y - sin * x + dy
 
-    def felt(self, x: F, y: F, force: float, shear: NDArray[np.float64]) -> tuple[F, F, float, NDArray[np.float64]]:
+    def felt(self, x: F, y: F, force: float, shear: Place) -> tuple[F, F, float, Place]:
         """Gel coordinates x, y [n, n] in mm, force in N and shear in mm. The gel follows half of the slip."""
         dx, dy = (np.float32(part) for part in self.slip)
         return x - dx, y - dy, force * self.force, shear + self.slip / 2

@@ -3,8 +3,8 @@
 Shapes: H, W pixels of a height map, row 0 at the top, x to the right, y down; heights and imprints in mm, forces in N.
 
     press()       object relief [H, W] mm  ->  imprint [H, W] mm (displacement of the gel towards the camera)
+    contact()     object relief [H, W] mm  ->  depth, place and size of the contact
     render()      imprint [H, W] mm        ->  picture [H, W, 3] uint8 of one `Sensor`
-    background()  the same sensor without contact
 
 The gel is a Winkler foundation, independent springs (Johnson, Contact Mechanics, 1985, section 4.3), under a membrane.
 Colour is almost linear in slope and saturates: gels have matt paint and are lit at a grazing angle, with one colour of LED
@@ -12,6 +12,7 @@ per side. A Lambertian model with an overhead term is much too grey (compare Joh
 and dots of `SENSORS` were set by eye, by comparison with pictures of real sensors; no real picture is used.
 """
 
+import math
 from functools import lru_cache
 from typing import Any
 
@@ -19,13 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from mvitac.sim.sensors import SENSORS, Sensor
+from mvitac.sim.sensors import SENSORS, Pair, Sensor
 
-__all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "background", "press", "pressure", "relax", "render"]
+__all__ = ["GEL_STIFFNESS", "SENSORS", "Sensor", "area_resize", "contact", "press", "pressure", "relax", "render"]
 
 F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
-Pair = tuple[float, float]
-
 GEL_STIFFNESS = 0.06  # Winkler modulus of the gel in N/mm^3: about 0.2 MPa over 3 to 4 mm
 
 MEMBRANE_MM = (0.12, 0.35, 0.9)
@@ -34,17 +33,14 @@ MEMBRANE_MM = (0.12, 0.35, 0.9)
 MEMBRANE_SAG = 0.8
 """Relative height of the bridge: the gel behind pushes the membrane into the gap, so shallow grooves remain visible."""
 
+KNOWN = ("depth_mm", "contact_x_mm", "contact_y_mm", "patch_mm2")
+"""What ``contact`` returns."""
+
 _TAG = 0x6E1
 
 
 def pressure(
-    relief_mm: F,
-    *,
-    force_n: float,
-    stiffness: float,
-    pixel_mm: float,
-    dome_radius_mm: float | None = 25.0,
-    gel_stiffness: float = GEL_STIFFNESS,
+    relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float | None = 25.0
 ) -> F:
     """Return the contact pressure [H, W] in N/mm^2 whose integral over the picture is `force_n`.
 
@@ -53,11 +49,8 @@ def pressure(
     """
     if relief_mm.ndim != 2:
         raise ValueError(f"relief_mm must be [H, W], got shape {relief_mm.shape}: pass one height map in mm")
-    if force_n < 0 or stiffness <= 0 or pixel_mm <= 0 or gel_stiffness <= 0:
-        raise ValueError(
-            f"need force_n >= 0 and stiffness, pixel_mm, gel_stiffness > 0, got {force_n=}, {stiffness=}, {pixel_mm=}, "
-            f"{gel_stiffness=}"
-        )
+    if force_n < 0 or stiffness <= 0 or pixel_mm <= 0:
+        raise ValueError(f"need force_n >= 0 and stiffness, pixel_mm > 0, got {force_n=}, {stiffness=}, {pixel_mm=}")
     if force_n == 0:
         return np.zeros(relief_mm.shape, np.float32)
     height = np.array(relief_mm, np.float64)
@@ -66,7 +59,7 @@ def pressure(
         height -= (x * x + y * y) / (2 * dome_radius_mm)
     # -inf means "no object here"; a gap of 50 mm is equivalent and keeps the arithmetic finite
     gap = np.minimum(height.max() - height, 50.0)
-    spring = stiffness * gel_stiffness / (stiffness + gel_stiffness) * pixel_mm**2  # N per mm and pixel
+    spring = stiffness * GEL_STIFFNESS / (stiffness + GEL_STIFFNESS) * pixel_mm**2  # N per mm and pixel
     gaps = np.sort(gap, axis=None)
     count = np.arange(1, gaps.size + 1)
     approach = (force_n / spring + np.cumsum(gaps)) / count  # if exactly the first `count` pixels touch
@@ -75,15 +68,7 @@ def pressure(
     return (overlap * (spring / pixel_mm**2)).astype(np.float32)
 
 
-def press(
-    relief_mm: F,
-    *,
-    force_n: float,
-    stiffness: float,
-    pixel_mm: float,
-    dome_radius_mm: float | None = 25.0,
-    gel_stiffness: float = GEL_STIFFNESS,
-) -> F:
+def press(relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float | None = 25.0) -> F:
     """Press an object into the gel: the imprint [H, W] in mm.
 
     A soft object deforms, too, so its contact is wider, shallower and flatter at the same force.
@@ -93,11 +78,9 @@ def press(
         stiffness: Winkler modulus of the object in N/mm^3 (foam 0.01, wood above 10; 1e3 is rigid).
         dome_radius_mm: Radius of the gel's dome; None = flat. Real gels are domed; a flat pad on a flat face gives a
             nearly blank picture.
-        gel_stiffness: Winkler modulus of the gel in N/mm^3.
     """
-    gel: Any = {"dome_radius_mm": dome_radius_mm, "gel_stiffness": gel_stiffness}
-    p = pressure(relief_mm, force_n=force_n, stiffness=stiffness, pixel_mm=pixel_mm, **gel)
-    return relax(p / np.float32(gel_stiffness), pixel_mm=pixel_mm)
+    spring = {"stiffness": stiffness, "pixel_mm": pixel_mm, "dome_radius_mm": dome_radius_mm}
+    return relax(pressure(relief_mm, force_n=force_n, **spring) / np.float32(GEL_STIFFNESS), pixel_mm=pixel_mm)
 
 
 def relax(indent_mm: F, *, pixel_mm: float) -> F:
@@ -108,6 +91,24 @@ def relax(indent_mm: F, *, pixel_mm: float) -> F:
     return gaussian_filter(surface, 0.07 / pixel_mm, mode="nearest")  # the paint layer smooths the rest
 
 
+def contact(
+    relief_mm: F, *, force_n: float, stiffness: float, pixel_mm: float, dome_radius_mm: float
+) -> dict[str, float]:
+    """Measure the contact that ``gel.press`` renders with these arguments, before the membrane smooths it.
+
+    Returns "depth_mm", the deepest indentation of the gel; "contact_x_mm" and "contact_y_mm", the centre of pressure,
+    right and down from the middle of the picture (NaN without contact); "patch_mm2", the area under pressure.
+    """
+    p = pressure(
+        relief_mm, force_n=force_n, stiffness=stiffness, pixel_mm=pixel_mm, dome_radius_mm=dome_radius_mm
+    ).astype(np.float64)
+    if not (total := float(p.sum())):
+        return dict(zip(KNOWN, (0.0, math.nan, math.nan, 0.0), strict=True))
+    x, y = ((np.arange(n) - (n - 1) / 2) * pixel_mm for n in (p.shape[1], p.shape[0]))
+    centre = float(p.sum(0) @ x) / total, float(p.sum(1) @ y) / total
+    return dict(zip(KNOWN, (float(p.max()) / GEL_STIFFNESS, *centre, float((p > 0).sum()) * pixel_mm**2), strict=True))
+
+
 def render(
     imprint_mm: F,
     sensor: Sensor,
@@ -115,7 +116,7 @@ def render(
     *,
     pixel_mm: float,
     shear_mm: Pair = (0.0, 0.0),
-    size: int | Pair | None = None,
+    size: int | None = None,
     unit: int | None = None,
     gain: float = 1.0,
 ) -> NDArray[np.uint8]:
@@ -124,7 +125,7 @@ def render(
     Args:
         rng: Random generator of camera noise, and of the unit if `unit` is None.
         shear_mm: Displacement (x, y) of the dots inside the contact.
-        size: Output size (h, w), or one number for both; default: (H, W).
+        size: Side of the picture, h = w; default: (H, W).
         unit: Number of a physical copy of the sensor with its own dots, dirt, scratches and tint. Give it to render
             several pictures with the same copy.
         gain: Factor of the colour response to slope (LED current, paint).
@@ -143,18 +144,9 @@ def render(
         _draw_markers(picture, imprint, sensor, copy, pixel_mm, shear_mm)
     _soil(picture, sensor, copy, pixel_mm)
     if size is not None:
-        h, w = (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
-        picture = area_resize(picture, h, w)
+        picture = area_resize(picture, size, size)
     picture += rng.standard_normal(picture.shape, np.float32) * np.float32(sensor.noise)
     return np.clip(picture + 0.5, 0, 255).astype(np.uint8)
-
-
-def background(
-    sensor: Sensor, rng: np.random.Generator, *, size: int | Pair, pixel_mm: float = 0.09, unit: int | None = None
-) -> NDArray[np.uint8]:
-    """Render the sensor without contact: uint8 [h, w, 3] for `size` = h = w or (h, w); `unit` as in `render`."""
-    h, w = (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
-    return render(np.zeros((h, w), np.float32), sensor, rng, pixel_mm=pixel_mm, unit=unit)
 
 
 def area_resize(picture: F, height: int, width: int) -> F:

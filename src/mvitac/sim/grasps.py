@@ -1,41 +1,24 @@
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
 """Simulated grasps: a parallel gripper with two gels and a camera tries to lift an object; the label is success.
 
 The format is that of "The Feeling of Success" (Calandra et al., CoRL 2017): about 106 objects with 50 grasps each, one
 camera picture and two tactile pictures before the fingers close, during the grip (closed, not lifted) and after the lift.
-Results are not comparable with those on real data. 'after' shows the outcome and 'before' shows no contact, so probes use
-'during'. Split by object, never by grasp.
 
 The outcome is computed by physics and has two factors: the distance of the grip from the centre of mass (camera), and
-whether the skin under the fingers grips or slides (gels: `mvitac.sim.skin.Patch`). Size and brightness of the imprint carry
-no information, because the hand knows the weight and presses as hard as a medium friction needs. Shape, mass, sensor copy,
-lamp, colours, table, wall, clutter and viewpoint are random.
-
-The generator was designed by one rule: on unseen objects, with touch and vision, a supervised model is at least 20 points
-above an untrained trunk and below 97 % (docs/simulator.md). It is frozen: every change of a picture or label increases
-VERSION.
+whether the skin under the fingers grips or slides (gels: `mvitac.sim.skin.Patch`). What else is random, and by which rule
+the generator was designed, is in docs/simulator.md. It is frozen: every change of a picture or label increases VERSION.
 
 Every item is a function of (seed, object, grasp).
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mvitac.sim import camera, gel, objects, physics, skin
-from mvitac.sim.contact import contact
-from mvitac.sim.objects import object_name
-from mvitac.sim.physics import PHASES
-
-__all__ = ["NUM_GRASPS", "NUM_OBJECTS", "PHASES", "VERSION", "grasp", "object_name"]
 
 VERSION = 2
 NUM_OBJECTS = 106
-NUM_GRASPS = 50  # grasps per object as in the original; larger indices are allowed
 
 FIELD_MM = 22.0  # width of a gel's field of view
 
@@ -76,21 +59,13 @@ def draw_plan(thing: objects.Thing, patch: skin.Patch, rng: np.random.Generator)
 
 
 def grasp(
-    seed: int,
-    obj: int,
-    index: int,
-    *,
-    size: int,
-    held_out_sensor: bool = False,
-    phases: tuple[str, ...] = PHASES,
-    measured: bool = False,
+    seed: int, obj: int, index: int, *, size: int, held_out_sensor: bool = False, measured: bool = False
 ) -> list[dict[str, Any]]:
     """Simulate grasp number ``index`` of object number ``obj``.
 
     Args:
         held_out_sensor: Use the sensor that is not used otherwise.
-        phases: Phases to render; fewer are faster.
-        measured: Also return what physics knows of the contact of each gel: ``contact.KNOWN`` and the shear force in N,
+        measured: Also return what physics knows of the contact of each gel: ``gel.KNOWN`` and the shear force in N,
             right and down in the gel's picture, with names such as ``depth_left_mm`` and ``shear_x_right_n``.
 
     Returns:
@@ -105,15 +80,34 @@ def grasp(
         raise ValueError(f"obj must be in 0..{NUM_OBJECTS - 1}, got {obj}")
     if index < 0 or seed < 0:
         raise ValueError(f"seed and index must be 0 or larger, got seed {seed} and index {index}")
-    if unknown := set(phases) - set(PHASES):
-        raise ValueError(f"phases must be among {PHASES}, got {sorted(unknown)}")
     if not 16 <= size <= 1024:
         raise ValueError(f"size must be in 16..1024 pixels, got {size}")
-    bench = _bench(seed, obj)
-    rng = np.random.default_rng([_PLAN, seed, obj, index])
+    bench, key = _bench(seed, obj), (seed, obj, index)
+    thing, rng = bench.thing, np.random.default_rng([_PLAN, *key])
     patch = skin.draw_patch(rng)
-    plan, what = draw_plan(bench.thing, patch, rng), {"phases": phases, "measured": measured}
-    return _record(bench, patch, plan, (seed, obj, index), size=size, held_out_sensor=held_out_sensor, **what)
+    plan = draw_plan(thing, patch, rng)
+    view = camera.draw_view(np.random.default_rng([_VIEW, *key]))
+    feel = np.random.default_rng([_TOUCH, *key])
+    sensors = [sensor for sensor in gel.SENSORS.values() if sensor.held_out == held_out_sensor]
+    sensor = sensors[int(feel.random() * len(sensors))]
+    units, gain = feel.integers(2**31, size=2).tolist(), feel.uniform(0.75, 1.3)
+    known = {"object": thing.name, "sensor": sensor.name, **_latents(thing, patch, plan)}
+    rows = []
+    outcome: dict[str, float] = {}
+    for order, moment in enumerate(bench.moments(plan), 1):
+        touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
+        row: dict[str, Any] = {"phase": moment.phase, **known}
+        for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
+            imprint, contacts = _pressed(bench, patch, moment, side, max(GRID, size), measured)
+            copy: Any = {"unit": units[side], "gain": gain, "pixel_mm": FIELD_MM / len(imprint)}
+            row[f"touch_{name}"] = gel.render(imprint, sensor, touch_rng, shear_mm=_drag_mm(touch), size=size, **copy)
+            row[f"contact_{name}"] = float(imprint.mean())
+            row[f"normal_{name}_n"] = touch.normal_n
+            row |= {side_name(known_as, name): value for known_as, value in contacts.items()}
+        row["vision"] = camera.photograph(bench, view, view_rng, size=size)
+        rows.append(row)
+        outcome = {"success": moment.success, "lift_mm": 1000 * moment.rise_m, "unstable": float(moment.unstable)}
+    return [{**row, **outcome} for row in rows]  # the outcome of the last moment
 
 
 @lru_cache(maxsize=4)
@@ -121,64 +115,10 @@ def _bench(seed: int, obj: int) -> physics.Bench:
     return physics.Bench(objects.make_thing(seed, obj))
 
 
-def _record(
-    bench: physics.Bench,
-    patch: skin.Patch,
-    plan: physics.Plan,
-    key: tuple[int, int, int],
-    *,
-    size: int,
-    held_out_sensor: bool,
-    phases: tuple[str, ...],
-    measured: bool = False,
-) -> list[dict[str, Any]]:
-    """Simulate a plan and render it; ``key`` is (seed, object, grasp), which determines view and sensor."""
-    thing = bench.thing
-    view = camera.draw_view(np.random.default_rng([_VIEW, *key]))
-    gels = _draw_gels(np.random.default_rng([_TOUCH, *key]), held_out_sensor)
-    known = {"object": thing.name, "sensor": gels.sensor.name, **_latents(thing, patch, plan)}
-    rows = []
-    moment = None
-    for order, moment in enumerate(bench.moments(plan), 1):
-        if moment.phase not in phases:
-            continue
-        # One noise stream per phase, so that leaving one out does not change the others.
-        touch_rng, view_rng = (np.random.default_rng([tag, *key, order]) for tag in (_TOUCH, _VIEW))
-        row: dict[str, Any] = {"phase": moment.phase, **known}
-        for side, name, touch in ((0, "left", moment.left), (1, "right", moment.right)):
-            imprint, contacts = _pressed(bench, patch, moment, side, max(GRID, size), measured)
-            row[f"touch_{name}"] = gels.render(side, imprint, touch, touch_rng, size)
-            row[f"contact_{name}"] = float(imprint.mean())
-            row[f"normal_{name}_n"] = touch.normal_n
-            row |= {side_name(known_as, name): value for known_as, value in contacts.items()}
-        row["vision"] = camera.photograph(bench.model, moment.data, thing, view, view_rng, size=size)
-        rows.append(row)
-    assert moment is not None, "there are three phases"
-    outcome = {"success": moment.success, "lift_mm": 1000 * moment.rise_m, "unstable": float(moment.unstable)}
-    return [{**row, **outcome} for row in rows]
-
-
-@dataclass(frozen=True)
-class _Gels:
-    """The two gels of one grasp."""
-
-    sensor: gel.Sensor
-    units: np.ndarray
-    gain: float
-
-    def render(
-        self, side: int, imprint: np.ndarray, touch: physics.Touch, rng: np.random.Generator, size: int
-    ) -> np.ndarray:
-        """Return the picture of one gel, uint8 [size, size, 3]."""
-        x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
-        copy: Any = {"unit": int(self.units[side]), "gain": self.gain, "pixel_mm": FIELD_MM / len(imprint)}
-        return gel.render(imprint, self.sensor, rng, shear_mm=(x, y), size=size, **copy)
-
-
-def _draw_gels(rng: np.random.Generator, held_out: bool) -> _Gels:
-    sensors = [sensor for sensor in gel.SENSORS.values() if sensor.held_out == held_out]
-    sensor = sensors[int(rng.random() * len(sensors))]
-    return _Gels(sensor, rng.integers(2**31, size=2), rng.uniform(0.75, 1.3))
+def _drag_mm(touch: physics.Touch) -> tuple[float, float]:
+    """Return how far the shear force drags the gel along x and y."""
+    x, y = (SHEAR_LIMIT_MM * float(np.tanh(n * SHEAR_MM_PER_N / SHEAR_LIMIT_MM)) for n in touch.shear_n)
+    return x, y
 
 
 def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dict[str, float]:
@@ -186,7 +126,7 @@ def _latents(thing: objects.Thing, patch: skin.Patch, plan: physics.Plan) -> dic
     low, high = thing.bounds
     grip = (low + high) / 2 + plan.offset_m
     return {
-        "mass_kg": thing.mass * plan.mass_scale,
+        "mass_kg": thing.mass,
         "friction": plan.friction,
         "force_n": plan.force_n,
         "offset_mm": 1000 * float(grip[1] - thing.center_of_mass[1]),
@@ -206,7 +146,7 @@ def _pressed(
     If ``measured``, also return what physics knows of the contact: depth_mm, shear_x_n, ...
     """
     touch = (moment.left, moment.right)[side]
-    relief = _relief(bench, patch, moment.data, side, grid) if touch.normal_n > 0 else None
+    relief = _relief(bench, patch, side, grid) if touch.normal_n > 0 else None
     spring = {"stiffness": bench.thing.stiffness, "pixel_mm": FIELD_MM / grid, "dome_radius_mm": objects.DOME_RADIUS_MM}
     imprint, force = np.zeros((grid, grid), np.float32), 0.0
     if relief is not None:
@@ -215,23 +155,23 @@ def _pressed(
         imprint = np.minimum(gel.press(relief, force_n=force, **spring), np.float32(2.5))
     if not measured:
         return imprint, {}
-    found = contact(imprint if relief is None else relief, force_n=force, **spring)
+    found = gel.contact(imprint if relief is None else relief, force_n=force, **spring)
     return imprint, {**found, "shear_x_n": touch.shear_n[0], "shear_y_n": touch.shear_n[1]}
 
 
-def _relief(bench: physics.Bench, patch: skin.Patch, data: mujoco.MjData, side: int, grid: int) -> np.ndarray | None:
+def _relief(bench: physics.Bench, patch: skin.Patch, side: int, grid: int) -> np.ndarray | None:
     """Return the height [grid, grid] in mm of the object in front of one gel; None if there is nothing."""
     sign = 1.0 if side == 0 else -1.0  # the left gel looks along +x, the right one along -x
-    apex = data.geom_xpos[bench.pads[side]] + [sign * objects.PAD_DEPTH_M, 0, 0]
+    apex = bench.data.geom_xpos[bench.pads[side]] + [sign * objects.PAD_DEPTH_M, 0, 0]
     axis = ((np.arange(grid) + 0.5) / grid - 0.5) * FIELD_MM / 1000
     rays = np.empty((grid, grid, 3))
     rays[..., 0], rays[..., 1], rays[..., 2] = sign * BEHIND_M, -sign * axis[None, :], -axis[:, None]
     rays = rays.reshape(-1, 3) / BEHIND_M
     origin = apex - [sign * BEHIND_M, 0, 0]
     groups = np.array([0, 0, 1, 0, 0, 0], np.uint8)
-    geom, distance, _ = camera.cast(bench.model, data, origin, rays, groups)
+    geom, distance, _ = camera.cast(bench, origin, rays, groups)
     points = origin + rays * distance[:, None]
-    local = (points - data.xpos[bench.body]) @ data.xmat[bench.body].reshape(3, 3)
+    local = (points - bench.data.xpos[bench.body]) @ bench.data.xmat[bench.body].reshape(3, 3)
     hit = geom >= 0
     relief = np.full(grid * grid, -np.inf, np.float32)
     relief[hit] = 1000 * (BEHIND_M - distance[hit]) + patch.relief_mm(1000 * local[hit])

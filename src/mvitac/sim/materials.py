@@ -3,8 +3,7 @@
 A class gives ranges; an instance is one object with its own relief, colour and physics; a touch is one press of it with its
 own pose, force, sensor, lamp and background. Split by instance.
 
-The generator was designed by one rule (benchmarks/difficulty.py): on every task, a supervised reference is far above an
-untrained trunk, and below 97 %. Therefore:
+The generator was designed by one rule (docs/simulator.md). Therefore:
 - "soft" is a threshold on the instance's stiffness, not on its class. Soft objects fold along curves and have lumpy outlines
   and rolled edges; hard ones crack along straight lines and have corners. Number and size of marks carry no information.
 - "rough" is the sign of the height skewness: raised peaks or sunk pits. Pictures of both have the same spectrum.
@@ -19,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mvitac.sim.contact import contact
-from mvitac.sim.coordinates import Motion, grid, outline, turn
-from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, press, render
+from mvitac.sim.coordinates import Motion, Place, grid, outline, turn
+from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, contact, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS, Sensor
 
@@ -35,7 +33,7 @@ _CAMERA_MM = 90.0  # width of the camera's field of view at zoom 1
 MIN_SIZE, MAX_SIZE = 16, 512
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Material:
     """Ranges of one class. `sight` and `feel` are relief kinds at camera and gel scale."""
 
@@ -54,38 +52,26 @@ class Material:
 # Some classes are similar on purpose: laminate looks like wood and feels like plastic; concrete and sand look alike, and so
 # do glass, plastic and paper; concrete and brick feel alike, and so do glass, metal and tile. One sense is not enough.
 MATERIALS: tuple[Material, ...] = (
-    Material(name="concrete", sight="blotch", feel="pores", colour=(0.52, 0.51, 0.49), soft=0.3, rough=0.5),
-    Material(name="rock", sight="facets", feel="facets", colour=(0.47, 0.45, 0.43), soft=0.28, rough=0.66),
-    Material(name="sand", sight="blotch", feel="grains", colour=(0.62, 0.55, 0.44), soft=0.68, rough=0.6),
-    Material(name="gravel", sight="pebbles", feel="pebbles", colour=(0.5, 0.48, 0.46), soft=0.35, rough=0.7),
-    Material(name="soil", sight="grains", feel="blotch", colour=(0.34, 0.26, 0.19), soft=0.72, rough=0.6),
-    Material(name="brick", sight="brick", feel="pores", colour=(0.55, 0.32, 0.25), soft=0.3, rough=0.62),
-    Material(name="tile", sight="tiles", feel="plain", colour=(0.6, 0.6, 0.58), gloss=(0.2, 0.8), soft=0.3, rough=0.32),
-    Material(
-        name="glass", sight="plain", feel="plain", colour=(0.42, 0.5, 0.5), gloss=(0.4, 1.0), soft=0.28, rough=0.3
-    ),
-    Material(
-        name="metal", sight="brushed", feel="plain", colour=(0.55, 0.56, 0.58), gloss=(0.3, 1.0), soft=0.28, rough=0.34
-    ),
-    Material(
-        name="plastic", sight="plain", feel="emboss", colour=(0.5, 0.45, 0.45), gloss=(0.2, 0.8), soft=0.5, rough=0.36
-    ),
-    Material(
-        name="laminate", sight="wood", feel="emboss", colour=(0.52, 0.38, 0.26), gloss=(0.1, 0.6), soft=0.4, rough=0.36
-    ),
-    Material(name="wood", sight="wood", feel="wood", colour=(0.54, 0.4, 0.27), soft=0.36, rough=0.5),
-    Material(name="bark", sight="fissures", feel="fissures", colour=(0.36, 0.3, 0.24), soft=0.42, rough=0.7),
-    Material(name="grass", sight="blades", feel="blades", colour=(0.34, 0.45, 0.22), soft=0.72, rough=0.55),
-    Material(name="leaf", sight="veins", feel="veins", colour=(0.3, 0.45, 0.2), gloss=(0.0, 0.5), soft=0.7, rough=0.42),
-    Material(name="paper", sight="plain", feel="fibres", colour=(0.66, 0.64, 0.58), soft=0.6, rough=0.4),
-    Material(
-        name="leather", sight="crackle", feel="crackle", colour=(0.4, 0.27, 0.2), gloss=(0.1, 0.6), soft=0.7, rough=0.4
-    ),
-    Material(
-        name="rubber", sight="studs", feel="studs", colour=(0.3, 0.3, 0.31), gloss=(0.0, 0.4), soft=0.7, rough=0.46
-    ),
-    Material(name="cloth", sight="weave", feel="weave", colour=(0.48, 0.42, 0.46), soft=0.72, rough=0.5),
-    Material(name="knit", sight="rib", feel="rib", colour=(0.46, 0.44, 0.5), soft=0.74, rough=0.56),
+    Material("concrete", "blotch", "pores", (0.52, 0.51, 0.49), soft=0.3, rough=0.5),
+    Material("rock", "facets", "facets", (0.47, 0.45, 0.43), soft=0.28, rough=0.66),
+    Material("sand", "blotch", "grains", (0.62, 0.55, 0.44), soft=0.68, rough=0.6),
+    Material("gravel", "pebbles", "pebbles", (0.5, 0.48, 0.46), soft=0.35, rough=0.7),
+    Material("soil", "grains", "blotch", (0.34, 0.26, 0.19), soft=0.72, rough=0.6),
+    Material("brick", "brick", "pores", (0.55, 0.32, 0.25), soft=0.3, rough=0.62),
+    Material("tile", "tiles", "plain", (0.6, 0.6, 0.58), gloss=(0.2, 0.8), soft=0.3, rough=0.32),
+    Material("glass", "plain", "plain", (0.42, 0.5, 0.5), gloss=(0.4, 1.0), soft=0.28, rough=0.3),
+    Material("metal", "brushed", "plain", (0.55, 0.56, 0.58), gloss=(0.3, 1.0), soft=0.28, rough=0.34),
+    Material("plastic", "plain", "emboss", (0.5, 0.45, 0.45), gloss=(0.2, 0.8), soft=0.5, rough=0.36),
+    Material("laminate", "wood", "emboss", (0.52, 0.38, 0.26), gloss=(0.1, 0.6), soft=0.4, rough=0.36),
+    Material("wood", "wood", "wood", (0.54, 0.4, 0.27), soft=0.36, rough=0.5),
+    Material("bark", "fissures", "fissures", (0.36, 0.3, 0.24), soft=0.42, rough=0.7),
+    Material("grass", "blades", "blades", (0.34, 0.45, 0.22), soft=0.72, rough=0.55),
+    Material("leaf", "veins", "veins", (0.3, 0.45, 0.2), gloss=(0.0, 0.5), soft=0.7, rough=0.42),
+    Material("paper", "plain", "fibres", (0.66, 0.64, 0.58), soft=0.6, rough=0.4),
+    Material("leather", "crackle", "crackle", (0.4, 0.27, 0.2), gloss=(0.1, 0.6), soft=0.7, rough=0.4),
+    Material("rubber", "studs", "studs", (0.3, 0.3, 0.31), gloss=(0.0, 0.4), soft=0.7, rough=0.46),
+    Material("cloth", "weave", "weave", (0.48, 0.42, 0.46), soft=0.72, rough=0.5),
+    Material("knit", "rib", "rib", (0.46, 0.44, 0.5), soft=0.74, rough=0.56),
 )
 CLASSES: tuple[str, ...] = tuple(m.name for m in MATERIALS)
 
@@ -150,7 +136,6 @@ def touch(
     touch: int,
     *,
     size: int,
-    held_out_sensor: bool = False,
     background: bool = False,
     moment: int = 0,
     measured: bool = False,
@@ -160,11 +145,10 @@ def touch(
     """Simulate one pair, given the numbers of the data set, class, instance and touch.
 
     Args:
-        held_out_sensor: Use the sensor that is not used otherwise; everything else is the same.
         background: Also return "background", the same copy of the sensor before contact.
         moment: 0, or the number of a later moment of the same press (`motion.Motion`).
-        measured: Also return depth, position and size of the contact (`contact.KNOWN`).
-        sensors: Sensors to choose from. Default: the known ones, or the held-out one.
+        measured: Also return depth, position and size of the contact (`gel.KNOWN`).
+        sensors: Sensors to choose from; all else is the same. Default: all that are not held out.
         through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs
             from those of smaller numbers; the camera takes another picture.
 
@@ -177,7 +161,7 @@ def touch(
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
     motion = Motion.draw(_TAG, seed, category, instance, touch, moment) if moment else None
-    choice = sensors or [s for s in SENSORS.values() if s.held_out == held_out_sensor]
+    choice = sensors or [s for s in SENSORS.values() if not s.held_out]
     if not 0 <= through < len(choice):
         raise ValueError(f"through {through}: there are {len(choice)} sensors for one spot, give a smaller number")
     again = np.random.default_rng([_TAG, seed, category, instance, touch, 0, through]) if through else None
@@ -213,12 +197,7 @@ def _check_request(seed: int, category: int, instance: int, touch: int, size: in
 
 
 def _look(
-    thing: Instance,
-    rng: np.random.Generator,
-    angle: float,
-    place: NDArray[np.float64],
-    size: int,
-    motion: Motion | None,
+    thing: Instance, rng: np.random.Generator, angle: float, place: Place, size: int, motion: Motion | None
 ) -> NDArray[np.uint8]:
     """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
     x, y, pixel = grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
@@ -293,7 +272,7 @@ def _feel(
     thing: Instance,
     rng: np.random.Generator,
     angle: float,
-    place: NDArray[np.float64],
+    place: Place,
     size: int,
     choice: Sequence[Sensor],
     background: bool,

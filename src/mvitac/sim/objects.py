@@ -7,6 +7,7 @@ Frames: the gripper closes along x, an object's long side is along y, z is up an
 Shapes: N points. Units: metres, kilograms and newtons, except names that end in ``_mm``.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,8 +85,7 @@ class Part:
 class Thing:
     """An object; it is the same in all its grasps."""
 
-    name: str
-    kind: str
+    name: str  # shape kind and number, such as box_010
     parts: tuple[Part, ...]
     finish: Finish
     density: float  # kilograms per cubic metre (objects are mostly hollow)
@@ -121,40 +121,19 @@ class Thing:
         return (center - half).min(0), (center + half).max(0)
 
 
-def object_name(seed: int, index: int) -> str:
-    """Return the name of an object (shape kind and index), e.g. ``box_010``. It does not depend on the seed."""
-    del seed
-    return f"{KINDS[index % len(KINDS)]}_{index:03d}"
-
-
 def _mm(rng: np.random.Generator, *ranges: tuple[float, float]) -> list[float]:
     """Draw a length from each range in millimetres; return them in metres."""
     return [rng.uniform(low, high) / 1000 for low, high in ranges]
 
 
-def _box(rng: np.random.Generator) -> tuple[Part, ...]:
-    x, y, z = _mm(rng, (11, 27), (30, 72), (13, 32))
-    return (Part("box", (x, y, z), (0, 0, z)),)
+def _single(shape: str, *ranges: tuple[float, float], lying: bool = False) -> Callable[..., tuple[Part, ...]]:
+    """A function that draws an object of one part, with half sizes in ``ranges`` in mm, which stands on z = 0."""
 
+    def draw(rng: np.random.Generator) -> tuple[Part, ...]:
+        size = tuple(_mm(rng, *ranges))
+        return (Part(shape, size, (0, 0, size[0] if lying else size[-1]), lying=lying),)
 
-def _can(rng: np.random.Generator) -> tuple[Part, ...]:
-    r, h = _mm(rng, (16, 31), (24, 52))
-    return (Part("cylinder", (r, h), (0, 0, h)),)
-
-
-def _rod(rng: np.random.Generator) -> tuple[Part, ...]:
-    r, h = _mm(rng, (12, 24), (38, 78))
-    return (Part("cylinder", (r, h), (0, 0, r), lying=True),)
-
-
-def _ellipsoid(rng: np.random.Generator) -> tuple[Part, ...]:
-    x, y, z = _mm(rng, (16, 30), (26, 58), (15, 28))
-    return (Part("ellipsoid", (x, y, z), (0, 0, z)),)
-
-
-def _capsule(rng: np.random.Generator) -> tuple[Part, ...]:
-    r, h = _mm(rng, (13, 25), (22, 55))
-    return (Part("capsule", (r, h), (0, 0, r), lying=True),)
+    return draw
 
 
 def _hammer(rng: np.random.Generator) -> tuple[Part, ...]:
@@ -196,8 +175,18 @@ def _dumbbell(rng: np.random.Generator) -> tuple[Part, ...]:
     )
 
 
-_ALL = (_box, _can, _rod, _ellipsoid, _capsule, _hammer, _mug, _bottle, _tee, _dumbbell)
-_DRAW = {draw.__name__[1:]: draw for draw in _ALL}
+_DRAW = {
+    "box": _single("box", (11, 27), (30, 72), (13, 32)),
+    "can": _single("cylinder", (16, 31), (24, 52)),
+    "rod": _single("cylinder", (12, 24), (38, 78), lying=True),
+    "ellipsoid": _single("ellipsoid", (16, 30), (26, 58), (15, 28)),
+    "capsule": _single("capsule", (13, 25), (22, 55), lying=True),
+    "hammer": _hammer,
+    "mug": _mug,
+    "bottle": _bottle,
+    "tee": _tee,
+    "dumbbell": _dumbbell,
+}
 """Shape kind -> function that draws its parts, which stand on z = 0."""
 KINDS = tuple(_DRAW)  # shape kinds. Objects cycle through them, so that every split by object has all kinds.
 
@@ -207,12 +196,10 @@ def make_thing(seed: int, index: int) -> Thing:
     rng = np.random.default_rng([OBJECT_TAG, seed, index])
     kind = KINDS[index % len(KINDS)]
     parts = _DRAW[kind](rng)
-    finish = draw_finish(rng)
     return Thing(
-        name=object_name(seed, index),
-        kind=kind,
+        name=f"{kind}_{index:03d}",
         parts=parts,
-        finish=finish,
+        finish=draw_finish(rng),
         density=rng.uniform(*MASS_KG) / sum(part.volume() * part.density for part in parts),
         softness=float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.0)])),
     )

@@ -13,7 +13,6 @@ import numpy as np
 
 from mvitac.sim import gel, objects
 
-PHASES = ("before", "during", "after")
 STEP_S = 0.002
 CHUNK = 5  # time steps between changes of the set points
 
@@ -37,7 +36,6 @@ class Plan:
     """Angle in radians between the object's long side and the pads."""
     lift_m: float
     friction: float
-    mass_scale: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,10 +48,9 @@ class Touch:
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """The scene at one moment. Read ``data`` before the next moment is requested, which overwrites it."""
+    """The forces at one moment. The scene, ``Bench.data``, stays until the next moment is requested."""
 
     phase: str
-    data: mujoco.MjData
     left: Touch
     right: Touch
     success: int  # valid at 'after'
@@ -81,8 +78,6 @@ class Bench:
         self.body = self.model.body("thing").id
         self.parts = np.flatnonzero(self.model.geom_bodyid == self.body)
         self.pads = (self.model.geom("left_pad").id, self.model.geom("right_pad").id)
-        self.mass = self.model.body_mass.copy()
-        self.inertia = self.model.body_inertia.copy()
         self.address = self.model.joint("thing").qposadr[0]
 
     def moments(self, plan: Plan) -> Iterator[Moment]:
@@ -102,16 +97,14 @@ class Bench:
         rise = float(data.xipos[self.body, 2]) - lowest
         moment = self._moment("after", rise, unstable)
         held = moment.left.normal_n > 0 and moment.right.normal_n > 0
-        success = int(held and rise > HELD_PART * plan.lift_m and not self._on_table() and not unstable)
+        on_table = any(0 in pair for pair in data.contact.geom[: data.ncon])
+        success = int(held and rise > HELD_PART * plan.lift_m and not on_table and not unstable)
         yield replace(moment, success=success)
 
     def _place(self, plan: Plan) -> tuple[float, float]:
         """Reset the scene for ``plan``; return the height of the hand and the position of the open fingers."""
         model, data, thing = self.model, self.data, self.thing
         mujoco.mj_resetData(model, data)
-        model.body_mass[self.body] = self.mass[self.body] * plan.mass_scale
-        model.body_inertia[self.body] = self.inertia[self.body] * plan.mass_scale
-        mujoco.mj_setConst(model, data)
         for part, geom in zip(thing.parts, self.parts, strict=True):
             # A round contact with a paraboloid of pressure rotates at a torque of 8/15 mu a F.
             patch = 8 / 15 * contact_radius_m(part, plan.force_n, thing.stiffness)
@@ -150,7 +143,7 @@ class Bench:
 
     def _moment(self, phase: str, rise: float, unstable: int) -> Moment:
         left, right = self._touch(0), self._touch(1)
-        return Moment(phase=phase, data=self.data, left=left, right=right, success=0, rise_m=rise, unstable=unstable)
+        return Moment(phase=phase, left=left, right=right, success=0, rise_m=rise, unstable=unstable)
 
     def _touch(self, side: int) -> Touch:
         """Return the sum of contact forces on a pad's dome."""
@@ -164,9 +157,6 @@ class Bench:
                 total += world if pair[1] == self.pads[side] else -world
         out = -1.0 if side == 0 else 1.0
         return Touch(normal_n=max(float(out * total[0]), 0.0), shear_n=(float(out * total[1]), float(-total[2])))
-
-    def _on_table(self) -> bool:
-        return any(0 in pair for pair in self.data.contact.geom[: self.data.ncon])
 
 
 def _lifted(lift_m: float, time: float) -> float:

@@ -8,13 +8,13 @@ amplitude or contrast.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-F = NDArray[Any]  # float32 [H, W] unless said otherwise; numpy's stubs lose the width on the way
+from mvitac.sim.gel import F
+
 _SIDE = 64  # period of the random tables in wavelengths, larger than any picture
 _NEXT = (np.arange(_SIDE) + 1) % _SIDE
 _STEPS = 129
@@ -203,17 +203,9 @@ class Relief:
     """-1: plateaus with pits and grooves; +1: separate peaks. Skewness R_sk of surface metrology (ISO 21920-2)."""
     tables: F  # random numbers [4, 64, 64] of this instance
 
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"unknown kind {self.kind!r}: choose one of {', '.join(KINDS)}")
-        if self.tables.shape != (4, _SIDE, _SIDE):
-            raise ValueError(
-                f"tables must be [4, {_SIDE}, {_SIDE}], got {self.tables.shape}: draw them with draw_tables()"
-            )
-
-    def __call__(self, x: F, y: F, scale: float = 1.0) -> F:
-        """Return heights [H, W]; `scale` > 1 gives the coarse structure of the same instance."""
-        wave = np.float32(self.wavelength_mm * scale)
+    def __call__(self, x: F, y: F) -> F:
+        """Return heights [H, W]."""
+        wave = np.float32(self.wavelength_mm)
         u, v = x / (wave * np.float32(self.anisotropy)), y / wave
         bend = np.float32(0.45 * self.irregularity)
         u, v = (

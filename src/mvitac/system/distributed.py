@@ -148,7 +148,9 @@ class SyncedBatchNorm(nn.BatchNorm2d):
         scratch = torch.zeros_like(self.running_mean)
         with torch.no_grad():
             own = torch.stack(torch.batch_norm_update_stats(input, scratch, scratch.clone(), 0.0)).float()
-            means, variances = _everyones(own).unbind(1)  # each [N, C]
+            everyones = [torch.empty_like(own) for _ in range(dist.get_world_size())]
+            dist.all_gather(everyones, own)
+            means, variances = torch.stack(everyones).unbind(1)  # each [N, C]
             mean = means.mean(0)
             variance = (variances + (means - mean).square()).mean(0)  # no cancellation
             num = len(means) * input.numel() // len(mean)
@@ -205,10 +207,3 @@ def _all_reduced(value: Tensor) -> Tensor:
     total = value.clone(memory_format=torch.contiguous_format)
     dist.all_reduce(total)
     return total
-
-
-def _everyones(own: Tensor) -> Tensor:
-    """Return ``own`` of every process as [size, ...]."""
-    found = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-    dist.all_gather(found, own)
-    return torch.stack(found)

@@ -58,7 +58,8 @@ class Bars(Progress):
         self.remove_task(task_id)
         told = self._due.pop(task.description, None) is not None
         if task.finished and (always or told):
-            self.say(_summary(task))
+            spent = duration(task.finished_time or 0)
+            self.say(f"{task.description}: {_count(task)} in {spent}{_bracketed(_speed(task))}")
 
     def _tell(self, task: Task) -> None:
         name, now, left = task.description, self.get_time(), time_left(task)
@@ -113,11 +114,6 @@ def _speed(task: Task) -> str:
 
 def _bracketed(text: str) -> str:
     return f" ({text})" if text else ""
-
-
-def _summary(task: Task) -> str:
-    spent = duration(task.finished_time or 0)
-    return f"{task.description}: {_count(task)} in {spent}{_bracketed(_speed(task))}"
 
 
 def _text(task: Task) -> str:

@@ -99,9 +99,12 @@ def read_log(run: Path) -> list[dict[str, Any]]:
     path, entries = run / "log.jsonl", []
     for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
         try:
-            entries.append(parse_json(line))
+            entry = parse_json(line)
         except ValueError:
             break
+        if not isinstance(entry, dict) or not isinstance(entry.get("step"), int):
+            break
+        entries.append(entry)
     return entries
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvitac.data.jpeg import Lazy
+from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
 from mvitac.methods.base import Views
 from mvitac.run import Run

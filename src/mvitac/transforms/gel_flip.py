@@ -52,11 +52,6 @@ def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.
     return change @ mixtures @ np.linalg.inv(slopes), mixtures, curl
 
 
-def mirror_colours(colours: np.ndarray, mixtures: np.ndarray) -> np.ndarray:
-    """M [3, 3] of a horizontal flip: maps rx to -rx, and ry and all other colours to themselves."""
-    return np.eye(3) - 2 * np.outer(colours[:, 0], mixtures[:, 0])
-
-
 class GelMirror:
     """Flips touch images of a pack on ``device``. Colours are learned once, from each sensor's training rows.
 
@@ -67,16 +62,13 @@ class GelMirror:
     def __init__(self, pack: Pack, device: torch.device) -> None:
         if not pack.spec.touch_channels:
             raise ValueError(f"dataset {pack.spec.name!r} has no touch to flip: give --augment.gel-flip plain")
-        named = "sensor" in pack.table.column_names
-        sensors = pack.column("sensor").astype(str) if named else np.full(pack.num, "touch")
         rows = pack.rows("train", "unlabelled", having=("touch",))
-        names = np.unique(sensors[rows]).tolist()
-        self.sensors = np.searchsorted(names, sensors)
-        """[pack.num]: number of each row's sensor. Not meaningful for rows outside the training rows."""
-        self.gels: list[list[tuple[Tensor, Tensor]]] = []
+        self.sensors = pack.sensors
+        """[pack.num]: number of each row's sensor."""
+        self.gels: dict[int, list[tuple[Tensor, Tensor]]] = {}
         """Per sensor and gel: M' [3, 3] and I0(x) - M I0(-x) [size, size, 3], where I0 has zero mean colour."""
-        for name in names:
-            own = rows[sensors[rows] == name]
+        for sensor in np.unique(self.sensors[rows]).tolist():
+            own, name = rows[self.sensors[rows] == sensor], pack.sensor_names[sensor]
             if len(own) < MIN_ROWS:
                 raise ValueError(
                     f"sensor {name!r} has {len(own)} training rows with touch, learning its colours needs {MIN_ROWS}:"
@@ -86,7 +78,7 @@ class GelMirror:
             own = own[np.linspace(0, len(own) - 1, min(len(own), NUM_ROWS)).astype(int)]
             try:
                 gels = _shrunk(pack, own).split(3, dim=1)
-                self.gels.append([tuple(t.to(device) for t in _learn(gel, pack.size)) for gel in gels])  # type: ignore
+                self.gels[sensor] = [tuple(t.to(device) for t in _learn(gel, pack.size)) for gel in gels]  # type: ignore
             except ValueError as error:
                 raise ValueError(f"sensor {name!r}: {error}: give --augment.gel-flip plain") from None
 
@@ -130,7 +122,8 @@ def _learn(gel: Float[Tensor, "N 3 h w"], size: int) -> tuple[Tensor, Tensor]:
     """M' and I0(x) - M I0(-x) of one gel from images of it, where I0 has zero mean colour."""
     mean = gel.mean(0, keepdim=True)
     colours, mixtures, _ = slope_colours((gel - mean).permute(0, 2, 3, 1).double().numpy())
-    matrix = torch.from_numpy(mirror_colours(colours, mixtures).T).float()
+    # M maps rx to -rx, and ry and all other colours to themselves.
+    matrix = torch.from_numpy((np.eye(3) - 2 * np.outer(colours[:, 0], mixtures[:, 0])).T).float()
     rest = F.interpolate(F.adaptive_avg_pool2d(mean, REST), (size, size), mode="bilinear")[0].permute(1, 2, 0)
     rest = rest - rest.mean((0, 1))
     return matrix, (rest - rest.flip(1) @ matrix).contiguous()

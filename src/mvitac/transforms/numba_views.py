@@ -169,15 +169,15 @@ def _bfloat16(value: Any) -> Any:
 
 
 @njit(nogil=True)
-def _normalise(levels: Any, grayscale: bool, luma: Any, factors: Any, offsets: Any, line: Any) -> None:
+def _normalise(levels: Any, grayscale: bool, tones: Any, line: Any) -> None:
     """Normalise a line of uint8 ``levels`` [S * 4], whose fourth channel is unused, into ``line`` [S * 3]."""
     for x in range(len(line) // 3):
         red, green, blue = np.float32(levels[4 * x]), np.float32(levels[4 * x + 1]), np.float32(levels[4 * x + 2])
         if grayscale:
-            red = green = blue = _fma(blue, luma[2], _fma(green, luma[1], red * luma[0]))
-        red = _fma(red, factors[0], offsets[0])
-        green = _fma(green, factors[1], offsets[1])
-        blue = _fma(blue, factors[2], offsets[2])
+            red = green = blue = _fma(blue, tones[0, 2], _fma(green, tones[0, 1], red * tones[0, 0]))
+        red = _fma(red, tones[1, 0], tones[2, 0])
+        green = _fma(green, tones[1, 1], tones[2, 1])
+        blue = _fma(blue, tones[1, 2], tones[2, 2])
         if line.itemsize == 4:
             line[3 * x], line[3 * x + 1], line[3 * x + 2] = red, green, blue
         else:
@@ -202,16 +202,7 @@ def _resize_rows(
 
 @njit(nogil=True)
 def _finish(
-    rows: Any,
-    starts: Any,
-    weights: Any,
-    terms: int,
-    precision: Any,
-    grayscale: bool,
-    luma: Any,
-    factors: Any,
-    offsets: Any,
-    out: Any,
+    rows: Any, starts: Any, weights: Any, terms: int, precision: Any, grayscale: bool, tones: Any, out: Any
 ) -> None:
     """Resize the height of ``rows``, uint8 [h, S * 4], and normalise into ``out`` [S, S * 3]."""
     levels = np.empty(rows.shape[1], np.uint8)
@@ -220,22 +211,11 @@ def _finish(
             _down_2(rows, starts[y], weights[0, y], weights[1, y], precision, levels)
         else:
             _down_3(rows, starts[y], weights[0, y], weights[1, y], weights[2, y], precision, levels)
-        _normalise(levels, grayscale, luma, factors, offsets, out[y])
+        _normalise(levels, grayscale, tones, out[y])
 
 
 @njit(nogil=True)
-def _views(
-    images: Any,
-    boxes: Any,
-    flip: Any,
-    grayscale: Any,
-    out: Any,
-    luma: Any,
-    factors: Any,
-    offsets: Any,
-    held: Any,
-    fours: Any,
-) -> None:
+def _views(images: Any, boxes: Any, flip: Any, grayscale: Any, out: Any, tones: Any, held: Any, fours: Any) -> None:
     """``views`` of ``images`` [B, H, W * C]. ``held`` is a byte buffer; ``fours`` [i] reads its bytes i to i + 3."""
     size, channels = out.shape[2:]
     starts, places = np.empty(size, np.int64), np.empty(size, np.uint64)  # unsigned: no negative indices
@@ -257,9 +237,9 @@ def _views(
             lines, gray = rows.view(np.uint8), grayscale[i]
             if channels == 3:
                 whole = out[i].reshape(size, 3 * size)
-                _finish(lines, starts, weights, terms, precision, gray, luma, factors, offsets, whole)
+                _finish(lines, starts, weights, terms, precision, gray, tones, whole)
             else:
-                _finish(lines, starts, weights, terms, precision, gray, luma, factors, offsets, sensor)
+                _finish(lines, starts, weights, terms, precision, gray, tones, sensor)
                 out[i, :, :, channel : channel + 3] = sensor.reshape(size, size, 3)
 
 
@@ -268,25 +248,16 @@ with suppress(RuntimeError):  # no writable cache: each process compiles again
 
 
 def views(
-    images: np.ndarray,
-    boxes: np.ndarray,
-    flip: np.ndarray,
-    grayscale: np.ndarray,
-    out: np.ndarray,
-    luma: np.ndarray,
-    factors: np.ndarray,
-    offsets: np.ndarray,
+    images: np.ndarray, boxes: np.ndarray, flip: np.ndarray, grayscale: np.ndarray, out: np.ndarray, tones: np.ndarray
 ) -> None:
     """Compute random views. Releases the GIL, so that several threads can fill parts of one ``out``.
 
     All arrays are contiguous. ``images`` are uint8 [B, H, W, C]; ``boxes``, ``flip`` and ``grayscale`` [B] as in
-    ``random_views.Drawn``; ``out`` [B, S, S, C] is float32, or the bits of bfloat16 as uint16; ``luma``, and
-    ``factors`` and ``offsets`` of the normalisation, are float32 [3].
+    ``random_views.Drawn``; ``out`` [B, S, S, C] is float32, or the bits of bfloat16 as uint16; ``tones`` float32 [3, 3]
+    are the weights of R, G, B in a gray, and factors and offsets of the normalisation.
     """
     assert max(images.shape[1:3]) <= MAX_SHRINK * out.shape[1]
     num, height, width, channels = images.shape
     held = np.zeros((width + TERMS) * channels, np.uint8)  # neighbours beyond the end of a row have weight 0
     fours = np.ndarray(len(held) - 3, np.uint32, held, strides=(1,))
-    _views(
-        images.reshape(num, height, width * channels), boxes, flip, grayscale, out, luma, factors, offsets, held, fours
-    )
+    _views(images.reshape(num, height, width * channels), boxes, flip, grayscale, out, tones, held, fours)

@@ -157,10 +157,10 @@ def _in_one_pass(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, co
     bits = out.view(torch.uint16) if dtype == torch.bfloat16 else out  # numpy has no bfloat16
     given = (images.permute(0, 2, 3, 1), drawn.boxes, drawn.flip, drawn.grayscale)
     each = [*(t.contiguous() for t in given), bits]
-    shared = [t.numpy() for t in (_luma(images.device).flatten(), *_normalisation(images.device))]
+    tones = torch.stack([_luma(images.device).flatten(), *_normalisation(images.device)]).numpy()
 
     def fill(*share: Tensor) -> None:
-        compiled.views(*(t.numpy() for t in share), *shared)
+        compiled.views(*(t.numpy() for t in share), tones)
 
     num_threads = min(num, torch.get_num_threads())
     if num_threads < 2:

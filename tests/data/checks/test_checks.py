@@ -16,8 +16,7 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.checks.contact_sheet import blocks_of
-from mvitac.data.checks.examine import examine, examine_pack, examine_source
+from mvitac.data.checks.examine import blocks_of, examine, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
 from mvitac.data.checks.image_stats import area_means, look_at

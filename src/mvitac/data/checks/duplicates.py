@@ -29,16 +29,11 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             across = across[np.argsort(numbers[across], kind="stable")]
             notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy in another split")
             rows += across.tolist()
+    item = "identical images across splits"
     if notes:
-        return Finding(
-            "identical images across splits",
-            "broken",
-            "; ".join(notes),
-            "remove the copies, or put them in one group so that they stay in one split",
-            rows=tuple(rows),
-        )
-    evidence = "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")
-    return Finding("identical images across splits", "ok", evidence)
+        advice = "remove the copies, or put them in one group so that they stay in one split"
+        return Finding(item, "broken", "; ".join(notes), advice, rows)
+    return Finding(item, "ok", "none" + (f" (inside one split: {'; '.join(inside)})" if inside else ""))
 
 
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -72,13 +67,11 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         )
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
         rows += pairs.ravel().tolist()
-    return Finding(
-        "near-copies across splits",
-        "look" if suspicious else "ok" if compared else "not checkable",
-        "; ".join(notes),
-        suspicious * "look at the sheet (pairs side by side); if they are one contact or one scene, group them",
-        rows=tuple(rows) if suspicious else (),
-    )
+    item, evidence = "near-copies across splits", "; ".join(notes)
+    if not suspicious:
+        return Finding(item, "ok" if compared else "not checkable", evidence)
+    advice = "look at the sheet (pairs side by side); if they are one contact or one scene, group them"
+    return Finding(item, "look", evidence, advice, rows)
 
 
 def _near_pairs(

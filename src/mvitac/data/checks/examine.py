@@ -1,6 +1,7 @@
 """Runs all checks on a pack, or on a source that is packed as thumbnails first."""
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,15 +10,15 @@ import numpy as np
 
 from mvitac.data.build import build
 from mvitac.data.checks import duplicates, image_checks, name_checks, table_checks, value_checks
-from mvitac.data.checks.contact_sheet import blocks_of
 from mvitac.data.checks.finding import Finding
 from mvitac.data.checks.image_stats import look_at
-from mvitac.data.image_grid import Block
+from mvitac.data.image_grid import Block, Tile, contents, pair
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Lost, Sample, Source
 from mvitac.data.spec import DataSpec, Window
 
 SINGLE = Window()
+SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24  # pixels; rows shown of a finding; rows shown if nothing is suspicious
 
 
 class ThumbnailSource(Source):
@@ -135,3 +136,23 @@ def examine_source(
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
         return findings, blocks_of(pack, findings)
+
+
+def blocks_of(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
+    """Return a block per finding that lists rows. Without any, one block of rows drawn at random."""
+    order = f"each pair: {contents(pack)}"
+    blocks = [
+        Block(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN]))
+        for f in findings
+        if f.rows and f.verdict in ("look", "broken")
+    ]
+    if blocks:
+        return blocks
+    num = min(NUM_SAMPLE, pack.num)
+    rows = np.sort(np.random.default_rng(0).choice(pack.num, num, replace=False))
+    return [Block(f"No suspicious rows. {num} of {pack.num} rows, drawn at random ({order})", _tiles(pack, rows))]
+
+
+def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:
+    ids, splits = pack.column("id").astype(str), pack.column("split").astype(str)
+    return [Tile(pair(pack, int(row), SIDE), f"{ids[row]} {splits[row]}") for row in rows]

@@ -16,7 +16,7 @@ class Finding:
     verdict: Verdict
     evidence: str  # what was measured, in one line
     advice: str = ""  # what to do; "" if nothing is wrong
-    rows: tuple[int, ...] = ()  # suspicious rows for the contact sheet, at most ``MAX_ROWS``
+    rows: Sequence[int] = ()  # suspicious rows for the contact sheet, of which ``MAX_ROWS`` are kept
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rows", tuple(int(row) for row in self.rows[:MAX_ROWS]))

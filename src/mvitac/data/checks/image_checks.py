@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, share, some
+from mvitac.data.checks.finding import Finding, Verdict, share, some
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
 
@@ -16,18 +16,13 @@ BLOCK = 48  # frames per measurement of the offset in a long sequence
 def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find constant images: a closed shutter, a failed decode, floats 0 to 1 stored as bytes."""
     found = {name: np.flatnonzero(one.has & ~one.seen) for name, one in looks.items()}
-    rows = np.unique(np.concatenate(list(found.values())))
-    if not len(rows):
+    rows = np.unique(np.concatenate(list(found.values()))).tolist()
+    if not rows:
         return Finding("constant frames", "ok", f"none among {pack.num} rows")
     what = "; ".join(f"{name}: {share(len(r), pack.num)}" for name, r in found.items() if len(r))
-    first = pack.column("id")[rows[0]]
-    return Finding(
-        "constant frames",
-        "broken" if len(rows) > 0.05 * pack.num else "look",
-        f"{what}, first {first}",
-        "look whether the sensor or the decoder failed, and leave these rows out",
-        rows=tuple(rows),
-    )
+    verdict: Verdict = "broken" if len(rows) > 0.05 * pack.num else "look"
+    advice = "look whether the sensor or the decoder failed, and leave these rows out"
+    return Finding("constant frames", verdict, f"{what}, first {pack.column('id')[rows[0]]}", advice, rows)
 
 
 def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -45,7 +40,7 @@ def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     verdict = "look" if rows else "ok"
     evidence = "; ".join(notes) or "all in colour"
     advice = "different cameras or converters: convert all alike, or mark them as different sensors" if rows else ""
-    return Finding("grayscale among colour", verdict, evidence, advice, rows=tuple(rows))
+    return Finding("grayscale among colour", verdict, evidence, advice, rows)
 
 
 def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -68,13 +63,10 @@ def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             rows += (mine := usable[swapped]).tolist()
             note = f"{share(len(mine), len(usable))} have red and blue mirrored{_where(pack, mine)}"
         notes.append(f"{name}: {note}")
-    return Finding(
-        "red and blue swapped",
-        "look" if rows else "ok" if compared else "not checkable",
-        "; ".join(notes),
-        "look at the sheet; if they are BGR (OpenCV's order), reverse their channels when reading" if rows else "",
-        rows=tuple(rows),
-    )
+    if not rows:
+        return Finding("red and blue swapped", "ok" if compared else "not checkable", "; ".join(notes))
+    advice = "look at the sheet; if they are BGR (OpenCV's order), reverse their channels when reading"
+    return Finding("red and blue swapped", "look", "; ".join(notes), advice, rows)
 
 
 def _mirrored(thumbs: np.ndarray) -> tuple[np.ndarray, bool, str]:
@@ -138,13 +130,9 @@ def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         told = f"{len(bad)} of {len(seen)} pairs, {chance:.1f} by chance" if len(bad) else f"none of {len(seen)} pairs"
         evidence = f"{told} ({100 * right:.0f} % of images can be told apart; a swap of all cannot)"
         return Finding(item, "ok", evidence)
-    return Finding(
-        item,
-        "look",
-        f"{share(len(bad), len(seen))} look swapped, first {pack.column('id')[bad[0]]}{_where(pack, bad)}",
-        "look at the sheet (vision left, touch right); exchange the two paths or keys of these rows",
-        rows=tuple(bad),
-    )
+    evidence = f"{share(len(bad), len(seen))} look swapped, first {pack.column('id')[bad[0]]}{_where(pack, bad)}"
+    advice = "look at the sheet (vision left, touch right); exchange the two paths or keys of these rows"
+    return Finding(item, "look", evidence, advice, bad.tolist())
 
 
 def _log_likelihood(values: np.ndarray, middle: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -185,13 +173,9 @@ def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     evidence = f"r = {mean[MAX_LAG]:.2f} at lag 0, best {mean[best]:.2f} at lag {lag} over {len(curves)} sequences"
     if not certain:
         return Finding(item, "ok", evidence)
-    later = "touch" if lag > 0 else "vision"
-    return Finding(
-        item,
-        "look",
-        f"{evidence}: {later} comes {abs(lag)} row{'s' * (abs(lag) > 1)} late",
-        "pair by timestamps if there are any, or shift one stream; motion that precedes contact can also do this",
-    )
+    evidence += f": {'touch' if lag > 0 else 'vision'} comes {abs(lag)} row{'s' * (abs(lag) > 1)} late"
+    advice = "pair by timestamps if there are any, or shift one stream; motion that precedes contact can also do this"
+    return Finding(item, "look", evidence, advice)
 
 
 def motion_correlations(pack: Pack, looks: dict[str, ImageStats], when: np.ndarray) -> np.ndarray:

@@ -32,13 +32,11 @@ def similar_names(pack: Pack) -> Finding:
     for task in pack.spec.tasks:
         if alike := _alike(task.classes):
             notes.append(f"classes of {task.name}: {_shown(alike)}")
-    return Finding(
-        "names that differ in spelling only",
-        "look" if notes else "ok",
-        "; ".join(dict.fromkeys(notes)) or "no two groups or classes differ only in case, blanks or zeros",
-        "if they mean the same, write them alike and pack again" if notes else "",
-        rows=tuple(dict.fromkeys(rows)),
-    )
+    item = "names that differ in spelling only"
+    if not notes:
+        return Finding(item, "ok", "no two groups or classes differ only in case, blanks or zeros")
+    advice = "if they mean the same, write them alike and pack again"
+    return Finding(item, "look", "; ".join(dict.fromkeys(notes)), advice, list(dict.fromkeys(rows)))
 
 
 def _alike(names: list[str] | tuple[str, ...], *, across_parts: bool = False) -> list[list[str]]:

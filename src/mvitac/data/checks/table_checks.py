@@ -19,13 +19,10 @@ def unreadable(pack: Pack) -> Finding:
     damaged = pack.meta.get("damaged", [])
     if not damaged:
         return Finding("unreadable items", "ok", f"none; {pack.num} rows were read")
-    name, why = damaged[0]
-    return Finding(
-        "unreadable items",
-        "broken" if len(damaged) > 0.01 * pack.num else "look",
-        f"{len(damaged)}; {pack.num} rows were read; first {name}: {why}",
-        "repair them or download them again; the pack does not contain them",
-    )
+    verdict: Verdict = "broken" if len(damaged) > 0.01 * pack.num else "look"
+    evidence = f"{len(damaged)}; {pack.num} rows were read; first {': '.join(damaged[0])}"
+    advice = "repair them or download them again; the pack does not contain them"
+    return Finding("unreadable items", verdict, evidence, advice)
 
 
 def missing_images(pack: Pack) -> Finding:
@@ -40,12 +37,9 @@ def missing_images(pack: Pack) -> Finding:
             if len(rows := pack.rows(split)) and lacking[rows].all():
                 verdict = "look"
                 notes.append(f"no row of {split} has {modality}")
-    return Finding(
-        "missing images",
-        verdict,
-        "; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}",
-        "assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else "",
-    )
+    evidence = "; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}"
+    advice = "assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else ""
+    return Finding("missing images", verdict, evidence, advice)
 
 
 def missing_labels(pack: Pack) -> Finding:
@@ -70,7 +64,7 @@ def missing_labels(pack: Pack) -> Finding:
                 rows += empty.tolist()
     advice = "fill them in, or move the rows to split unlabelled; fine if they are meant for pre-training only"
     evidence = "; ".join(notes) or "none in train, val and test"
-    return Finding(item, verdict, evidence, advice if notes else "", tuple(rows))
+    return Finding(item, verdict, evidence, advice if notes else "", rows)
 
 
 def class_balance(pack: Pack) -> list[Finding]:
@@ -152,7 +146,7 @@ def leaks(pack: Pack) -> list[Finding]:
         item = "groups across splits" if split == "split" else f"groups across column {split}"
         evidence = "; ".join(notes) or f"none of {', '.join(names)} is in more than one split"
         advice = bool(notes) * "split by the largest of these keys, or report what test shares with train"
-        findings.append(Finding(item, verdict, evidence, advice, tuple(rows)))
+        findings.append(Finding(item, verdict, evidence, advice, rows))
     if sound:
         evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
         findings.append(Finding("groups across split columns", "ok", evidence))
@@ -178,20 +172,15 @@ def mixture(pack: Pack) -> Finding:
         if alone := sorted(on["test"] - on["train"]):
             verdict = "look"
             notes.append(f"{column} {some(alone)} only in test")
-        told = []
         for task in pack.spec.tasks:
             labels = pack.labels(task.name, "train", "val", "test")
             counted = (labels >= 0) & (values != "None")
-            told += _predicts(f"{column} alone", task.name, values[counted], labels[counted])
-        if told:
-            verdict = "look"
-            notes += told
+            if told := _predicts(f"{column} alone", task.name, values[counted], labels[counted]):
+                verdict = "look"
+                notes += told
     if not columns:
-        return Finding(
-            "sensors and resolutions",
-            "not checkable",
-            "no column sensor, and a pack holds one size: check the source with --data instead",
-        )
+        lacking = "no column sensor, and a pack holds one size: check the source with --data instead"
+        return Finding("sensors and resolutions", "not checkable", lacking)
     advice = "probe each kind separately, or use the same kinds in train and test" if verdict != "ok" else ""
     return Finding("sensors and resolutions", verdict, "; ".join(notes), advice)
 
@@ -229,13 +218,9 @@ def numbers(pack: Pack) -> Finding:
             if len(far):
                 notes.append(f"{name} is {values[far[0]]:g} in row {far[0]}, others {low:g} to {high:g}")
                 rows += list(far)
-    return Finding(
-        "numbers",
-        "look" if notes else "ok",
-        "; ".join(notes) or f"{seen} columns, all finite and in range",
-        "repair the cells, or leave the rows out" if notes else "",
-        rows=tuple(rows),
-    )
+    if not notes:
+        return Finding("numbers", "ok", f"{seen} columns, all finite and in range")
+    return Finding("numbers", "look", "; ".join(notes), "repair the cells, or leave the rows out", rows)
 
 
 def give_aways(pack: Pack) -> Finding:

@@ -4,10 +4,10 @@ import re
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, Verdict, share, some
+from mvitac.data.checks.finding import Finding, share, some
 from mvitac.data.pack import Pack
 from mvitac.data.spec import Target, ValueTask, Window
-from mvitac.data.windows import frames_of, places
+from mvitac.data.windows import frames_of, places, recordings
 
 UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", "g", "Nm", "Pa", "kPa")
 """Units whose name at the end of a column's name, as in depth_mm, is taken for the unit of the column."""
@@ -18,15 +18,15 @@ STUCK_FRAMES = 10  # shortest constant stretch that is reported
 
 def values(pack: Pack) -> list[Finding]:
     """Return one finding per target of a task with values."""
-    recordings = _recordings(pack, Window())
+    touches = _touches(pack)
     return [
-        _finding(pack, task, target, pack.values(task)[:, t], recordings)
+        _finding(pack, task, target, pack.values(task)[:, t], touches)
         for task in pack.spec.values
         for t, target in enumerate(task.targets)
     ]
 
 
-def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, recordings: list[np.ndarray]) -> Finding:
+def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, touches: list[np.ndarray]) -> Finding:
     item = f"values of {task.name}" + (f": {target.name}" if len(task.targets) > 1 else "")
     sides = {side: pack.rows(*splits, only=task.only, by=task.split) for side, splits in _SIDES.items()}
     measured = {side: rows[np.isfinite(found[rows])] for side, rows in sides.items()}
@@ -42,33 +42,26 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, rec
     checks = {
         "check the unit": _unit(target, known, pack.column("group")[rows].astype(str)),
         "repair these cells, or leave them empty": _outliers(rows, known),
-        "glitches of the sensor: repair these cells, or leave them empty": _spikes(found, recordings),
-        "a stuck or saturated sensor: leave these cells empty": _stuck(found, recordings),
+        "glitches of the sensor: repair these cells, or leave them empty": _spikes(found, touches),
+        "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches),
         "expect larger errors there, or split so that train covers test": _outside(found, measured, target),
     }
     wrong = {advice: note for advice, note in checks.items() if note[0]}
-    verdict: Verdict = "look" if wrong else "ok"
-    return Finding(
-        item,
-        verdict,
-        "; ".join([*evidence, *(text for text, _ in wrong.values())]),
-        "; ".join(wrong),
-        rows=tuple(row for _, suspicious in wrong.values() for row in suspicious),
-    )
+    evidence += [text for text, _ in wrong.values()]
+    suspects = [row for _, suspicious in wrong.values() for row in suspicious]
+    return Finding(item, "look" if wrong else "ok", "; ".join(evidence), "; ".join(wrong), suspects)
 
 
 _SIDES = {"train": ("train", "val"), "test": ("test",)}
 Note = tuple[str, list[int]]  # what is wrong ("" = nothing), and the rows to look at
 
 
-def _recordings(pack: Pack, window: Window) -> list[np.ndarray]:
+def _touches(pack: Pack) -> list[np.ndarray]:
     """Rows of each touch in the order of time; empty if no column orders them."""
     try:
-        _, place = places(pack, window)
+        return [*recordings(pack, places(pack, Window())[1])]
     except ValueError:
         return []
-    touches = map(pack.rows_of, range(int(pack.touch_groups.max()) + 1))
-    return [rows[np.argsort(place[rows], kind="stable")] for rows in touches]
 
 
 def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
@@ -109,12 +102,12 @@ def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
     return "; ".join(notes), rows[(far & (high > low)) | (negative & (high > 0))].tolist()
 
 
-def _spikes(found: np.ndarray, recordings: list[np.ndarray]) -> Note:
+def _spikes(found: np.ndarray, touches: list[np.ndarray]) -> Note:
     """Values that jump away for a few frames of a recording and come back to where they were."""
     spikes: list[int] = []
     usual = np.percentile(found[np.isfinite(found)], [1, 99])
     usual += np.array([-0.1, 0.1]) * (usual[1] - usual[0])
-    for rows in (rows[np.isfinite(found[rows])] for rows in recordings):
+    for rows in (rows[np.isfinite(found[rows])] for rows in touches):
         if len(rows) < 8:
             continue
         y = found[rows]
@@ -142,10 +135,10 @@ def _back(y: np.ndarray, first: int, least: float, usual: np.ndarray) -> int:
     return 0
 
 
-def _stuck(found: np.ndarray, recordings: list[np.ndarray]) -> Note:
+def _stuck(found: np.ndarray, touches: list[np.ndarray]) -> Note:
     """Stretches of one recording with the same value other than 0, which is what no contact measures."""
     parts: list[np.ndarray] = []
-    for rows in (rows[np.isfinite(found[rows])] for rows in recordings):
+    for rows in (rows[np.isfinite(found[rows])] for rows in touches):
         parts += np.split(rows, np.flatnonzero(np.diff(found[rows])) + 1)
     short = [len(part) for part in parts if 0 < len(part) < STUCK_FRAMES]
     stretches = [part for part in parts if len(part) >= STUCK_FRAMES and found[part[0]] != 0]
@@ -174,10 +167,10 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
         return Finding(item, "not checkable", "a part of the items has gaps: examine all of them")
     try:
         name, place = places(pack, window)
-        index, whole = frames_of(pack, window)
+        index, whole, _ = frames_of(pack, window)
     except ValueError as error:
         return Finding(item, "broken", str(error), "training refuses these windows, too")
-    steps = [np.diff(place[rows]) for rows in _recordings(pack, window) if len(rows) > 2]
+    steps = [np.diff(place[rows]) for rows in recordings(pack, place) if len(rows) > 2]
     rates = np.array([np.median(step) for step in steps])
     gaps = sum(int((step > 2.5 * rate).sum()) for step, rate in zip(steps, rates, strict=True))
     evidence = [f"{share(int(whole.sum()), pack.num)} rows have all frames before them, by column {name}"]
@@ -198,5 +191,4 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     if too_short := set(pack.touch_groups.tolist()) - set(pack.touch_groups[whole].tolist()):
         evidence.append(f"{share(len(too_short), int(pack.touch_groups.max()) + 1)} touches are shorter than a window")
         advice.append("their first frame repeats in every row: give fewer frames or a smaller stride")
-    verdict: Verdict = "look" if advice else "ok"
-    return Finding(item, verdict, "; ".join(evidence), "; ".join(advice))
+    return Finding(item, "look" if advice else "ok", "; ".join(evidence), "; ".join(advice))

@@ -1,5 +1,3 @@
 """Grasps of Calandra et al. (2017), read as published."""
 
-from mvitac.datasets.calandra import reader
-
-__all__ = ["reader"]
+from mvitac.datasets.calandra import reader as reader

@@ -19,7 +19,6 @@ playdoh_container bandaid_box emergency_stop_button_for_sawyer plastic_duck brow
 AUTHORS_TEST, AUTHORS_TRAIN = tuple(_TEST.split()), tuple(_TRAIN.split())
 """The paper's 40 most attempted objects as listed by its authors (in their spelling)."""
 
-
 REPAIRS = {
     "plastic_duc": "plastic_duck",
     "hair_dryer_": "hair_dryer_spiky_nozzle",
@@ -47,9 +46,9 @@ def object_name(value: Any, repairs: dict[str, str]) -> str:
     return repairs.get(name, name)
 
 
-def most_attempted(counts: Counter[str], num: int = 40) -> list[str]:
-    """Return the ``num`` objects with most attempts; ties are sorted by name."""
-    return sorted(counts, key=lambda name: (-counts[name], name))[:num]
+def most_attempted(counts: Counter[str]) -> list[str]:
+    """Return the 40 objects with most attempts; ties are sorted by name."""
+    return sorted(counts, key=lambda name: (-counts[name], name))[:40]
 
 
 def doubtful(counts: Counter[str]) -> list[tuple[str, str]]:
@@ -75,11 +74,6 @@ def _one_edit(a: str, b: str) -> bool:
     a, b = sorted((a, b), key=len)
     same = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
     return a[same:] == b[same + 1 :] or a[same + 1 :] == b[same + 1 :]
-
-
-def doubtful_text(counts: Counter[str]) -> str:
-    pairs = [f"{name} ({counts[name]}) for {likely} ({counts[likely]})?" for name, likely in doubtful(counts)]
-    return f"{'; '.join(pairs)} repair with --data.repairs wrong=right" if pairs else ""
 
 
 def owners_shuffle(names: Sequence[str], seed: int) -> list[str]:

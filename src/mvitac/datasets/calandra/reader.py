@@ -27,28 +27,18 @@ import numpy as np
 from mvitac.data.source import Count, Sample, Source, one_stamp, stamp_of
 from mvitac.data.spec import PHASES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.datasets.calandra.objects import (
-    AUTHORS_TEST,
-    AUTHORS_TRAIN,
-    REPAIRS,
-    doubtful,
-    doubtful_text,
-    most_attempted,
-    object_name,
-    owners_shuffle,
-)
+from mvitac.datasets.calandra import objects
+from mvitac.datasets.calandra.objects import AUTHORS_TEST, AUTHORS_TRAIN
 from mvitac.registry import to_json, unknown
 from mvitac.system.files import brief, digest
 
 VERSION = 1  # version of this reader. Increase it when the same shards would give another pack.
 Phase = Literal["before", "during", "after"]
 NUM_SHARDS, NUM_PER_SHARD, NUM_GRASPS = 38, 250, 9296
-SHARD = re.compile(r"calandra_corl2017_(\d{3})\.h5")
-
+SHARD = re.compile(r"calandra_corl2017_\d{3}\.h5")
 
 KINECT_CROP = (0.06441159, 0.60563023, 0.13482023, 0.97554603)
 """Top, bottom, left, right as fractions of the image: the owners' crop to the table and some space above it."""
-
 
 _CLASSES = ("failure", "success")
 TASKS = {
@@ -136,7 +126,7 @@ class Calandra(Source):
     def __init__(self, config: CalandraConfig) -> None:
         self.config = config
         self._files = {file: stamp_of(str(file)) for file in find_shards(config.path, config.shards)}
-        repairs = REPAIRS | dict(text.split("=") for text in config.repairs)
+        repairs = objects.REPAIRS | dict(text.split("=") for text in config.repairs)
         everything = [grasp for file in self._files for grasp in list_grasps(file, repairs)]
         self.counts = Counter(grasp.object for grasp in everything if not grasp.damage)
         """Attempts per object in all shards, including objects that the split leaves out."""
@@ -216,30 +206,32 @@ class Calandra(Source):
 
     def expected(self) -> list[Count]:
         """Count shards and grasps, and compare the 40 most attempted objects with the authors' list."""
-        have = {int(_number(file)) for file in self._files}
+        have = {_number(file) for file in self._files}
         absent = sorted(set(range(NUM_SHARDS)) - have)
-        top, listed = most_attempted(self.counts), {*AUTHORS_TRAIN, *AUTHORS_TEST}
+        top, listed = objects.most_attempted(self.counts), {*AUTHORS_TRAIN, *AUTHORS_TEST}
         lacking, others = sorted(listed - set(top)), sorted(set(top) - listed)
         swaps = f"listed but not among them: {', '.join(lacking)}; among them: {', '.join(others)}" if lacking else ""
+        doubtful = objects.doubtful(self.counts)
+        pairs = [f"{wrong} ({self.counts[wrong]}) for {right} ({self.counts[right]})?" for wrong, right in doubtful]
+        hint = f"{'; '.join(pairs)} repair with --data.repairs wrong=right" if pairs else ""
         return [
             Count("shards", NUM_SHARDS, len(have), f"missing {' '.join(f'{n:03d}' for n in absent)}" if absent else ""),
             Count("grasps that can be read", NUM_GRASPS, sum(self.counts.values())),
             Count("objects of the authors' list among the 40 most attempted", 40, len(listed & set(top)), swaps),
-            Count("object names that look cut or misspelt", 0, len(doubtful(self.counts)), doubtful_text(self.counts)),
+            Count("object names that look cut or misspelt", 0, len(pairs), hint),
         ]
 
 
-def _number(file: Path) -> str:
-    found = SHARD.fullmatch(file.name)
-    assert found is not None
-    return found[1]
+def _number(file: Path) -> int:
+    """The number in the name of a shard, which matches ``SHARD``."""
+    return int(file.stem[-3:])
 
 
 def find_shards(path: Path, shards: Sequence[int]) -> list[Path]:
     """Return the shards in folder ``path``, or those in ``shards``; ValueError names what is missing."""
     if not path.is_dir():
         raise ValueError(f"{path} is not a folder: give the one with calandra_corl2017_000.h5 and its neighbours")
-    files = {int(_number(file)): file for file in sorted(path.iterdir()) if SHARD.fullmatch(file.name)}
+    files = {_number(file): file for file in sorted(path.iterdir()) if SHARD.fullmatch(file.name)}
     missing = [number for number in shards if number not in files]
     if missing or not files:
         lacking = f"calandra_corl2017_{missing[0]:03d}.h5" if missing else "calandra_corl2017_NNN.h5"
@@ -253,7 +245,7 @@ def list_grasps(file: Path, repairs: dict[str, str]) -> list[Grasp]:
     """Return every grasp of a shard with name and outcome. In a shard that cannot be opened, all grasps are damaged."""
     import h5py
 
-    shard = int(_number(file))
+    shard = _number(file)
     try:
         with h5py.File(file) as opened:
             data: Any = opened["data"]
@@ -270,7 +262,7 @@ def _describe(data: Any, grasp: Grasp, repairs: dict[str, str]) -> Grasp:
     try:
         attributes = data[f"i{grasp.index}"].attrs
         what = "attribute object_name"
-        name = object_name(attributes["object_name"], repairs)
+        name = objects.object_name(attributes["object_name"], repairs)
         what = "attribute is_gripping"
         gripping = np.asarray(attributes["is_gripping"]).reshape(-1)
         if len(gripping) != 1 or gripping[0] not in (0, 1):
@@ -282,14 +274,13 @@ def _describe(data: Any, grasp: Grasp, repairs: dict[str, str]) -> Grasp:
 
 
 def _image(file: Any, name: str, grasp: Grasp) -> np.ndarray:
-    where = f"{grasp.file.name} i{grasp.index}: {name}"
     try:
         dataset = file[f"data/i{grasp.index}/{name}"]
         if dataset.dtype != np.uint8 or len(dataset.shape) != 3 or dataset.shape[2] != 3 or 0 in dataset.shape:
             raise ValueError(f"is {dataset.dtype} {dataset.shape}, not uint8 H x W x 3")
         return dataset[()]
     except (OSError, KeyError, RuntimeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{where} cannot be read ({brief(error)})") from None
+        raise ValueError(f"{grasp.file.name} i{grasp.index}: {name} cannot be read ({brief(error)})") from None
 
 
 def crop_kinect(image: np.ndarray) -> np.ndarray:
@@ -314,7 +305,7 @@ def split_objects(config: CalandraConfig, names: Sequence[str]) -> dict[str, str
         splits |= {name: "test" for name in names if name in AUTHORS_TEST}
         others = {name: "unlabelled" for name in names if name not in splits} if config.extra_objects else {}
     elif config.split == "object":
-        shuffled = owners_shuffle(names, config.split_seed)
+        shuffled = objects.owners_shuffle(names, config.split_seed)
         num_train = int(0.75 * len(shuffled))
         splits, others = {name: "train" if i < num_train else "test" for i, name in enumerate(shuffled)}, {}
     else:

@@ -1,5 +1,3 @@
 """Reads and writes LeRobot datasets."""
 
-from mvitac.datasets.lerobot import reader
-
-__all__ = ["reader"]
+from mvitac.datasets.lerobot import reader as reader

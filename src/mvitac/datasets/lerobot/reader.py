@@ -12,7 +12,7 @@ used, so cameras may have different rates. If it is farther away than ``toleranc
 """
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,10 +21,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mvitac.data.video import frame_times
 from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.datasets.table.video_times import nearest, timestamps
 from mvitac.registry import unknown
 from mvitac.system.files import brief, digest, read_json
 
@@ -64,7 +64,7 @@ class LeRobotConfig(RowsConfig):
         info = _info(self.path)
         cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
         names = choose(cameras, self.vision, self.touch, self.path)
-        embedded = [key for key in names.values() if key in _embedded(info)]
+        embedded = [key for key in names.values() if info["features"][key]["dtype"] == "image"]
         rows, cells = _frames(self.path, info, embedded, self.every, self.vectors())
         found: dict[str, list[ImageRef | None]] = {}
         for column, key in names.items():
@@ -90,12 +90,12 @@ class LeRobotConfig(RowsConfig):
             if file not in times:
                 if not file.is_file():
                     raise ValueError(f"{file} is missing: fetch the videos too, or leave {key} out")
-                times[file] = timestamps(file)
+                times[file] = frame_times(file)
             start, end = episode[f"videos/{key}/from_timestamp"], episode.get(f"videos/{key}/to_timestamp")
             # One file has several episodes: the nearest frame must be of the same episode.
             low, high = np.searchsorted(times[file], [start - 1e-3, (np.inf if end is None else end) - 1e-3])
             when = start + np.array([float(rows[i]["timestamp"]) for i in numbers])
-            at, away = nearest(times[file][low:high], when)
+            at, away = _nearest(times[file][low:high], when)
             for i, frame, miss, moment in zip(numbers, (low + at).tolist(), away.tolist(), when.tolist(), strict=True):
                 if miss <= self.tolerance:
                     places[i] = Frame(str(file), frame)
@@ -105,6 +105,16 @@ class LeRobotConfig(RowsConfig):
                         f" {miss:.3f} s away): give a larger --data.tolerance, or --data.allow-missing"
                     )
         return places
+
+
+def _nearest(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index in ascending ``times`` [N] nearest to each of ``wanted`` [M], and the distance in seconds."""
+    if not len(times):
+        return np.zeros(len(wanted), int), np.full(len(wanted), np.inf)
+    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    at = np.where(np.abs(times[after] - wanted) < np.abs(times[before] - wanted), after, before)
+    return at, np.abs(times[at] - wanted)
 
 
 def choose(cameras: Sequence[str], vision: str | None, touch: tuple[str, ...], where: Path) -> dict[str, str]:
@@ -142,21 +152,20 @@ def _info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _embedded(info: dict[str, Any]) -> list[str]:
-    return [key for key, feature in info["features"].items() if feature["dtype"] == "image"]
-
-
 def _tables(root: Path, folder: str, *wanted: str) -> list[dict[str, Any]]:
     """Return the rows of all parquet files in ``folder``: episode_index and the columns that begin with ``wanted``."""
-    files = sorted((root / folder).glob("*/*.parquet"))
-    if not files:
-        raise ValueError(f"{root / folder} holds no parquet files: fetch the whole dataset")
     rows: list[dict[str, Any]] = []
-    for file in files:
-        opened = _open(file)
+    for _, opened in _open_all(root / folder):
         names = [n for n in opened.schema_arrow.names if n == "episode_index" or n.startswith(wanted)]
         rows += opened.read(columns=names).to_pylist()
     return rows
+
+
+def _open_all(folder: Path) -> Iterator[tuple[Path, pq.ParquetFile]]:
+    files = sorted(folder.glob("*/*.parquet"))
+    if not files:
+        raise ValueError(f"{folder} holds no parquet files: fetch the whole dataset")
+    yield from ((file, _open(file)) for file in files)
 
 
 def _open(file: Path) -> pq.ParquetFile:
@@ -183,11 +192,7 @@ def _frames(
     scalars = [k for k, f in info["features"].items() if f["dtype"] in SCALARS and list(f.get("shape", [1])) == [1]]
     rows: list[dict[str, str]] = []
     cells: dict[str, list[ImageRef | None]] = {key: [] for key in images}
-    files = sorted((root / "data").glob("*/*.parquet"))
-    if not files:
-        raise ValueError(f"{root / 'data'} holds no parquet files: fetch the whole dataset")
-    for file in files:
-        opened = _open(file)
+    for file, opened in _open_all(root / "data"):
         for name in ("timestamp", "episode_index", "frame_index", *images):
             if name not in opened.schema_arrow.names:
                 raise ValueError(f"{file} has no column {name!r}: fetch it again")

@@ -26,6 +26,13 @@ TAKEN = {"timestamp", "task_index", "task", *RENAMED, *RENAMED.values()}
 """Column names reserved by the format or by our reader; a pack column of such a name is renamed."""
 NUM_FOR_STATS = 256  # number of images used for mean and standard deviation
 ONE_FILE = "chunk-000/file-000.parquet"
+KINDS = {
+    "int64": (pa.int64(), pa.types.is_integer),
+    "bool": (pa.bool_(), pa.types.is_boolean),
+    "float64": (pa.float64(), pa.types.is_float64),
+    "float32": (pa.float32(), pa.types.is_floating),
+}
+"""lerobot's name of a type of numbers -> arrow's type, and whether a column of a pack has it; all others are text."""
 
 
 def check_fps(fps: float) -> None:
@@ -45,12 +52,11 @@ def write_lerobot(pack: Pack, out: Path, *, fps: int = 10) -> int:
     if not len(rows):
         raise ValueError(f"{pack.path} has no row with all of {', '.join(pack.spec.modalities)}: nothing to write")
     rows = rows[np.argsort(pack.touch_groups[rows], kind="stable")]
-    groups = pack.touch_groups[rows]
-    starts = np.flatnonzero(np.r_[True, groups[1:] != groups[:-1]])
-    ends = np.r_[starts[1:], len(rows)]
+    _, starts, lengths = np.unique(pack.touch_groups[rows], return_index=True, return_counts=True)
+    ends = starts + lengths
     with new_folder(out) as partial:
         features = _features(pack)
-        homes = _write_data(pack, rows, starts, fps, partial, features)
+        homes = _write_data(pack, rows, starts, ends, fps, partial, features)
         _write_episodes(pack, partial, starts, ends, homes)
         _write_tasks(pack, partial)
         write_json(partial / "meta" / "stats.json", _stats(pack, rows, starts, fps))
@@ -101,16 +107,7 @@ def _carried(pack: Pack) -> dict[str, tuple[str, str]]:
         name, kind = field.name, field.type
         while name in TAKEN or (name != field.name and name in pack.table.column_names):
             name += "_in_pack"
-        dtype = (
-            "int64"
-            if pa.types.is_integer(kind)
-            else "bool"
-            if pa.types.is_boolean(kind)
-            else ("float64" if pa.types.is_float64(kind) else "float32")
-            if pa.types.is_floating(kind)
-            else "string"
-        )
-        carried[name] = (field.name, dtype)
+        carried[name] = (field.name, next((dtype for dtype, (_, has) in KINDS.items() if has(kind)), "string"))
     return carried
 
 
@@ -127,18 +124,17 @@ def _features(pack: Pack) -> dict[str, Any]:
 
 
 def _write_data(
-    pack: Pack, rows: np.ndarray, starts: np.ndarray, fps: int, out: Path, features: dict[str, Any]
+    pack: Pack, rows: np.ndarray, starts: np.ndarray, ends: np.ndarray, fps: int, out: Path, features: dict[str, Any]
 ) -> list[tuple[int, int]]:
     """Write the data files; return (chunk, file) of each episode, which is in a single file."""
     picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    kinds = {"int64": pa.int64(), "float32": pa.float32(), "float64": pa.float64(), "bool": pa.bool_()}
-    kinds |= {"string": pa.string(), "image": picture}
+    kinds = {"string": pa.string(), "image": picture, **{name: kind for name, (kind, _) in KINDS.items()}}
     schema = pa.schema([(name, kinds[feature["dtype"]]) for name, feature in features.items()])
     homes: list[tuple[int, int]] = []
     writer: pq.ParquetWriter | None = None
     number, written = -1, 0
     try:
-        for episode, (start, end) in enumerate(zip(starts, np.r_[starts[1:], len(rows)], strict=True)):
+        for episode, (start, end) in enumerate(zip(starts, ends, strict=True)):
             if writer is None or written > FILE_BYTES:
                 if writer:
                     writer.close()

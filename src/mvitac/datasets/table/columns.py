@@ -1,55 +1,15 @@
 """Converts a manifest's text cells to a pack's columns: labels, controls, groups, splits and ids."""
 
 import math
-import os
 import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from mvitac.data.pack_table import SPLITS
-from mvitac.data.spec import AnyTask, Target, Task, ValueTask
-from mvitac.datasets.table.image_columns import Background, Refs
+from mvitac.data.spec import Target, Task, ValueTask
+from mvitac.datasets.table.image_columns import Selection
 from mvitac.datasets.table.manifest import Manifest, number_of, text_of
-from mvitac.datasets.table.splits import BY_GROUP, assign_splits, check_leak, check_sides, check_split_names
 
 MAX_ONE_HOT = 64
-
-
-@dataclass(frozen=True, kw_only=True)
-class Selection:
-    """The rows of a manifest that become samples; all lists have one entry per row."""
-
-    manifest: Manifest
-    numbers: list[int]  # row numbers in the manifest, counted from 1
-    rows: list[dict[str, str]]
-    refs: Refs
-    backgrounds: list[Background]  # one per touch column; empty for raw images
-
-    @property
-    def where(self) -> str:
-        """Name of the table, for error messages."""
-        return str(self.manifest.file)
-
-    def filled(self, column: str, what: str) -> list[str]:
-        """Return the cells of ``column``; ValueError if one of them is empty."""
-        empty = [number for number, row in zip(self.numbers, self.rows, strict=True) if not row[column]]
-        if empty:
-            hint = f"; write one of {', '.join(SPLITS)}" if what == "split" else ""
-            raise ValueError(
-                f"{self.where}: column {column!r} ({what}) is empty in {len(empty)} rows, first row {empty[0]}{hint}"
-            )
-        return [row[column] for row in self.rows]
-
-    def ids(self) -> list[str]:
-        """Return the column "id" if there is one, else the row numbers."""
-        if "id" not in self.manifest.columns:
-            return [f"{number:06d}" for number in self.numbers]
-        ids = self.filled("id", "id")
-        twice = [name for name, count in Counter(ids).items() if count > 1]
-        if twice:
-            raise ValueError(f"{self.where}: id {twice[0]!r} occurs in several rows: ids must differ")
-        return ids
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,36 +139,3 @@ def _numeric(selected: Selection, column: str, labelled: Sequence[bool]) -> dict
             f" {names[0]!r}: at most {MAX_ONE_HOT} become one-hot"
         )
     return {f"{column}={name}": [float(cell == name) for cell in cells] for name in names}
-
-
-def split_rows(
-    selected: Selection,
-    column: str,
-    grouping: Grouping,
-    tasks: Sequence[AnyTask],
-    labels: Sequence[Sequence[int]],
-    *,
-    shares: tuple[float, float],
-    seed: int,
-    allow_leak: bool,
-) -> list[str]:
-    """Return the split of each row: read from ``column``, or assigned by group, and checked.
-
-    ``shares``: fractions of the groups in test and in val, for ``BY_GROUP``. ``allow_leak`` accepts a group, touch
-    group or image in more than one split.
-    """
-    where = selected.where
-    if column == BY_GROUP:
-        splits = assign_splits(grouping.groups, labels, *shares, seed)
-    else:
-        splits = selected.filled(column, "split")
-        check_split_names(where, column, selected.numbers, splits)
-    if not allow_leak:
-        check_leak(where, column, f"groups ({grouping.group_by})", grouping.groups, splits)
-        check_leak(where, column, f"touch groups ({grouping.touch_group_by})", grouping.touch_groups, splits)
-        for name, refs in selected.refs.items():
-            there = [i for i, ref in enumerate(refs) if ref]
-            images = [os.path.normpath(str(refs[i])) for i in there]
-            check_leak(where, column, f"{name} images", images, [splits[i] for i in there])
-    check_sides(where, column, splits, tasks, labels, len(set(grouping.groups)))
-    return splits

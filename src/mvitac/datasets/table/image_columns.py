@@ -4,9 +4,12 @@ Row numbers count from 1, row indices from 0.
 """
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from mvitac.data.pack_table import SPLITS
 from mvitac.data.source import Stamp, stamp_of
 from mvitac.datasets.table.image_refs import ImageRef
 from mvitac.datasets.table.manifest import Condition, Manifest
@@ -17,7 +20,43 @@ Background = dict[int, tuple[ImageRef, ...]]
 """Row number -> the no-contact images whose mean is subtracted from the row's touch image."""
 
 
-def image_columns(manifest: Manifest, vision: str | None, touch: tuple[str, ...]) -> tuple[str | None, tuple[str, ...]]:
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """The rows of a manifest that become samples; all lists have one entry per row."""
+
+    manifest: Manifest
+    numbers: list[int]  # row numbers in the manifest, counted from 1
+    rows: list[dict[str, str]]
+    refs: Refs
+    backgrounds: list[Background]  # one per touch column; empty for raw images
+
+    @property
+    def where(self) -> str:
+        """Name of the table, for error messages."""
+        return str(self.manifest.file)
+
+    def filled(self, column: str, what: str) -> list[str]:
+        """Return the cells of ``column``; ValueError if one of them is empty."""
+        empty = [number for number, row in zip(self.numbers, self.rows, strict=True) if not row[column]]
+        if empty:
+            hint = f"; write one of {', '.join(SPLITS)}" if what == "split" else ""
+            raise ValueError(
+                f"{self.where}: column {column!r} ({what}) is empty in {len(empty)} rows, first row {empty[0]}{hint}"
+            )
+        return [row[column] for row in self.rows]
+
+    def ids(self) -> list[str]:
+        """Return the column "id" if there is one, else the row numbers."""
+        if "id" not in self.manifest.columns:
+            return [f"{number:06d}" for number in self.numbers]
+        ids = self.filled("id", "id")
+        twice = [name for name, count in Counter(ids).items() if count > 1]
+        if twice:
+            raise ValueError(f"{self.where}: id {twice[0]!r} occurs in several rows: ids must differ")
+        return ids
+
+
+def find(manifest: Manifest, vision: str | None, touch: tuple[str, ...]) -> tuple[str | None, tuple[str, ...]]:
     """Return the columns of vision and touch images: those asked for ("" = none), else those with the usual names."""
     have = (*manifest.columns, *manifest.found)
     vision = ("vision" if "vision" in have else None) if vision is None else vision or None
@@ -97,35 +136,35 @@ def backgrounds_from_rows(
 
 
 def check_present(
-    manifest: Manifest, refs: Refs, by_modality: dict[str, Sequence[str]], numbers: Sequence[int], allow_missing: bool
+    selected: Selection, by_modality: dict[str, Sequence[str]], allow_missing: bool
 ) -> dict[str, list[bool]]:
     """Return, for each modality that some rows lack, which rows lack it; ValueError unless ``allow_missing``."""
     missing: dict[str, list[bool]] = {}
     for modality, columns in by_modality.items():
-        gaps = [[refs[c][i] is None for c in columns] for i in range(len(numbers))]
-        for number, gap in zip(numbers, gaps, strict=True):
+        gaps = [[selected.refs[c][i] is None for c in columns] for i in range(len(selected.rows))]
+        for number, gap in zip(selected.numbers, gaps, strict=True):
             if any(gap) and not (allow_missing and all(gap)):
                 accept = "--data.allow-missing accepts rows without a modality"
                 hint = accept if all(gap) else "stacked sensors need both images"
                 raise ValueError(
-                    f"{manifest.at(number)} has no {columns[gap.index(True)]} path: fill it, or leave the row out"
+                    f"{selected.manifest.at(number)} has no {columns[gap.index(True)]} path: fill it, or leave the row out"
                     f" (--data.only); {hint}"
                 )
         lacking = [bool(gap) and all(gap) for gap in gaps]
         if all(lacking) and columns:
-            raise ValueError(f"{manifest.file}: {modality} is empty in every row: leave it out by --data.{modality} ''")
+            raise ValueError(
+                f"{selected.where}: {modality} is empty in every row: leave it out by --data.{modality} ''"
+            )
         if any(lacking):
             missing[modality] = lacking
     present = [m for m, columns in by_modality.items() if columns]
-    for i, number in enumerate(numbers):
+    for i, number in enumerate(selected.numbers):
         if missing and all(m in missing and missing[m][i] for m in present):
-            raise ValueError(f"{manifest.at(number)} has neither image: leave it out (--data.only)")
+            raise ValueError(f"{selected.manifest.at(number)} has neither image: leave it out (--data.only)")
     return missing
 
 
-def check_files(
-    manifest: Manifest, refs: Refs, backgrounds: Sequence[Background], numbers: Sequence[int]
-) -> tuple[list[int], dict[str, Stamp]]:
+def check_files(selected: Selection) -> tuple[list[int], dict[str, Stamp]]:
     """Check that every image file exists and is not empty.
 
     Returns the file size of each image of each row (for the fingerprint), and the stamp of each file by its path.
@@ -133,9 +172,9 @@ def check_files(
     stamps: dict[str, Stamp] = {}
     missing: list[str] = []
     sizes: list[int] = []
-    for i, number in enumerate(numbers):
-        named = [(column, found[i]) for column, found in refs.items()]
-        named += [("background", ref) for b in backgrounds for ref in b.get(number, ())]
+    for i, number in enumerate(selected.numbers):
+        named = [(column, found[i]) for column, found in selected.refs.items()]
+        named += [("background", ref) for b in selected.backgrounds for ref in b.get(number, ())]
         for column, ref in named:
             if ref is None:
                 continue
@@ -144,13 +183,13 @@ def check_files(
             size = stamps[ref.path][0]
             sizes.append(size)
             if size <= 0:
-                name = manifest.rows[number - 1].get(column) or Path(ref.path).name
+                name = selected.rows[i].get(column) or Path(ref.path).name
                 missing.append(f"row {number} {column} {name}{' (0 bytes)' if size == 0 else ''}")
     if missing:
         tried = "; backslashes were also tried as slashes" if "\\" in missing[0] else ""
         tried = "; C:\\... is on another computer" if re.search(r" [A-Za-z]:\\", missing[0]) else tried
         raise ValueError(
-            f"{manifest.file}: {len(missing)} of {len(sizes)} image files are missing or empty, e.g."
-            f" {'; '.join(missing[:3])} (paths are relative to {manifest.root}{tried})"
+            f"{selected.where}: {len(missing)} of {len(sizes)} image files are missing or empty, e.g."
+            f" {'; '.join(missing[:3])} (paths are relative to {selected.manifest.root}{tried})"
         )
     return sizes, stamps

@@ -22,8 +22,6 @@ from mvitac.data.images import decode
 from mvitac.system.files import brief
 
 HDF5 = (".h5", ".hdf5")
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
-
 
 Damage = dict["ImageRef", str]  # reference of a damaged image -> what is wrong with it
 

@@ -21,7 +21,8 @@ import pyarrow.parquet as pq
 
 from mvitac.data.images import IMAGES
 from mvitac.data.pack_table import SPLITS
-from mvitac.datasets.table.image_refs import HDF5, VIDEOS, File, Frame, ImageRef
+from mvitac.data.video import VIDEOS
+from mvitac.datasets.table.image_refs import HDF5, File, Frame, ImageRef
 from mvitac.datasets.table.splits import likely_split
 from mvitac.registry import unknown
 from mvitac.system.files import brief, digest, digest_file, parse_json
@@ -52,12 +53,10 @@ class Manifest:
     """What the file has and is no column -> why."""
 
     @classmethod
-    def of(
-        cls, root: Path, rows: list[dict[str, str]], found: dict[str, list[ImageRef | None]] | None = None
-    ) -> "Manifest":
+    def of(cls, root: Path, rows: list[dict[str, str]]) -> "Manifest":
         """Return the table of ``rows`` that a reader made from the files below ``root``."""
         columns = tuple(dict.fromkeys(name for row in rows for name in row))
-        return cls(root, root, columns, rows, digest(rows), found or {})
+        return cls(root, root, columns, rows, digest(rows))
 
     def check(self, column: str) -> None:
         if column not in self.columns and column not in self.found:

@@ -3,6 +3,7 @@
 The table is checked completely before the first image is decoded.
 """
 
+import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
@@ -13,28 +14,11 @@ from typing import Annotated, Any
 import tyro
 
 from mvitac.data.source import Lost, Sample, Source, one_stamp
-from mvitac.data.spec import DataSpec
+from mvitac.data.spec import AnyTask, DataSpec
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.datasets.table.columns import (
-    Grouping,
-    Selection,
-    element_of,
-    read_controls,
-    read_task,
-    read_values,
-    split_rows,
-    value_task,
-    with_elements,
-)
-from mvitac.datasets.table.image_columns import (
-    Background,
-    Refs,
-    backgrounds_from_columns,
-    backgrounds_from_rows,
-    check_files,
-    check_present,
-    image_columns,
-)
+from mvitac.datasets.table import columns, image_columns, splits
+from mvitac.datasets.table.columns import Grouping, value_task
+from mvitac.datasets.table.image_columns import Background, Refs, Selection
 from mvitac.datasets.table.manifest import Condition, Manifest
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP, group_by_video
@@ -109,7 +93,6 @@ class RowsConfig(DatasetConfig, ABC):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_columns()
         for name, share in (("test_share", self.test_share), ("val_share", self.val_share)):
             if not 0 <= share < 1:
                 raise ValueError(f"{name} {share}: give a share of the groups in [0, 1)")
@@ -123,11 +106,6 @@ class RowsConfig(DatasetConfig, ABC):
             raise ValueError("a background is only used with subtract-background: add that option, or leave this out")
         for text in (*self.only, *self.label_only, *self.no_contact):
             Condition.parse(text)
-        names = Counter([*self.labels, *(value_task(text).name for text in self.values)])
-        if twice := [name for name, times in names.items() if times > 1]:
-            raise ValueError(f"task {twice[0]!r} occurs twice: give each task its own name, --values NAME=column:unit")
-
-    def _check_columns(self) -> None:
         if len(self.touch) > 2:
             raise ValueError(f"touch {' '.join(self.touch)}: give one column, or two to stack (left right)")
         named = Counter([*self.touch, *([self.vision] if self.vision else [])])
@@ -135,29 +113,32 @@ class RowsConfig(DatasetConfig, ABC):
             raise ValueError(f"column {named.most_common(1)[0][0]!r} is named twice: every image needs its own column")
         if len(set(self.labels)) < len(self.labels):
             raise ValueError(f"labels {' '.join(self.labels)}: name every column once")
-        for name, columns in self.control_columns().items():
-            if not name or not all(columns):
+        for name, used in self.control_columns().items():
+            if not name or not all(used):
                 raise ValueError(f"control {name!r}: write it as name=column or name=column,column")
             if name in CONTROL_NAMES:
                 raise ValueError(
                     f"control {name!r} is always computed: choose a name not among {', '.join(CONTROL_NAMES)}"
                 )
+        names = Counter([*self.labels, *(value_task(text).name for text in self.values)])
+        if twice := [name for name, times in names.items() if times > 1]:
+            raise ValueError(f"task {twice[0]!r} occurs twice: give each task its own name, --values NAME=column:unit")
 
     def control_columns(self) -> dict[str, tuple[str, ...]]:
         """Return control name -> manifest columns."""
         pairs = [text.partition("=") for text in self.controls]
         if len({name.strip() for name, _, _ in pairs}) < len(pairs):
             raise ValueError(f"controls {' '.join(self.controls)}: give every control a name of its own")
-        return {name.strip(): tuple(c.strip() for c in columns.split(",")) for name, _, columns in pairs}
+        return {name.strip(): tuple(c.strip() for c in listed.split(",")) for name, _, listed in pairs}
 
     def numbers(self) -> list[str]:
         """Return the manifest columns that hold numbers: those of values, and those of controls."""
         named = [target.name for text in self.values for target in value_task(text).targets]
-        return [*named, *(column for columns in self.control_columns().values() for column in columns)]
+        return [*named, *(column for used in self.control_columns().values() for column in used)]
 
     def vectors(self) -> set[str]:
         """Return the columns of lists of numbers of which an element is named, such as state of state[2]."""
-        return {element_of(name)[0] for name in self.numbers()} - {""}
+        return {columns.element_of(name)[0] for name in self.numbers()} - {""}
 
     @abstractmethod
     def manifest(self) -> Manifest:
@@ -173,11 +154,11 @@ class Rows(Source):
     sizes_at = "file_sizes"
 
     def __init__(self, config: RowsConfig) -> None:
-        manifest = with_elements(config.manifest(), config.numbers())
+        manifest = columns.with_elements(config.manifest(), config.numbers())
         self._config = config
         self._manifest_digest = manifest.digest
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
-        self._vision, self._touch = image_columns(manifest, config.vision, config.touch)
+        self._vision, self._touch = image_columns.find(manifest, config.vision, config.touch)
         given = manifest.rows
         manifest = manifest.normalised({self._vision, *self._touch, *(config.background or ("background",))})
         # Tables that were in this form keep their packs in the cache.
@@ -193,21 +174,19 @@ class Rows(Source):
 
         selected = self._select(manifest)
         asked = {"vision": [self._vision] if self._vision else [], "touch": self._touch}
-        missing = check_present(manifest, selected.refs, asked, selected.numbers, config.allow_missing)
-        self._sizes, stamps = check_files(manifest, selected.refs, selected.backgrounds, selected.numbers)
+        missing = image_columns.check_present(selected, asked, config.allow_missing)
+        self._sizes, stamps = image_columns.check_files(selected)
 
         grouping = self._grouping(selected)
         counts = [all(condition.holds(row) for condition in label_conditions) for row in selected.rows]
-        read = [read_task(selected, column, counts) for column in label_columns]
-        values, measured = read_values(selected, value_tasks, counts)
+        read = [columns.read_task(selected, column, counts) for column in label_columns]
+        values, measured = columns.read_values(selected, value_tasks, counts)
         tasks, labels = [*(task for task, _ in read), *value_tasks], [*(label for _, label in read), *measured]
-        shares, seed = (config.test_share, config.val_share), config.split_seed
-        how: Any = {"shares": shares, "seed": seed, "allow_leak": config.allow_leak}
-        splits = split_rows(selected, self._split, grouping, tasks, labels, **how)
-        extra, controls = read_controls(selected, config.control_columns(), labels)
+        assigned = self._assign(selected, grouping, tasks, labels)
+        extra, controls = columns.read_controls(selected, config.control_columns(), labels)
 
         own: dict[str, Sequence[Any]] = {"id": selected.ids(), "group": grouping.groups}
-        own |= {"touch_group": grouping.touch_groups, "split": splits}
+        own |= {"touch_group": grouping.touch_groups, "split": assigned}
         own |= {f"label_{task.name}": label for task, label in read} | values
         own |= {f"has_{modality}": [not lacks for lacks in lacking] for modality, lacking in missing.items()}
         self._rows = self._make_rows(selected, own, extra)
@@ -240,9 +219,11 @@ class Rows(Source):
         refs: Refs = {column: manifest.refs(column) for column in (self._vision, *self._touch) if column}
         backgrounds: list[Background] = []
         if config.difference and no_contact:
-            backgrounds = backgrounds_from_rows(manifest, refs, self._touch, kept, self._sensor, no_contact)
+            backgrounds = image_columns.backgrounds_from_rows(
+                manifest, refs, self._touch, kept, self._sensor, no_contact
+            )
         elif config.difference:
-            backgrounds = backgrounds_from_columns(manifest, refs, self._touch, kept, config.background)
+            backgrounds = image_columns.backgrounds_from_columns(manifest, refs, self._touch, kept, config.background)
         if no_contact:
             kept = [i for i in kept if not all(condition.holds(rows[i]) for condition in no_contact)]
             if not kept:
@@ -265,6 +246,28 @@ class Rows(Source):
         shared = touch_group or group_by
         return Grouping(groups=groups, group_by=group_by, touch_groups=touch_groups, touch_group_by=shared)
 
+    def _assign(
+        self, selected: Selection, grouping: Grouping, tasks: Sequence[AnyTask], labels: Sequence[Sequence[int]]
+    ) -> list[str]:
+        """Return the split of each row: read from its column, or assigned by group, and checked."""
+        config, column, where = self._config, self._split, selected.where
+        if column == BY_GROUP:
+            shares = config.test_share, config.val_share
+            found = splits.assign_splits(grouping.groups, labels, *shares, config.split_seed)
+        else:
+            found = selected.filled(column, "split")
+            splits.check_split_names(where, column, selected.numbers, found)
+        if not config.allow_leak:
+            splits.check_leak(where, column, f"groups ({grouping.group_by})", grouping.groups, found)
+            touches = f"touch groups ({grouping.touch_group_by})"
+            splits.check_leak(where, column, touches, grouping.touch_groups, found)
+            for name, refs in selected.refs.items():
+                there = [i for i, ref in enumerate(refs) if ref]
+                images = [os.path.normpath(str(refs[i])) for i in there]
+                splits.check_leak(where, column, f"{name} images", images, [found[i] for i in there])
+        splits.check_sides(where, column, found, tasks, labels, len(set(grouping.groups)))
+        return found
+
     def _make_rows(
         self, selected: Selection, own: dict[str, Sequence[Any]], extra: dict[str, list[float]]
     ) -> list[Row]:
@@ -280,13 +283,13 @@ class Rows(Source):
         known = {*own, *selected.refs, "has_vision", "has_touch"}
         rows = []
         for i, (number, cells) in enumerate(zip(selected.numbers, selected.rows, strict=True)):
-            columns = {name: values[i] for name, values in own.items()}
-            columns |= {name: cell for name, cell in cells.items() if name not in known}
-            columns |= {name: values[i] for name, values in extra.items()}
+            row = {name: values[i] for name, values in own.items()}
+            row |= {name: cell for name, cell in cells.items() if name not in known}
+            row |= {name: values[i] for name, values in extra.items()}
             touch = tuple(ref for c in self._touch if (ref := selected.refs[c][i]))
             background = tuple(b[number] for b in selected.backgrounds) if touch else ()
             vision = selected.refs[self._vision][i] if self._vision else None
-            rows.append(Row(number, vision, touch, background, columns))
+            rows.append(Row(number, vision, touch, background, row))
         return rows
 
     def spec(self) -> DataSpec:
@@ -325,6 +328,6 @@ def _check_columns(config: RowsConfig, manifest: Manifest, chosen: Sequence[str 
     """Raise ValueError unless every column that an option names exists."""
     texts = (*config.only, *config.label_only, *config.no_contact)
     asked = [*chosen, config.touch_group, *(Condition.parse(text).column for text in texts)]
-    for column in (*asked, *(c for columns in config.control_columns().values() for c in columns)):
+    for column in (*asked, *(c for used in config.control_columns().values() for c in used)):
         if column is not None and column != BY_GROUP:
             manifest.check(column)

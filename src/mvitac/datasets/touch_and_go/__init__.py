@@ -1,5 +1,3 @@
 """Touch and Go (Yang et al., 2022), read as published."""
 
-from mvitac.datasets.touch_and_go import reader
-
-__all__ = ["reader"]
+from mvitac.datasets.touch_and_go import reader as reader

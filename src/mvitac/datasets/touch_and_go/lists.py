@@ -20,7 +20,7 @@ CLASSES = (
     *("natural fabric", "rubber", "paper", "tree", "grass", "soil", "rock", "gravel", "sand", "plants", "others"),
 )
 SOFT = (7, 8, 9, 11, 13)  # categories that the owners call soft; the others are hard
-LISTS_AT = "https://github.com/fredfyyang/Touch-and-Go, folder 'Visuo-tactile contrastive learning/dataset'"
+AT = "https://github.com/fredfyyang/Touch-and-Go, folder 'Visuo-tactile contrastive learning/dataset'"
 LIST_FILES = ("train.txt", "test.txt", "train_rough.txt", "test_rough.txt", "label.txt")
 NUM_ROWS = {"train.txt": 91_982, "test.txt": 29_879, "train_rough.txt": 35_119, "test_rough.txt": 8_085}
 """Number of rows of the published lists."""
@@ -73,7 +73,7 @@ def read_lists(folder: Path) -> list[Frame]:
     elif not present and (folder / "label.txt").is_file():
         _add_list(known, folder / "label.txt", "label", False)
     else:
-        raise ValueError(f"{folder} has no train.txt and test.txt: they are in {LISTS_AT} (--data.lists)")
+        raise ValueError(f"{folder} has no train.txt and test.txt: they are in {AT} (--data.lists)")
     labelled = [frame for frame in known.values() if frame.category >= 0 or frame.rough >= 0]
     return sorted(labelled, key=lambda frame: (frame.recording, frame.number))
 

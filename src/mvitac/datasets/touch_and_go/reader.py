@@ -19,28 +19,9 @@ from typing import Any, ClassVar, Literal
 from mvitac.data.source import Count, Lost, Sample, Source, one_stamp
 from mvitac.data.spec import MODALITIES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.datasets.touch_and_go.lists import (
-    CLASSES,
-    LIST_FILES,
-    LISTS_AT,
-    NUM_ROWS,
-    SOFT,
-    Frame,
-    assign_by_recording,
-    assign_official,
-    find_touches,
-    leaks,
-    read_list,
-    read_lists,
-)
-from mvitac.datasets.touch_and_go.recordings import (
-    HOMEPAGE,
-    Recording,
-    find_recordings,
-    missing_report,
-    on_disk,
-    read_frames,
-)
+from mvitac.datasets.touch_and_go import lists, recordings
+from mvitac.datasets.touch_and_go.lists import Frame
+from mvitac.datasets.touch_and_go.recordings import HOMEPAGE, Recording, missing_report
 from mvitac.registry import to_json
 from mvitac.system.files import digest, digest_file
 
@@ -113,34 +94,36 @@ class TouchAndGo(Source):
     sizes_at = "recordings"
 
     def __init__(self, config: TouchAndGoConfig) -> None:
-        self._config, self._lists = config, _lists_folder(config)
-        listed = read_lists(self._lists)
+        self._config, self._lists = config, config.lists or config.root
+        if not self._lists.is_dir():
+            raise ValueError(f"{self._lists} is not a folder: give the one with the lists; get them from {lists.AT}")
+        listed = lists.read_lists(self._lists)
         if config.split == "official" and listed[0].listed == "label":
-            raise ValueError(f"{self._lists} has no train.txt and test.txt, which the official split needs: {LISTS_AT}")
+            raise ValueError(f"{self._lists} has no train.txt and test.txt, which the official split needs: {lists.AT}")
         self._num_listed = len(listed)
         self._num_names = len({frame.recording for frame in listed})
-        recordings, missing = _find_recordings(config, sorted({frame.recording for frame in listed}))
+        found, missing = _find_recordings(config, sorted({frame.recording for frame in listed}))
         self._missing = missing
         listed = [frame for frame in listed if frame.recording not in missing]
-        find_touches(listed)
+        lists.find_touches(listed)
         if config.split == "official":
-            assign_official(listed, config.val_part, config.split_seed)
+            lists.assign_official(listed, config.val_part, config.split_seed)
         else:
-            assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
-        self._recordings = {recording.name: recording for recording in recordings}
-        self._chunks = _chunks([*listed, *_unlabelled(listed, recordings, config)])
+            lists.assign_by_recording(listed, config.test_share, config.val_part, config.split_seed)
+        self._recordings = {recording.name: recording for recording in found}
+        self._chunks = _chunks([*listed, *_unlabelled(listed, found, config)])
         frames = [(chunk[0].recording, [frame.number for frame in chunk]) for chunk in self._chunks]
         self._stamps = [one_stamp(self._recordings[name].stamps(numbers)) for name, numbers in frames]
-        notes = leaks(listed) if config.split == "official" else []
+        notes = lists.leaks(listed) if config.split == "official" else []
         if missing:
             notes.append(missing_report(missing, self._num_names))
         self._spec = _spec(config, any(frame.rough >= 0 for frame in listed), tuple(notes), bool(missing))
-        lists = [file for file in sorted(self._lists.glob("*.txt")) if file.name in LIST_FILES]
+        files = [file for file in sorted(self._lists.glob("*.txt")) if file.name in lists.LIST_FILES]
         self._fingerprint = {
             "reader": f"touch-and-go {VERSION}",
-            "lists": {file.name: digest_file(file) for file in lists},
+            "lists": {file.name: digest_file(file) for file in files},
             "options": {k: v for k, v in to_json(config).items() if k not in ("root", "lists", *KEEPING)},
-            "recordings": digest([recording.state() for recording in recordings]),
+            "recordings": digest([recording.state() for recording in found]),
             "missing": dict(sorted(missing.items())),
         }
 
@@ -162,10 +145,10 @@ class TouchAndGo(Source):
     def expected(self) -> list[Count]:
         """Compare the lists with their published lengths, and with the recordings and frames on disk."""
         counts = []
-        for name in NUM_ROWS:
+        for name, published in lists.NUM_ROWS.items():
             if (self._lists / name).is_file():
-                rows = read_list(self._lists / name, len(CLASSES))
-                counts.append(Count(f"rows of {name}", NUM_ROWS[name], len(rows)))
+                rows = lists.read_list(self._lists / name, len(lists.CLASSES))
+                counts.append(Count(f"rows of {name}", published, len(rows)))
         absent = missing_report(self._missing, self._num_names) if self._missing else ""
         counts.append(Count("listed recordings", self._num_names, self._num_names - len(self._missing), absent))
         there, short = 0, []
@@ -188,7 +171,7 @@ class TouchAndGo(Source):
         chunk, lost = self._chunks[item], {}
         recording = self._recordings[chunk[0].recording]
         images = {
-            modality: read_frames(place, [frame.number for frame in chunk], self._config.size, lost)
+            modality: recordings.read_frames(place, [frame.number for frame in chunk], self._config.size, lost)
             for modality, place in recording.places.items()
         }
         samples: list[Sample | Lost] = []
@@ -203,25 +186,18 @@ class TouchAndGo(Source):
         return samples
 
 
-def _lists_folder(config: TouchAndGoConfig) -> Path:
-    folder = config.lists or config.root
-    if not folder.is_dir():
-        raise ValueError(f"{folder} is not a folder: give the one with the lists; get them from {LISTS_AT}")
-    return folder
-
-
 def _find_recordings(config: TouchAndGoConfig, names: list[str]) -> tuple[list[Recording], dict[str, str]]:
     """Return the recordings to pack, and why each other one of ``names`` cannot be used."""
     modalities = MODALITIES if config.modalities == "both" else (config.modalities,)
-    recordings, missing = find_recordings(config.root, names, modalities, config.frames)
+    found, missing = recordings.find_recordings(config.root, names, modalities, config.frames)
     if config.unlabelled:
-        others = sorted(on_disk(config.root).keys() - set(names))
-        recordings += find_recordings(config.root, others, modalities, config.frames)[0]
-    if not recordings or (missing and not config.partial):
+        others = sorted(recordings.on_disk(config.root).keys() - set(names))
+        found += recordings.find_recordings(config.root, others, modalities, config.frames)[0]
+    if not found or (missing and not config.partial):
         hint = "" if config.modalities != "both" else "; modalities=touch needs only gelsight"
         advice = f"fetch them from {HOMEPAGE}, or let partial pack what is there{hint}"
         raise ValueError(f"{config.root}: {missing_report(missing, len(names))}; {advice}")
-    return recordings, missing
+    return found, missing
 
 
 def _chunks(frames: Sequence[Frame]) -> list[list[Frame]]:
@@ -236,7 +212,7 @@ def _chunks(frames: Sequence[Frame]) -> list[list[Frame]]:
     return chunks
 
 
-def _unlabelled(listed: Sequence[Frame], recordings: Sequence[Recording], config: TouchAndGoConfig) -> list[Frame]:
+def _unlabelled(listed: Sequence[Frame], found: Sequence[Recording], config: TouchAndGoConfig) -> list[Frame]:
     """Return every n-th unlabelled frame of the recordings without val and test frames."""
     if not config.unlabelled:
         return []
@@ -245,7 +221,7 @@ def _unlabelled(listed: Sequence[Frame], recordings: Sequence[Recording], config
     for frame in listed:
         known[frame.recording][frame.number] = frame
     extra = []
-    for recording in recordings:
+    for recording in found:
         if recording.name in scored:
             continue
         own, start = known[recording.name], 0
@@ -270,7 +246,7 @@ def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
         "split": frame.split,
         "frame": frame.number,
         "label_category": frame.category,
-        "label_soft": -1 if frame.category < 0 else int(frame.category in SOFT),
+        "label_soft": -1 if frame.category < 0 else int(frame.category in lists.SOFT),
     }
     for task in spec.tasks[2:]:
         columns |= {"label_rough": frame.rough, **({task.split: frame.split_rough} if task.split != "split" else {})}
@@ -280,7 +256,7 @@ def _columns(frame: Frame, spec: DataSpec) -> dict[str, Any]:
 def _spec(config: TouchAndGoConfig, rough: bool, notes: tuple[str, ...], missing: bool) -> DataSpec:
     # The rough/smooth lists have another split than the category lists.
     own = "split_rough" if config.split == "official" else "split"
-    tasks = [Task(name="category", classes=CLASSES), Task(name="soft", classes=("hard", "soft"))]
+    tasks = [Task(name="category", classes=lists.CLASSES), Task(name="soft", classes=("hard", "soft"))]
     return DataSpec(
         name=f"touch-and-go ({config.split}{', partial' if missing else ''})",
         vision_channels=3 * (config.modalities != "touch"),
