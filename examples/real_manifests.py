@@ -127,13 +127,15 @@ def wedge_force(folder: Path, out: Path) -> None:
 
 
 def wedge_force_pairs(folder: Path, out: Path) -> None:
-    """Every third frame, four folds of two objects. Add the control ``moved``: mean absolute difference to the first frame."""
+    """Every third frame, four folds of two objects. Add control ``moved``: mean absolute difference to the first frame."""
     rows = [row for row in read(folder / "manifest.csv") if int(row["frame"]) % 3 == 0]
     videos: dict[str, dict[int, np.ndarray]] = {}
     for row in rows:
         if row["touch"] not in videos:
             wanted = [int(r["frame"]) for r in rows if r["touch"] == row["touch"]]
-            videos[row["touch"]] = {i: image.astype(np.float32) for i, image in frames(folder / row["touch"], wanted, 72)}
+            videos[row["touch"]] = {
+                i: image.astype(np.float32) for i, image in frames(folder / row["touch"], wanted, 72)
+            }
         seen = videos[row["touch"]]
         row["moved"] = f"{np.abs(seen[int(row['frame'])] - seen[0]).mean():.3f}"
     add_folds(rows, 4, by="object", stratum="object")

@@ -64,7 +64,7 @@ SETS: dict[str, dict[str, Any]] = {
 }
 WINDOWS, SEEDS = (1, 2, 4, 8), (0, 1, 2)
 FIXED = {"slip_gsmini": 41}
-"""Set -> the longest distance of two stored frames, in frames of the video: the shortest stride that all recordings allow."""
+"""Set -> the longest distance of two stored frames, in frames of the video, and so the shortest stride."""
 
 
 def folds_of(pack: Pack, num: int) -> Iterator[Pack]:
