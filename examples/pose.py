@@ -4,7 +4,8 @@
 
 The data is that of github.com/dexterousrobot/tactile_data_shear as a manifest: one row per tap with columns touch, sensor
 (franka or cr), split and the six targets. Ridge regression on blurred pictures is fitted on franka's training taps. It is
-scored on franka's test taps, and on cr's taps in all eight orientations of their pictures.
+scored on franka's test taps, and on cr's taps in all eight orientations of their pictures. In brackets: how alike the mean
+pictures of both rigs are.
 """
 
 from __future__ import annotations
@@ -32,6 +33,19 @@ def picture(file: Path) -> np.ndarray:
     return gaussian_filter(small, 1.0)[::2, ::2]
 
 
+def layout(files: list[Path]) -> np.ndarray:
+    """The mean of 300 whole pictures [128, 128]: where the pins are. It needs no label."""
+    images = [np.asarray(Image.open(file).convert("L").resize((128, 128)), np.float32) for file in files[:300]]
+    return np.mean(images, axis=0)
+
+
+def likeness(a: np.ndarray, b: np.ndarray) -> float:
+    """The highest correlation of two blurred pictures over shifts of up to 6 pixels."""
+    a, b = gaussian_filter(a, 1.0), gaussian_filter(b, 1.0)
+    shifts = [np.roll(b, (x, y), axis=(0, 1)) for x in range(-6, 7, 2) for y in range(-6, 7, 2)]
+    return max(np.corrcoef(a.ravel(), shifted.ravel())[0, 1] for shifted in shifts)
+
+
 def shown(values: np.ndarray) -> str:
     return " ".join(f"{value:6.2f}" for value in values)
 
@@ -50,12 +64,15 @@ def main(manifest: Path) -> None:
     squares = make_pipeline(PCA(40, random_state=0), PolynomialFeatures(2), StandardScaler(), RidgeCV(strengths))
     for name, model in (("linear", linear), ("with products", squares.fit(flat[learn], y[learn]))):
         print(f"same rig, {name:21}", shown(r2_score(y[same], model.predict(flat[same]), multioutput="raw_values")))
+    files = {name: [manifest.parent / row["touch"] for row in rows if row["sensor"] == name] for name in here}
+    pins = {name: layout(files[name]) for name in files}
     truth = y[here["cr"]]
     for mirrored in (False, True):
         for turns in range(4):
             seen = np.rot90(cr[:, :, ::-1] if mirrored else cr, turns, axes=(1, 2))
             guess = linear.predict((seen - seen.mean(0)).reshape(len(seen), -1))  # its own mean: unlabelled pictures
-            name = f"{'mirrored, ' if mirrored else ''}turned by {90 * turns}"
+            alike = likeness(pins["franka"], np.rot90(pins["cr"][:, ::-1] if mirrored else pins["cr"], turns))
+            name = f"{'mirrored, ' if mirrored else ''}turned by {90 * turns} ({alike:.2f})"
             print(f"cr {name:27}", shown(r2_score(truth, guess, multioutput="raw_values")))
             agree = [np.corrcoef(truth[:, t], guess[:, t])[0, 1] for t in range(len(TARGETS))]
             print(f"{'':30}", shown(np.array(agree)), "(correlation)")

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from mvitac.data.video import frames
+
 Rows = list[dict[str, str]]
 
 
@@ -124,6 +126,22 @@ def wedge_force(folder: Path, out: Path) -> None:
     write(rows, out / "wedge_force.csv", folder, ("touch",))
 
 
+def wedge_force_pairs(folder: Path, out: Path) -> None:
+    """Every third frame, four folds of two objects. Add control ``moved``: mean absolute difference to the first frame."""
+    rows = [row for row in read(folder / "manifest.csv") if int(row["frame"]) % 3 == 0]
+    videos: dict[str, dict[int, np.ndarray]] = {}
+    for row in rows:
+        if row["touch"] not in videos:
+            wanted = [int(r["frame"]) for r in rows if r["touch"] == row["touch"]]
+            videos[row["touch"]] = {
+                i: image.astype(np.float32) for i, image in frames(folder / row["touch"], wanted, 72)
+            }
+        seen = videos[row["touch"]]
+        row["moved"] = f"{np.abs(seen[int(row['frame'])] - seen[0]).mean():.3f}"
+    add_folds(rows, 4, by="object", stratum="object")
+    write(rows, out / "wedge_force_pairs.csv", folder, ("touch",))
+
+
 def tactip_shear(folder: Path, out: Path) -> None:
     """Every tap is independent. Blocks of ten keep records of scores per group small."""
     rows = read(folder / "manifest.csv")
@@ -132,11 +150,31 @@ def tactip_shear(folder: Path, out: Path) -> None:
     write(rows, out / "tactip_shear.csv", folder, ("touch",))
 
 
+def tactip_rigs(folder: Path, out: Path) -> None:
+    """One set for both questions: columns ``same_`` and ``other_`` hold the values of the taps that each of them uses.
+
+    A fifth of franka's training taps is val. franka's test taps have values of the same rig only, cr's of the other only.
+    """
+    rows = read(folder / "manifest.csv")
+    for i, row in enumerate(rows):
+        row["block"] = f"{row['sensor']}-{row['split']}-{i // 10:04d}"
+        row["split"] = "val" if row["split"] == "train" and i // 10 % 5 == 4 else row["split"]
+        for target in [name for name in row if name.startswith(("pose_", "shear_"))]:
+            value = row.pop(target)
+            row[f"same_{target}"] = value if row["sensor"] == "franka" else ""
+            row[f"other_{target}"] = value if row["sensor"] == "cr" or row["split"] != "test" else ""
+    write(rows, out / "tactip_rigs.csv", folder, ("touch",))
+
+
+MANIFESTS = {make: make.__name__ for make in (slip_grasp, slip_gsmini, physiclear, vt60, wedge_force, tactip_shear)}
+MANIFESTS |= {wedge_force_pairs: "wedge_force", tactip_rigs: "tactip_shear"}
+"""What makes a manifest -> the dataset's folder."""
+
 if __name__ == "__main__":
     if len(sys.argv) != 3 or not Path(sys.argv[1]).is_dir():
         sys.exit(f"usage: python {sys.argv[0]} DATA_FOLDER OUT_FOLDER")
-    for make in (slip_grasp, slip_gsmini, physiclear, vt60, wedge_force, tactip_shear):
-        source = Path(sys.argv[1]) / make.__name__
+    for make, name in MANIFESTS.items():
+        source = Path(sys.argv[1]) / name
         if (source / "manifest.csv").is_file():
             make(source, Path(sys.argv[2]))
         else:

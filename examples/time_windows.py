@@ -55,14 +55,16 @@ SETS: dict[str, dict[str, Any]] = {
         "folds": 6,
         "event": Event(happens="0"),
     },
-    "physiclear": {
-        "options": {"touch": ("touch",), "labels": ("material",), "touch_group": "video"},
+    "physiclear": {  # the split of docs/results/real.md, by group
+        "options": {"touch": ("touch",), "labels": ("material", "hardness", "roughness"), "touch_group": "video"},
         "columns": {"contact energy": ("contact_energy",)},
         "folds": 0,
         "event": None,
     },
 }
 WINDOWS, SEEDS = (1, 2, 4, 8), (0, 1, 2)
+FIXED = {"slip_gsmini": 41}
+"""Set -> the longest distance of two stored frames, in frames of the video, and so the shortest stride."""
 
 
 def folds_of(pack: Pack, num: int) -> Iterator[Pack]:
@@ -112,15 +114,23 @@ def untrained(config: FolderConfig, pack: Pack, temporal: str, seed: int) -> np.
     return pack_features(fresh(run, pack.spec, pack.size), pack, "touch", np.arange(pack.num)).numpy()
 
 
-def cases(config: FolderConfig, columns: dict[str, tuple[str, ...]]) -> Iterator[tuple[str, int | None, Any]]:
-    """Name, seed and features of everything that is scored; features are computed when called."""
+def cases(
+    config: FolderConfig, columns: dict[str, tuple[str, ...]], fixed: int
+) -> Iterator[tuple[str, int | None, Any]]:
+    """Name, seed and features of everything that is scored; features are computed when called.
+
+    ``fixed``: also score windows whose frames are so many frames of the video apart; 0: do not.
+    """
     plain = config.open(quiet=True)
     for name, of in columns.items():
         yield name, None, lambda of=of: (plain, np.stack([plain.column(c).astype(float) for c in of], axis=1))
-    shown = [(minus_first, frames) for minus_first in (True, False) for frames in WINDOWS]
-    for minus_first, frames in shown:
-        options = replace(config, num_frames=frames, minus_first=minus_first, order="seq")
-        name, pack = f"{frames}{', minus first' * minus_first}", options.open(quiet=True)
+    shown = [(minus_first, frames, 0) for minus_first in (True, False) for frames in WINDOWS]
+    shown += [(minus_first, frames, fixed) for minus_first in (True, False) for frames in (2, 4) if fixed]
+    for minus_first, frames, apart in shown:
+        order: dict[str, Any] = {"order": "frame", "stride": float(apart)} if apart else {"order": "seq"}
+        options = replace(config, num_frames=frames, minus_first=minus_first, **order)
+        pack = options.open(quiet=True)
+        name = f"{frames}{f', {apart} frames apart' if apart else ''}{', minus first' * minus_first}"
         yield f"pixels {name}", None, lambda p=pack: (p, thumbnails(p, "touch", np.arange(p.num)))
         for seed in SEEDS:
             yield f"untrained {name}", seed, lambda o=options, p=pack, s=seed: (p, untrained(o, p, "stack", s))
@@ -132,11 +142,12 @@ def cases(config: FolderConfig, columns: dict[str, tuple[str, ...]]) -> Iterator
             yield f"untrained, mean {frames}", seed, lambda o=options, p=pack, s=seed: (p, untrained(o, p, "mean", s))
 
 
-def show(kept: dict[str, list[dict[str, Any]]], event: bool) -> None:
+def show(kept: dict[str, list[dict[str, Any]]], task: str, event: bool) -> None:
     """Print every source with its interval, and its difference to the untrained trunk on single frames."""
     by_source: dict[str, list[dict[str, Any]]] = {}
     for record in (record for records in kept.values() for record in records if ("event" in record) == event):
-        by_source.setdefault(record["source"], []).append(record)
+        if record["task"] == task:
+            by_source.setdefault(record["source"], []).append(record)
     if not (base := by_source.get("untrained 1")):
         return
     for source, records in by_source.items():
@@ -170,20 +181,21 @@ def main(manifests: Path, name: str, out: Path) -> None:
         print(key, *(percent(r["accuracy"]) for r in kept[key]), flush=True)
 
     def print_all() -> None:
-        print("\naccuracy %, AUROC, difference to the untrained trunk on single frames and its p")
-        show(kept, event=False)
+        for task in config.labels:
+            print(f"\n{task}: accuracy %, AUROC, difference to the untrained trunk on single frames and its p")
+            show(kept, task, event=False)
         print("\nevent: detected %, false alarms %, first alarm before the end, AUROC of recordings", flush=True)
-        show(kept, event=True)
+        show(kept, config.labels[0], event=True)
 
     if about["event"]:  # of all frames, also those after the ones to predict from
         asked = [
             *about["columns"],
             *(f"{kind} {n}" for kind in ("pixels", "untrained") for n in ("1", "4, minus first")),
         ]
-        for case in cases(replace(config, label_only=()), about["columns"]):
+        for case in cases(replace(config, label_only=()), about["columns"], 0):
             if case[0] in asked and not case[1]:  # one seed
                 score(*case, event=about["event"])
-    for case in cases(config, about["columns"]):
+    for case in cases(config, about["columns"], FIXED.get(name, 0)):
         score(*case)
     print_all()
 

@@ -213,3 +213,8 @@ def test_export_and_live_of_windows(
     command = ["live", str(out), "--vision", f"{tmp_path / 'vision'}@30", "--touch", f"{tmp_path / 'touch'}@30"]
     assert main([*command, "--calibration", "2", "--stale", "60"]) == 0
     assert "level: " in capsys.readouterr().out
+    (tmp_path / "one").mkdir()
+    Image.new("RGB", (32, 32)).save(tmp_path / "one" / "0.png")
+    command[5:] = [str(tmp_path / "one"), "--json", str(tmp_path / "summary.json")]
+    assert main(command) == 2 and not (tmp_path / "summary.json").exists()
+    assert "the model looks at 2 frames at once, " in (error := capsys.readouterr().err) and error.count("\n") == 1

@@ -182,6 +182,28 @@ def test_a_plan_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "file", sorted((Path(__file__).parents[2] / "examples").glob("*.toml")), ids=lambda file: file.stem
+)
+def test_plans_of_the_examples_name_settings_that_exist(file: Path) -> None:
+    plan = find_plan(str(file))
+    for row in plan.rows:
+        if not any(name.startswith("data.") for name in row.set):
+            plan.run(row, PackConfig(), 0, phased=False)
+
+
+@pytest.mark.parametrize("name", ["force", "pose"])
+def test_methods_of_these_plans_see_equally_many_images(pack: Pack, name: str) -> None:
+    plan = find_plan(str(Path(__file__).parents[2] / "examples" / f"{name}.toml"))
+    spec, seen = replace(pack.spec, vision_channels=0), {}
+    for row in plan.rows:
+        run = plan.run(row, PackConfig(), 0, phased=False)
+        if not run.method.needs_pairs and row.label not in ("ViT, not trained", "supervised, 96 px"):
+            method = run.method.on_tiny_trunk(spec, run.encoder)
+            seen[row.label] = (run.steps or 0) * run.batch_size * method.views
+    assert len(seen) > 8 and len(set(seen.values())) == 1, seen
+
+
+@pytest.mark.parametrize(
     ("text", "says"),
     [
         ("rows = []", "has no rows"),

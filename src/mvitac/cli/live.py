@@ -18,7 +18,7 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse
 from mvitac.data.spec import task_title
-from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, about_sensor, frame_shapes
+from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, about_sensor, frame_shapes, frames_of
 from mvitac.live.cameras import source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.display import Window, draw
@@ -159,8 +159,9 @@ def _streams(options: _Options, engine: Engine) -> dict[str, list[Any]]:
     streams = {}
     for modality, texts in sources(frame_shapes(engine), options.vision, options.touch).items():
         names = [modality] if len(texts) == 1 else [f"{modality} {i + 1}" for i in range(len(texts))]
-        pairs = zip(names, texts, strict=True)
-        streams[modality] = [Stream(name, source(text, modality), stale_after=options.stale) for name, text in pairs]
+        found = [source(text, modality, frames_of(engine.window, modality)) for text in texts]
+        pairs = zip(names, found, strict=True)
+        streams[modality] = [Stream(name, origin, stale_after=options.stale) for name, origin in pairs]
     return streams
 
 

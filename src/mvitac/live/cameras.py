@@ -180,11 +180,11 @@ class Simulated(Source):
 MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d+(\.\d+)?))?")
 
 
-def source(text: str, modality: str) -> Source:
-    """The source that ``text`` names; ValueError if there is none, or its file cannot be read.
+def source(text: str, modality: str, frames: int = 1) -> Source:
+    """The source that ``text`` names; ValueError if there is none, its file cannot be read, or it has too few pictures.
 
     A camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` after it requests that mode), a video file, a
-    folder[@fps], or ``sim``[:seed] of this modality.
+    folder[@fps], or ``sim``[:seed] of this modality. ``frames``: how many the model looks at at once.
     """
     if text == "sim" or text.startswith("sim:"):
         seed = text.partition(":")[2] or "0"
@@ -205,7 +205,14 @@ def source(text: str, modality: str) -> Source:
                 raise ValueError
         except ValueError:
             raise ValueError(f"source {text!r}: {fps!r} is no frame rate, give e.g. {path}@30") from None
-        return _readable(Folder(path, float(fps)), text)
+        pictures = Folder(path, float(fps))
+        _readable(pictures, text)
+        if (num := len(pictures.left)) < frames:
+            raise ValueError(
+                f"source {text!r}: the model looks at {frames} frames at once, {path} holds {num} picture{'s' * (num > 1)}:"
+                f" give {frames} or more, a video or a camera"
+            )
+        return pictures
     if path.is_file() and path.suffix.lower() in VIDEOS:
         return _readable(Video(path), text)
     what = "" if path.exists() else f"there is no {path} here; "
