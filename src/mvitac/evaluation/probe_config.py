@@ -22,7 +22,8 @@ class ProbeConfig:
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
     """Modalities to probe. Default: all of the data."""
     controls: bool = True
-    """Also score the controls: majority class, untrained trunk, pixels, border, and the dataset's own."""
+    """Score the controls, too: majority class, untrained trunk, pixels, border, and the dataset's own. --no-controls leaves
+    them out."""
     imagenet: Path | None = None
     """File with ImageNet weights of the trunk, for the frozen-ImageNet control."""
     event: tuple[str, ...] = field(default=(), metadata=LATER)

@@ -69,7 +69,8 @@ class Finetuning:
     seeds: int = 1
     """Number of seeds. Each draws its own groups, batches and views."""
     from_scratch: bool = True
-    """Also train all of the same network from random weights with the same labels. Its settings are chosen alike."""
+    """Also train all of the same network from random weights with the same labels, its settings chosen alike.
+    --no-from-scratch leaves it out."""
     allow_leak: bool = False
     """Go on if the model, or one it started from, was trained on test rows or groups. LEAK stands beside every score."""
 

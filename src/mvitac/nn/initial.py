@@ -30,7 +30,7 @@ class Init:
     modalities: tuple[Literal["vision", "touch"], ...] = ()
     """Encoders to take. Default: all that fit, and at least one."""
     heads: bool = True
-    """Also take the heads into the space shared by both modalities, where they fit."""
+    """Also take the heads into the space shared by both modalities, where they fit. --init.no-heads leaves them."""
     digest: tyro.conf.Suppress[str] = ""
     """sha256 of the weights. Training records it."""
 
