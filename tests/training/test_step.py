@@ -20,7 +20,7 @@ from mvitac.nn.encoders import draws_random_numbers
 from mvitac.recipes import recipe
 from mvitac.registry import default, to_json
 from mvitac.run import Optim, Run
-from mvitac.system import processes
+from mvitac.system import threads as system_threads
 from mvitac.training.loop import train
 from mvitac.training.step import Step, build_optimiser
 from support.small_methods import TINY_VIT, small
@@ -167,8 +167,8 @@ def test_copies_do_not_share_weights() -> None:
 def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """MViTac's two towers train in two threads where there are two: the same weights, bit for bit."""
     run = replace(RUN, method=MViTacConfig(keys="end-to-end", losses=("vt", "tv")))
-    at_once, calls = processes._at_once, []
-    monkeypatch.setattr(processes, "_at_once", lambda towers: calls.append(len(towers)) or at_once(towers))
+    at_once, calls = system_threads._at_once, []
+    monkeypatch.setattr(system_threads, "_at_once", lambda towers: calls.append(len(towers)) or at_once(towers))
 
     def trained(threads: int) -> dict[str, Tensor]:
         torch.set_num_threads(threads)
