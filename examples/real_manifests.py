@@ -127,7 +127,8 @@ def wedge_force(folder: Path, out: Path) -> None:
 
 
 def wedge_force_pairs(folder: Path, out: Path) -> None:
-    """Every third frame, four folds of two objects. Add control ``moved``: mean absolute difference to the first frame."""
+    """Every third frame, four folds of two objects. Add control ``moved`` (mean absolute difference to the first frame) and
+    label ``contact`` (.5 N or more)."""
     rows = [row for row in read(folder / "manifest.csv") if int(row["frame"]) % 3 == 0]
     videos: dict[str, dict[int, np.ndarray]] = {}
     for row in rows:
@@ -138,6 +139,7 @@ def wedge_force_pairs(folder: Path, out: Path) -> None:
             }
         seen = videos[row["touch"]]
         row["moved"] = f"{np.abs(seen[int(row['frame'])] - seen[0]).mean():.3f}"
+        row["contact"] = "yes" if float(row["force_n"]) >= 0.5 else "no"
     add_folds(rows, 4, by="object", stratum="object")
     write(rows, out / "wedge_force_pairs.csv", folder, ("touch",))
 
