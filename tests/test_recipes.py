@@ -200,20 +200,16 @@ def test_rows_with_other_phases_are_no_grasps(pack: Pack) -> None:
 
 
 def test_records_without_later_fields_mean_what_they_meant() -> None:
-    """Runs before these fields: nearly frozen prototypes, all of CMC's negatives, decayed norms. Digests are unchanged."""
-    for name in ("dino", "cmc"):
+    """Runs before these fields: nearly frozen prototypes, all of CMC's negatives, long queues, decayed norms. Digests are
+    unchanged."""
+    then = {"dino": {"prototype_norm": 16.0}, "cmc": {"negatives_per_row": 0.0}, "moco": {"queue_per_row": 0.5}}
+    for name, fields in then.items():
         run = with_method(recipe("modern"), name)
         old = to_json(run)
-        for inner, key in (("method", "prototype_norm"), ("method", "negatives_per_row"), ("optim", "decay_norms")):
-            old[inner].pop(key, None)
+        for inner, key in (*(("method", key) for key in fields), ("optim", "decay_norms")):
+            old[inner].pop(key)
         loaded = Run.load(old)
         assert loaded.optim.decay_norms and loaded.digest() != run.digest()
-        method = loaded.method
-        assert method == (
-            replace(run.method, prototype_norm=16.0) if name == "dino" else replace(run.method, negatives_per_row=0.0)
-        )
+        assert loaded.method == replace(run.method, **fields)
         written = to_json(loaded, for_digest=True)
-        assert (
-            not {"prototype_norm", "negatives_per_row"} & set(written["method"])
-            and "decay_norms" not in written["optim"]
-        )
+        assert not set(fields) & set(written["method"]) and "decay_norms" not in written["optim"]

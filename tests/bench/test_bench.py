@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -215,6 +216,11 @@ def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(
     page = write_board(results, tmp_path / "board.html").read_text()
     monkeypatch.setattr("mvitac.bench.board._by_labels", lambda board: iter(()))
     assert "Score against labels" in page and "Score against labels" not in _page(board)  # no empty section
+    drawn = page[page.index("<svg") : page.index("</svg>")]
+    (row,) = (row for row in board.rows if row.task == "folded: pattern (copy)")
+    marked = re.findall(r">(-?\d+ L)<", drawn)
+    assert f"{round(100 * row.cells[leaked]['mean'])} L" in marked
+    assert len(marked) == sum(bool(cell.get("leak")) for row in board.rows for cell in row.cells.values())
     assert "LEAK: 72 of 120 test rows" in page and " LEAK</td>" in page.replace("&nbsp;", " ")
     assert "none found" in page and clean in page
 
@@ -231,10 +237,15 @@ def test_the_board(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFi
     page = (tmp_path / "board.html").read_text()
     board = gather({r["encoder"]["name"]: r for r in map(read_result, results)})
     assert board.controls == ["majority or mean", "noise only", "border", "pixels", "untrained"]
-    assert page.index(">majority or mean<") < page.index(">untrained<") < page.index(f">{board.encoders[0]}<")
+    table = page[page.index("<table") :]
+    assert table.index(">majority or mean<") < table.index(">untrained<") < table.index(f">{board.encoders[0]}<")
     for text in ("stripes: pattern", "12 test instances", "touch, R2", "2 tasks that were not run", "levels", "30"):
         assert text in page, text
-    assert page.count("<svg") == 3 + 2  # touch of three tasks against parameters, two modalities against labels
+    assert (
+        page.count("<svg") == 1 + 3 + 2
+    )  # at a glance; touch of three tasks against parameters; two modalities by labels
+    drawn = page[page.index("<svg") : page.index("</svg>")]
+    assert f">{board.encoders[0]}<" in drawn and ">noise only<" in drawn and ">light, touch, R2<" in drawn
     assert (
         "≈" in page
         and "<script" not in page

@@ -17,7 +17,7 @@ from mvitac.evaluation import robustness as module
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
 from mvitac.evaluation.probe import ProbeSplit, probe_features, split_rows
-from mvitac.evaluation.robustness import CLEANED, DROPOUT, LEAK, MISSING, NOISE, PREPARED, STRESSES, stress
+from mvitac.evaluation.robustness import CLEANED, DROPOUT, LEAK, MISSING, NOISE, NOISED, PREPARED, STRESSES, stress
 from mvitac.experiments.collect import gather, lay_out
 from mvitac.experiments.jobs import do_all
 from mvitac.experiments.table_formats import write_tables
@@ -47,7 +47,7 @@ def records(trained: Path, pack: Pack) -> dict[tuple[str, str, str], dict]:
 
 def test_every_stress_of_every_modality(records: dict) -> None:
     tasks = ("pattern", "bright")
-    anywhere = {(t, m, k) for t in tasks for m in ("touch", "vision", "both") for k in (*STRESSES[:4], *LEAK)}
+    anywhere = {(t, m, k) for t in tasks for m in ("touch", "vision", "both") for k in (*STRESSES[:6], *LEAK)}
     lost = (*MISSING.values(), DROPOUT, *PREPARED.values())
     assert set(records) == anywhere | {(t, "both", k) for t in tasks for k in lost}
     sizes = {
@@ -81,7 +81,10 @@ def test_modality_dropout_learns_from_each_row_three_times(
     )
     task = pack.spec.tasks[0]
     found = {r["probe"]: r for r in stress(load(trained), pack, [task], ["both"])}
-    (x, rows), (prepared, thrice) = learned
+    (x, rows), (noised, twice), (prepared, thrice) = learned
+    assert np.array_equal(twice.train, np.tile(rows.train, 2)) and np.array_equal(
+        noised[: len(rows.train)], x[: len(rows.train)]
+    )
     assert np.array_equal(thrice.train, np.tile(rows.train, 3)) and np.array_equal(thrice.val, np.tile(rows.val, 3))
     assert np.array_equal(thrice.test, rows.test)
     num, width = len(rows.train), x.shape[1] // 2
@@ -140,8 +143,8 @@ def test_noise_is_that_strong_and_the_same_for_all(trained: Path, pack: Pack, mo
     monkeypatch.setattr(module, "_noisy", lambda image, seed, row: rows.append(row) or real(image, seed, row))
     stress(load(trained), pack, pack.spec.tasks, ["touch"])
     assert (
-        set(pack.rows("test")) <= set(rows) <= set(pack.rows("test", "train"))
-    )  # train: to know the noise, unlabelled
+        set(pack.rows("test")) <= set(rows) <= set(pack.rows("test", "train", "val"))
+    )  # train and val: to know the noise, and for a probe that learns from noisy images, too
 
 
 def test_cleaned_features_have_the_statistics_of_clean_ones(
@@ -164,6 +167,7 @@ def test_cleaned_features_have_the_statistics_of_clean_ones(
         if r["probe"] == "linear"
     )
     assert abs(found[CLEANED] - plain) <= 0.05 and found[NOISE] < plain - 0.1
+    assert min(found[kind] for kind in NOISED) > found[NOISE] + 0.1  # a probe that knows both does for both
     assert levels[0] == 0 and min(levels[1:]) == pytest.approx(20, rel=0.25)  # the noise of the images was measured
 
 
@@ -191,7 +195,7 @@ def test_touch_only_models_miss_nothing(pack: Pack) -> None:
     model = Model(run.method.build(pack.spec, run.encoder), run, pack.spec, pack.size)
     found = stress(model, pack, pack.spec.tasks[:1], ["touch", "vision", "both"])
     assert {r["modality"] for r in found} == {"touch"}
-    assert {r["probe"] for r in found} == {*STRESSES[:4], *LEAK}
+    assert {r["probe"] for r in found} == {*STRESSES[:6], *LEAK}
 
 
 def test_in_a_comparison_and_on_the_command_line(

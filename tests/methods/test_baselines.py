@@ -240,10 +240,12 @@ def test_moco_contrasts_with_the_queue_then_fills_it() -> None:
         torch.testing.assert_close(value, expected, msg=name)
 
 
-def test_a_queue_is_at_most_half_the_data() -> None:
+def test_a_queue_is_at_most_an_eighth_of_the_data() -> None:
     method = MoCoConfig(hidden=8, out=4).build(Toy().spec(), TINY)
     method.prepare(ROWS)
-    assert all(len(queue.keys) == 40 for queue in method.queues.values())
+    assert all(len(queue.keys) == 10 for queue in method.queues.values())
+    assert MoCoConfig().queue_size(1_281_167) == 4_096
+    assert MoCoConfig(queue_per_row=0.5).queue_size(3_900) == 1_950  # as in runs before this field
 
 
 def test_hinge_written_out() -> None:
@@ -495,6 +497,7 @@ def test_momentum_zero_copies_the_queries() -> None:
         (CMCConfig, {"bank_momentum": 1.5}),
         (SimCLRConfig, {"temperature": 0.0}),
         (MoCoConfig, {"queue": 0}),
+        (MoCoConfig, {"queue_per_row": 0.0}),
         (BYOLConfig, {"momentum": -0.1}),
         (DINOConfig, {"teacher_temperature": 0.0}),
         (VICRegConfig, {"variance": -1.0}),

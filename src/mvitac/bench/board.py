@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from mvitac.bench.charts import against_labels, against_parameters
+from mvitac.bench.charts import against_labels, against_parameters, at_a_glance
 from mvitac.bench.result import problems, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
 from mvitac.evaluation.intervals import paired_difference
@@ -144,6 +144,9 @@ def order_of(row: Row, names: Sequence[str]) -> str:
     return text + (f"; not ordered because of LEAK: {', '.join(left_out)}" if left_out else "")
 
 
+GLANCE = """Accuracy %, or R2 % of values. The shade of a cell rises from the untrained trunk to the best of its column; one
+without a shade is no better than an untrained trunk, or has an L: LEAK or LEAK?, see below. Encoders stand by their mean
+rank, controls below them."""
 SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder has several), in percent: accuracy, or R2
 of values. Controls come first. Encoders follow by their mean rank, which is for reading only: the order of each task is
 below. An empty cell was not run."""
@@ -171,6 +174,7 @@ def _page(board: Board) -> str:
         ("labels", "Score against labels", [*_by_labels(board)]),
     )
     sections = [
+        ("glance", "At a glance", _glance(board)),
         ("scores", "Scores", _scores(board)),
         ("order", "Order", _text_table(ORDER, ["", "from best to worst"], orders)),
         ("encoders", "Encoders and leaks", _encoders(board)),
@@ -182,6 +186,17 @@ def _page(board: Board) -> str:
 
 def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return page.paragraph(" ".join(intro.split())) + page.table(columns, rows, words=True, label=columns[1])
+
+
+def _glance(board: Board) -> str:
+    columns = []
+    for row in board.rows:
+        one, task = row.task.split(": ", 1)
+        what = f"{task}, {row.modality}" + (", R2" if row.score == "R2" else "")
+        columns.append((one, what, row.cells))
+    drawn = at_a_glance([*board.encoders, *board.controls[::-1]], columns)
+    svg = to_svg(drawn, "glance", "All scores at a glance; the numbers are in the table below")
+    return page.paragraph(" ".join(GLANCE.split())) + page.grid([page.figure(svg)], "wide")
 
 
 def _scores(board: Board) -> str:

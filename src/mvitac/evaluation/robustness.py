@@ -35,6 +35,9 @@ NOISE_LEVELS = 20.0  # standard deviation of the noise added to each 8-bit chann
 CLEANED = "noisy images, cleaned"
 """The same images, denoised (``transforms.denoise``), and their features given the mean and standard deviation of clean
 ones. Level of noise and statistics come from noisy images of training rows, without labels."""
+NOISED = ("noise in the probe", f"noise in the probe, {NOISE}")
+"""A probe fitted on every row twice: as it is, and with noise that is then taken off. It is scored on clean and on noisy,
+denoised test images."""
 MISSING = {"vision": "vision missing", "touch": "touch missing"}
 """modality -> name. The probe uses both modalities; in test rows, features of this one are replaced by their mean."""
 DROPOUT = "modality dropout"
@@ -43,7 +46,7 @@ both present and, under names such as "modality dropout, vision missing", with o
 LEAK = {"unseen groups": False, "groups seen in training": True}
 """name -> whether half of each test group's rows replace as many training rows. Both score the other half."""
 PREPARED = {lost: f"{DROPOUT}, {name}" for lost, name in MISSING.items()}
-STRESSES = (*SHARES, NOISE, CLEANED, *MISSING.values(), DROPOUT, *PREPARED.values(), *LEAK)
+STRESSES = (*SHARES, NOISE, CLEANED, *NOISED, *MISSING.values(), DROPOUT, *PREPARED.values(), *LEAK)
 
 Scores = Iterator[tuple[str, dict[str, Any]]]  # (name of the stress, scores)
 
@@ -100,7 +103,13 @@ def stress(model: Model, pack: Pack, tasks: Sequence[AnyTask], modalities: Seque
             NOISE: np.concatenate([noisy(m, rows.test) for m in names], axis=1),
             CLEANED: np.concatenate([cleaned(case, m) for m in names], axis=1),
         }
-        for scores in (_fewer_or_leaked(case), _worse_images(case, worse), _dropout(case)):
+        denoised = np.concatenate([noisy(m, rows.all, levels[m]) for m in names], axis=1)
+        versions = [dict(zip(NOISED, (case.joined(), denoised), strict=True)), _missing(case)]
+        for scores in (
+            _fewer_or_leaked(case),
+            _worse_images(case, worse),
+            *(_versions(case, v) for v in versions if v),
+        ):
             for kind, result in scores:
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
@@ -147,15 +156,21 @@ def _worse_images(case: _Case, worse: dict[str, np.ndarray]) -> Scores:
             yield kind, score(_without(lost, case.clean, num)[num:])
 
 
-def _dropout(case: _Case) -> Scores:
-    """Modality dropout, for a probe on both modalities."""
+def _missing(case: _Case) -> dict[str, np.ndarray]:
+    """Features [N, D] of all rows for modality dropout, by name: whole, and without each of two modalities."""
     if len(case.clean) < 2:
-        return
+        return {}
+    num = len(case.rows.fitted)
+    return {DROPOUT: case.joined(), **{kind: _without(lost, case.clean, num) for lost, kind in PREPARED.items()}}
+
+
+def _versions(case: _Case, versions: dict[str, np.ndarray]) -> Scores:
+    """Scores on each version of the test rows' features; the probe is fitted on all versions of the other rows."""
     rows, num, split = case.rows, len(case.rows.fitted), len(case.rows.train)
-    whole = [case.joined(), *(_without(lost, case.clean, num) for lost in MISSING)]
-    prepared = np.concatenate([z[:split] for z in whole] + [z[split:num] for z in whole])
-    score = case.fit(prepared, ProbeSplit(np.tile(rows.train, 3), np.tile(rows.val, 3), rows.test))
-    for kind, z in zip((DROPOUT, *PREPARED.values()), whole, strict=True):
+    parts = [z[:split] for z in versions.values()] + [z[split:num] for z in versions.values()]
+    times = len(versions)
+    score = case.fit(np.concatenate(parts), ProbeSplit(np.tile(rows.train, times), np.tile(rows.val, times), rows.test))
+    for kind, z in versions.items():
         yield kind, score(z[num:])
 
 

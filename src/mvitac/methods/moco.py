@@ -7,7 +7,7 @@ which can reveal the positive.
 """
 
 from abc import ABC
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ from mvitac.nn.encoders import EncoderConfig, Head, build_towers, trunks
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 from mvitac.nn.momentum import Momentum, momentum_at
+from mvitac.registry import formerly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +26,10 @@ class QueueConfig(MethodConfig, ABC):
     """Fields shared by the methods with a queue (moco, mct)."""
 
     queue: int = 4096
-    """Number of keys K in each queue. MoCo's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go. At most half the
-    training rows, so that a row seldom meets its own older key."""
+    """Number of keys K in each queue. MoCo's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
+    queue_per_row: float = field(default=0.125, metadata=formerly(0.5))
+    """At most this many keys per training row. In a longer queue, a row often meets its own older key and those of its
+    positives as negatives."""
     momentum: float = 0.999
     """Momentum m of the key towers (MoCo: .999)."""
     momentum_end: float | None = None
@@ -42,10 +45,12 @@ class QueueConfig(MethodConfig, ABC):
         self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
         if not 1 <= self.queue <= 1 << 24:
             raise ValueError(f"queue {self.queue}: give 1 to {1 << 24} keys")
+        if not 0 < self.queue_per_row <= 1:
+            raise ValueError(f"queue_per_row {self.queue_per_row}: give a share of the training rows, > 0 and <= 1")
 
     def queue_size(self, num_rows: int) -> int:
         """Number of keys to keep when training on ``num_rows`` rows."""
-        return min(self.queue, max(1, num_rows // 2))
+        return min(self.queue, max(1, int(self.queue_per_row * num_rows)))
 
 
 @dataclass(frozen=True, kw_only=True)
