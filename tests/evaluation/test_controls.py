@@ -13,7 +13,6 @@ import pytest
 from mvitac.data.spec import DataSpec
 from mvitac.evaluation.classifiers import fit_knn, fit_linear
 from mvitac.evaluation.controls import borders, controls_of, start_weights, starts_of, thumbnails
-from mvitac.methods.moco import MoCoConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig
 from mvitac.recipes import recipe, with_method
@@ -62,11 +61,6 @@ def test_classes_never_seen_get_probability_zero() -> None:
     x, y = np.array([[-1.0], [-0.9], [0.9], [1.0]]), np.array([0, 0, 2, 2])
     found = fit_linear(x, y, x, y, 4)[0](np.array([[1.0]]))[0]
     assert found[2] > found[0] > 0 and found[[1, 3]].tolist() == [0, 0] and found.sum() == pytest.approx(1)
-
-
-@pytest.mark.parametrize(("num_rows", "size"), [(30, 10), (12, 6), (1, 1)])
-def test_a_queue_is_never_more_than_half_the_rows(num_rows: int, size: int) -> None:
-    assert MoCoConfig(queue=10).queue_size(num_rows) == size
 
 
 def modalities_of(runs: list[Run], spec: DataSpec) -> list[tuple[str, int]]:

@@ -245,6 +245,7 @@ def test_a_queue_is_at_most_an_eighth_of_the_data() -> None:
     method.prepare(ROWS)
     assert all(len(queue.keys) == 10 for queue in method.queues.values())
     assert MoCoConfig().queue_size(1_281_167) == 4_096
+    assert [MoCoConfig(queue=10).queue_size(num) for num in (1, 12, 96)] == [1, 1, 10]
     assert MoCoConfig(queue_per_row=0.5).queue_size(3_900) == 1_950  # as in runs before this field
 
 
