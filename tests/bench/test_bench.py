@@ -241,9 +241,8 @@ def test_the_board(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFi
     assert table.index(">majority or mean<") < table.index(">untrained<") < table.index(f">{board.encoders[0]}<")
     for text in ("stripes: pattern", "12 test instances", "touch, R2", "2 tasks that were not run", "levels", "30"):
         assert text in page, text
-    assert (
-        page.count("<svg") == 1 + 3 + 2
-    )  # at a glance; touch of three tasks against parameters; two modalities by labels
+    # At a glance; touch of three tasks against parameters; two modalities against labels.
+    assert page.count("<svg") == 1 + 3 + 2
     drawn = page[page.index("<svg") : page.index("</svg>")]
     assert f">{board.encoders[0]}<" in drawn and ">noise only<" in drawn and ">light, touch, R2<" in drawn
     assert (

@@ -27,7 +27,7 @@ def at_a_glance(names: Sequence[str], columns: Sequence[tuple[str, str, Mapping[
         columns: (set, task and modality, name -> cell) of each column. An absent name is left empty, and a score with a
             leak has an L and no shade.
     """
-    figure = Figure(figsize=(2.0 + 0.36 * len(columns), 1.3 + 0.2 * len(names)))
+    figure = Figure(figsize=(max(9.2, 2.0 + 0.36 * len(columns)), 1.3 + 0.2 * len(names)))  # letters of one size
     axes = figure.subplots()
     for x, (one, _, cells) in enumerate(columns):
         clean = {name: cell["mean"] for name, cell in cells.items() if not cell.get("leak")}
