@@ -1,7 +1,7 @@
 """One encoder for simulation and all small real sets, against encoders of each set alone (docs/results/transfer.md).
 
     python examples/real_manifests.py DATA MANIFESTS
-    python examples/one_encoder.py MANIFESTS OUT [--seeds 1] [--rows joint "simulation" ...] [--own-steps 300]
+    python examples/one_encoder.py MANIFESTS OUT [--seeds 1] [--rows joint "simulation" ...] [--steps 5400]
 
 Three folds of objects of every set. The encoder of a fold is pre-trained on simulated materials and on the training rows of
 all sets in that fold, so it has seen no object that it is tested on. A stopped script continues where it was.
@@ -117,8 +117,8 @@ def pretrain(out: Path, *options: str) -> Path:
 class Encoders:
     """The model of a row of the table by set, fold and seed."""
 
-    def __init__(self, manifests: Path, out: Path, own_steps: int) -> None:
-        self.manifests, self.out, self.own_steps = manifests, out, own_steps
+    def __init__(self, manifests: Path, out: Path, steps: int, own_steps: int) -> None:
+        self.manifests, self.out, self.steps, self.own_steps = manifests, out, steps, own_steps
 
     def _packs(self, fold: int) -> list[Path]:
         return [pack.path for name in SETS for pack in packs_of(name, fold, self.manifests, self.out)]
@@ -134,15 +134,18 @@ class Encoders:
         steps = ["--steps", str(self.own_steps), "--seed", str(seed)]
         return pretrain(out, *data, *steps, *more)
 
+    def _many(self, name: str, seed: int, *data: str) -> Path:
+        return pretrain(self.out / "runs" / name, *data, "--steps", str(self.steps), "--seed", str(seed))
+
     def simulation(self, name: str, fold: int, seed: int) -> Path:
-        return pretrain(self.out / "runs" / f"simulation-seed{seed}", "--data", "materials", "--seed", str(seed))
+        return self._many(f"simulation-seed{seed}", seed, "--data", "materials")
 
     def joint(self, name: str, fold: int, seed: int) -> Path:
         parts = self._parts(fold, f"sim={self.out / 'packs' / 'sim'}")
-        return pretrain(self.out / "runs" / f"joint-fold{fold}-seed{seed}", *parts, "--seed", str(seed))
+        return self._many(f"joint-fold{fold}-seed{seed}", seed, *parts)
 
     def real(self, name: str, fold: int, seed: int) -> Path:
-        return pretrain(self.out / "runs" / f"real-fold{fold}-seed{seed}", *self._parts(fold), "--seed", str(seed))
+        return self._many(f"real-fold{fold}-seed{seed}", seed, *self._parts(fold))
 
     def in_place(self, name: str, fold: int, seed: int) -> Path:
         return self._own(name, fold, seed, self.out / "runs" / f"in-place-{name}-fold{fold}-seed{seed}")
@@ -222,12 +225,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="seeds of every row, from 0 on")
     parser.add_argument("--rows", nargs="+", default=["simulation", "joint", "in place"])
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=list(SETS))
+    parser.add_argument("--steps", type=int, default=1350, help="steps of rows that are trained on several sets")
     parser.add_argument("--own-steps", type=int, default=300, help="steps of rows that are trained on one set")
     args = parser.parse_args()
     if not (args.out / "packs" / "sim").exists():
         data = recipe("quick").data
         build(data.source(), args.out / "packs" / "sim", size=data.size)
-    encoders, file = Encoders(args.manifests, args.out, args.own_steps), args.out / "scores.json"
+    encoders, file = Encoders(args.manifests, args.out, args.steps, args.own_steps), args.out / "scores.json"
     kept: dict[str, list[dict[str, Any]]] = read_json(file, "scores") if file.exists() else {}
     for seed in range(args.seeds):
         for source in ["untrained", *(["pixels"] if not seed else []), *args.rows]:

@@ -108,6 +108,23 @@ def test_alpha_is_chosen_on_the_held_out_rows() -> None:
     assert fit_ridge(x, y, 20)[1][0] > fit_ridge(*memorised, 20)[1][0]
 
 
+def test_a_feature_that_one_row_has_does_not_predict_metres() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(1100, 3))
+    y = x[:, :1] + rng.normal(0, 0.1, (1100, 1))
+    dead = np.zeros((1100, 1))
+    dead[7], dead[1000] = 1e-6, 0.02  # after a ReLU: hardly there in one row of train, an ordinary value in one of test
+    predict, _ = fit_ridge(np.hstack([x, dead])[:1000], y[:1000], 200)
+    assert np.abs(predict(np.hstack([x, dead])[1000:]) - y[1000:]).max() < 1
+    weights, bias = predict.weights()
+    assert np.allclose(np.hstack([x, dead]) @ weights.T + bias, predict(np.hstack([x, dead])))
+
+
+def test_a_feature_that_few_rows_have_is_used() -> None:
+    x = np.random.default_rng(0).random((1000, 1)) * (np.arange(1000) % 100 == 0)[:, None]  # contact in 1 % of the rows
+    assert r2_score(x, fit_ridge(x, x, 200)[0](x)) > 0.99
+
+
 def test_a_control_may_be_a_curve() -> None:
     x = np.linspace(-1, 1, 200)[:, None]
     y = x**2

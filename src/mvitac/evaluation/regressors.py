@@ -22,6 +22,24 @@ Regressor = Callable[[np.ndarray], np.ndarray]
 ALPHAS = tuple(10.0**k for k in range(-1, 6))
 """Candidate strengths of ridge regularisation, on standardised features and targets."""
 NEIGHBOURS = 20
+RARE = 0.003
+"""A feature that has one value in all but this share of the rows is left out of ridge regression."""
+
+
+class FeatureScaler(StandardScaler):
+    """Zero mean and unit variance; a feature that has one value in nearly all rows becomes 0.
+
+    After a ReLU, a feature may be 0 in all rows but one. Its standard deviation is then so small that an ordinary value in
+    another row comes to thousands of them, and to predictions of metres where millimetres are measured.
+    """
+
+    def fit(
+        self, x: np.ndarray, y: np.ndarray | None = None, sample_weight: np.ndarray | None = None
+    ) -> "FeatureScaler":
+        super().fit(x, y, sample_weight)
+        rare = (x != np.median(x, axis=0)).mean(axis=0) < RARE
+        self.scale_ = np.where(rare, np.inf, self.scale_)
+        return self
 
 
 def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> "tuple[Joined, list[float]]":
@@ -29,13 +47,13 @@ def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> "tuple[Joined, list
 
     Each alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
     """
-    fitted = _fit_each(x, y, num_val, lambda: [])
+    fitted = _fit_each(x, y, num_val, lambda: [FeatureScaler()])
     return Joined(fitted), [float(pipeline[-1].alpha_) for pipeline, _, _ in fitted]
 
 
 def fit_curve(x: np.ndarray, y: np.ndarray, num_val: int) -> Regressor:
     """Fit a smooth curve: ridge on cubic splines of each column of ``x``, for controls of a few columns."""
-    return Joined(_fit_each(x, y, num_val, lambda: [SplineTransformer(n_knots=6, extrapolation="linear")]))
+    return Joined(_fit_each(x, y, num_val, lambda: [StandardScaler(), SplineTransformer(6, extrapolation="linear")]))
 
 
 def fit_neighbours(x: np.ndarray, y: np.ndarray) -> Regressor:
@@ -52,7 +70,7 @@ Fitted = tuple[Any, float, float]
 """A scikit-learn regressor of one standardised target, and the target's mean and standard deviation."""
 
 
-def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, basis: Callable[[], list[Any]]) -> list[Fitted]:
+def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, before: Callable[[], list[Any]]) -> list[Fitted]:
     x = x.astype(np.float64)  # in float32 the normal equations of correlated features are ill-conditioned
     held = np.where(np.arange(len(x)) < len(x) - num_val, -1, 0)  # -1: always fitted on, 0: held out
     fitted = []
@@ -62,7 +80,7 @@ def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, basis: Callable[[], li
         both = len(set(held[have])) == 2
         ridge = RidgeCV(ALPHAS, cv=PredefinedSplit(held[have]) if both else None)
         with threadpools().limit(limits=1):  # as for logistic regression: threads wait longer than they compute
-            pipeline = make_pipeline(StandardScaler(), *basis(), ridge).fit(x[have], (target[have] - mean) / std)
+            pipeline = make_pipeline(*before(), ridge).fit(x[have], (target[have] - mean) / std)
         fitted.append((pipeline, mean, std))
     return fitted
 
