@@ -29,7 +29,7 @@ from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.run_names import names_of
 from mvitac.system.files import digest, digest_file, read_json
 
-RESULT = Path(__file__).parents[2] / "benchmarks" / "board" / "sim-v1" / "sim-v1-resnet18-random.json"
+RESULT = Path(__file__).parents[2] / "benchmarks" / "board" / "sim-v2" / "sim-v2-resnet18-random.json"
 
 _touched: list[str] | None = None
 
