@@ -99,8 +99,9 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
                 not_run.append(f"{one.name}, {ask.name}: {name} was not run: {block['not_run']}")
             else:
                 forms.setdefault((block["form"], block["data"]["rows"]), []).append((name, block))
+        several = len({form for form, _ in forms}) > 1
         for (form, _), found in forms.items():
-            task = f"{one.name}: {ask.name}{f' ({form})' if len(one.forms) > 1 else ''}"
+            task = f"{one.name}: {ask.name}{f' ({form})' if several else ''}"
             records = []
             for name, block in found:  # controls are the same in all results: those of the first one are shown
                 mine = records_of(block, results[name]["encoder"])
