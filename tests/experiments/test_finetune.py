@@ -271,6 +271,13 @@ def test_statistics_alone_change_statistics_alone(
         assert before[record["task"]]["group_correct"] == record["group_correct"]
 
 
+def test_a_run_in_bf16_adapts(pack: Pack, bare: Pack, tmp_path: Path) -> None:
+    """The precision of most recipes where the processor has it; every processor computes it."""
+    start = train(smoke(pack, eval_every=0, precision="bf16"), tmp_path / "start", quiet=True)
+    adapted(start, bare, tmp_path / "out", Adaptation(steps=2, batches=2, old=bare.path))
+    assert all(bool(value.isfinite().all()) for value in weights(tmp_path / "out").values())
+
+
 def test_a_new_sensor_is_also_scored_in_known_colours(
     ancestor: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

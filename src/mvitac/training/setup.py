@@ -220,7 +220,8 @@ def _before_first_step(setup: Setup) -> None:
         if setup.world.size > 1:
             raise ValueError("renew_norms works on one process only: leave it out, or start without torchrun")
         steps = setup.chunks(0, run.renew_norms)
-        update_bn((chunk() for chunks in steps for chunk in chunks), method)
+        with setup.step.autocast():  # views are in the precision of the run
+            update_bn((chunk() for chunks in steps for chunk in chunks), method)
         for module in method.modules():
             if isinstance(module, Momentum):
                 module.restart()

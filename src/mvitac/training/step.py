@@ -57,7 +57,7 @@ class Step:
         self.optimiser.zero_grad(set_to_none=True)
         if len(chunks) == 1 and self.world.size == 1:
             torch.manual_seed(seed)
-            with self._autocast():
+            with self.autocast():
                 losses = self.forward(chunks[0]())
             losses["loss"].backward()
         else:
@@ -66,7 +66,7 @@ class Step:
         self.method.after_step(progress)
         return {name: value.detach() for name, value in losses.items()}
 
-    def _autocast(self) -> torch.autocast:
+    def autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
     def _backward_by_chunks(self, chunks: Sequence[Chunk], seed: int) -> dict[str, Tensor]:
@@ -84,7 +84,7 @@ class Step:
             views = chunk()
             with torch.set_grad_enabled(single):
                 queries.append(self._queries(views, first_seed + i))
-            with torch.no_grad(), self._autocast():
+            with torch.no_grad(), self.autocast():
                 keys.append(method.keys(views))
 
         # Losses over all embeddings, and the gradient of each embedding of this process.
@@ -102,7 +102,7 @@ class Step:
     def _queries(self, views: Views, seed: int) -> Embeddings:
         assert isinstance(self.method, Contrastive)
         torch.manual_seed(seed)
-        with self._autocast():
+        with self.autocast():
             return self.method.queries(views)
 
     def _contrast(
@@ -117,7 +117,7 @@ class Step:
         all_queries = {name: self.world.gather(z).requires_grad_() for name, z in own.items()}
         all_keys = {name: self.world.gather(torch.cat([z[name] for z in keys])) for name in keys[0]}
         torch.manual_seed(seed)  # what losses draw (CMC's negatives) is the same on every process
-        with self._autocast():
+        with self.autocast():
             losses = self.method.contrast(all_queries | all_keys)
         # An embedding gets no gradient if its loss is not part of the sum.
         found = torch.autograd.grad(losses["loss"], list(all_queries.values()), allow_unused=True)
