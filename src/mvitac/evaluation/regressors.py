@@ -37,7 +37,8 @@ class FeatureScaler(StandardScaler):
         self, x: np.ndarray, y: np.ndarray | None = None, sample_weight: np.ndarray | None = None
     ) -> "FeatureScaler":
         super().fit(x, y, sample_weight)
-        rare = (x != np.median(x, axis=0)).mean(axis=0) < RARE
+        usual = np.median(x[:: len(x) // 1000 + 1], axis=0)  # of some rows, which is much faster and as good
+        rare = (x != usual).mean(axis=0) < RARE
         self.scale_ = np.where(rare, np.inf, self.scale_)
         return self
 
