@@ -50,7 +50,8 @@ def at_a_glance(names: Sequence[str], columns: Sequence[tuple[str, str, Mapping[
     axes.spines[:].set_visible(False)
     starts = [x for x, (one, _, _) in enumerate(columns) if not x or one != columns[x - 1][0]]
     for x, end in zip(starts, [*starts[1:], len(columns)], strict=True):
-        axes.text((x + end - 1) / 2, len(names) - 0.2, columns[x][0], ha="center", va="top", weight="bold")
+        one = columns[x][0] if end - x > 1 else columns[x][0].replace("_", "\n")  # a single column is narrow
+        axes.text((x + end - 1) / 2, len(names) - 0.2, one, ha="center", va="top", weight="bold")
     return figure
 
 
