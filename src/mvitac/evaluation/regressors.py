@@ -33,12 +33,10 @@ class FeatureScaler(StandardScaler):
     another row comes to thousands of them, and to predictions of metres where millimetres are measured.
     """
 
-    def fit(
-        self, x: np.ndarray, y: np.ndarray | None = None, sample_weight: np.ndarray | None = None
-    ) -> "FeatureScaler":
-        super().fit(x, y, sample_weight)
-        usual = np.median(x[:: len(x) // 1000 + 1], axis=0)  # of some rows, which is much faster and as good
-        rare = (x != usual).mean(axis=0) < RARE
+    def fit(self, X: np.ndarray, y: Any = None, sample_weight: Any = None) -> "FeatureScaler":
+        super().fit(X, y, sample_weight)
+        usual = np.median(X[:: len(X) // 1000 + 1], axis=0)  # of some rows, which is much faster and as good
+        rare = (usual != X).mean(axis=0) < RARE
         self.scale_ = np.where(rare, np.inf, self.scale_)
         return self
 
