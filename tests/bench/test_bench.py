@@ -321,6 +321,13 @@ def test_results_of_other_suites_are_refused(
     other = changed(results[1], tmp_path / "b.json", resigned, signed=True)
     assert "is of another suite" in said(capsys, "bench", "board", results[0], other)
     assert "bench one of them with --name" in said(capsys, "bench", "board", results[0], results[0])
+
+    def of_v1(value: dict[str, Any]) -> None:
+        value["suite"]["name"] = "sim-v1"
+        resigned(value)
+
+    old = changed(results[1], tmp_path / "old.json", of_v1, signed=True)
+    assert "is of sim-v1, this version has sim-v2: run the bench again" in said(capsys, "bench", "check", old)
     monkeypatch.setattr(suite, "SUITES", tmp_path)
     (tmp_path / "toys.toml").write_text(SUITE)
     assert main(["bench", "check", str(results[0])]) == 0

@@ -13,6 +13,7 @@ someone repeats them.
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ KEPT = (
     *("group_sizes", "group_correct", "r2", "targets", "group_sums", "C", "alpha", "steps"),
 )
 """Fields of a record of a probe that a result keeps."""
+VERSION = re.compile(r"-v\d+$")  # at the end of a suite's name
 SHARED = ("n", "value", "squared_value")
 """Sums per group that depend on the rows alone: they are written once for all records of a task."""
 
@@ -125,6 +127,9 @@ def read_result(path: Path) -> dict[str, Any]:
             f"{path} is of another version of {suite.name} ({suite.digest()[:12]}, this version has"
             f" {find_suite(suite.name).digest()[:12]}): run the bench again"
         )
+    now = {VERSION.sub("", name): name for name in shipped()}.get(VERSION.sub("", suite.name), suite.name)
+    if now != suite.name:
+        raise ValueError(f"{path} is of {suite.name}, this version has {now}: run the bench again")
     return value
 
 
