@@ -208,7 +208,8 @@ def show(found: dict[str, Any], console: Console) -> None:
         table.add_row(name, *cells, _range(best))
     console.print(table)
     for name, gain in found["gain"].items():
-        p = "" if gain["p"] is None else f", p {gain['p']:.3f}"  # none with one seed
+        p = gain["p"]  # None with one seed
+        p = "" if p is None else f", p {p:.3f}" if p >= 0.0005 else ", p < .001"
         console.print(f"re-grasp, {name}: {100 * gain['mean']:+.1f} points {_range(gain)}{p}", highlight=False)
 
 

@@ -54,17 +54,15 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
     Unless noted, effects are measured in 300 steps of `demo`'s networks with momentum keys (docs/results/ablation.md).
     "No difference" means a difference within the noise. Points are percentage points of accuracy.
 
-    - End-to-end keys: gradients through both views instead of a momentum tower, as in SimCLR. After 1,150 steps: 10 points
-      of category, 8 of rough, and almost twice the retrieval score of momentum keys. Steps take a third to a half longer
-      (docs/results/materials_1150.md).
-    - Inter-modal losses on all pairs of views, and no flips of touch, which no real press shows. Together 3 points of
-      category (4 by touch, 2.7 by vision) on top of end-to-end keys, and no score is worse (same page). Alone: no flips
-      1.8, all pairs 1.1, neither significant. Other methods gain 2 to 2.6 without the flips.
+    - End-to-end keys: gradients through both views instead of a momentum tower, as in SimCLR, and inter-modal losses on all
+      pairs of views. With all steps of `quick`: 11 points of category, 12 of rough, and almost twice the retrieval score
+      of momentum keys. Steps take 1.4 times as long (docs/results/materials.md).
+    - No flips of touch, which no real press shows. Together with all pairs of views 3 points of category on top of
+      end-to-end keys in an earlier test (docs/results/recipes.md).
     - AdamW with lr 1e-3, warm-up and cosine schedule (MoCo v3): Adam at a constant .03 destroys the ImageNet weights. Also
-      from scratch, 8 points of category (one seed). Biases and BatchNorm are not decayed. The published tables were made
-      with them decayed, by a factor of 1 - 1e-4 over the whole run of `demo`.
+      from scratch, 8 points of category (one seed). Biases and BatchNorm are not decayed.
     - BatchNorm in the heads (SimCLR v2, MoCo v3): prevents an early collapse of the embeddings with small batches. No
-      difference (three seeds: without it +1.2, p .61).
+      difference (three seeds: without it +1.2).
     - Momentum .99 rising to 1 (BYOL, MoCo v3), for methods that have one: the keys converge with the queries. No
       difference from 0 to .999 (one seed).
     - Rows of a touch are spread over the epoch: consecutive frames of one touch are near-duplicates and wrong as negatives.
@@ -73,12 +71,11 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
       L_tt without the material (docs/simulator.md has the figures). Another row of the same touch group shares only the
       object in the simulator, where it is another press of the same instance; in Touch and Go it is a neighbouring frame of
       the same contact. In the simulator a neighbouring moment gains 3 points of category where another press gains 10
-      (300 steps, one seed). The largest effect: after 1,150 steps 21 points of category, 7
-      of soft, 20 of rough; with end-to-end keys 31 of category, and end-to-end keys gain nothing without it. Not used for
-      grasps: the rows of a grasp differ in its phase (before, during, after), and the phases differ in the contact itself.
-    - All four losses, also with same-image positives: on simulated grasps, training without the intra-modal losses gains
-      6.7 points (docs/results/grasps_1150.md). This was seen on test data and is not adopted until another dataset
-      confirms it.
+      (300 steps, one seed). The largest effect: with momentum keys and all steps of `quick` 19 points of category, 7 of
+      soft, 13 of rough. Not used for grasps: the rows of a grasp differ in its phase (before, during, after), and the
+      phases differ in the contact itself.
+    - All four losses, also with same-image positives: on simulated grasps, training without the intra-modal losses gains 5.7
+      points (docs/results/grasps.md). This was seen on test data and is not adopted until another dataset confirms it.
     - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16, a step takes ten times as
       long or more. The scores of the two differ in one of nine cases only (docs/speed.md).
     """
@@ -107,7 +104,7 @@ def demo(data: DatasetConfig, phased: bool | None = None) -> Run:
     - Whole images are probed at 72 px, because crops show them at that scale during training.
     - Constant momentum .9: with .99 rising to 1 the keys would average over more steps than a short run has.
     - Crops of at least 40 % of the area, no grayscale, lr 2e-3: easier views for few steps.
-    - one-per-touch batches, as in the published tables: all touch groups of simulated materials have the same size.
+    - one-per-touch batches: all touch groups of simulated materials have the same size.
     """
     base = modern(data, phased)
     views = ViewAugment(scale=(0.4, 1.0), grayscale=0.0)
@@ -131,7 +128,7 @@ def quick(data: DatasetConfig, phased: bool | None = None) -> Run:
     `mvitac demo` trains this recipe. It takes 9 to 17 minutes on two cores without fast bf16, 5 to 7 with it.
 
     - End-to-end keys, inter-modal losses on all pairs of views, and no flips of touch, as in `modern`: a pair takes 1.5
-      times as long, and the scores are much higher. The published tables use `demo`, with the paper's momentum keys.
+      times as long, and the scores are much higher (docs/results/materials.md).
     - Batch 32 for twice the steps of batch 64, and the learning rate divided by the square root of 2.
     - Batch size and number of steps were chosen on split val, seed 0, never on test (docs/simulator.md).
     """
