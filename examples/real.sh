@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Reproduce docs/results/real.md: write the manifests, then run all methods of Tables I and II on every dataset (CPU).
+# Run all methods of Tables I and II on every dataset (CPU), after writing the manifests. docs/results/real.md has the
+# options of its tables.
 # Arguments: data folder, output folder, options of mvitac compare. A stopped script continues where it was stopped.
 #   examples/real.sh ../shared/data runs/real --jobs 2
 #   STEPS=150 SETS="vt60 physiclear-by-group" examples/real.sh ...    # shorter runs, only these datasets

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import mvitac
 from mvitac.data.build import build
@@ -114,6 +115,9 @@ def test_touch_that_knows_the_outcome_lifts_like_the_oracle(
     assert found["success"]["first grasp"]["again"]["tried"] == 1
     shown = capsys.readouterr().out
     assert "10 test objects" in shown and f"{100 * success['vision']:.1f}" in shown
+    found["gain"]["both - vision"]["p"] = 0.0002
+    regrasp.show(found, Console())
+    assert "p < .001" in capsys.readouterr().out
 
 
 def test_what_cannot_be_played_is_named(run: Path, smoke_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
