@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,15 +71,49 @@ def test_find_does_not_stack_sensors_of_two_sizes(tmp_path: Path) -> None:
         _picture([tmp_path / "left.png", tmp_path / "right.png"])
 
 
-def test_a_jpeg_without_its_end_is_refused(tmp_path: Path) -> None:
-    """Pillow shows zeros after half of the file as gray. An end marker inside a comment is none; a trailer is allowed."""
-    path = tmp_path / "touch.jpg"
-    rgb = np.random.default_rng(5).integers(0, 256, (64, 64, 3), dtype=np.uint8)
-    Image.fromarray(rgb).save(path, comment=b"\xff\xd9")
+def smooth(size: tuple[int, int]) -> Image.Image:
+    """A random RGB picture that JPEG keeps well."""
+    small = np.random.default_rng(5).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    return Image.fromarray(small).resize(size)
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_damaged_jpeg_is_refused(tmp_path: Path, progressive: bool) -> None:
+    """Where libjpeg warns, Pillow shows gray or smeared pixels. An end marker in a comment is none."""
+    path, end = tmp_path / "touch.jpg", b"\xff\xd9"
+    smooth((320, 240)).save(path, comment=end, quality=90, progressive=progressive)
     whole = path.read_bytes()
-    for kept in (len(whole) // 2, len(whole) - 2):
-        path.write_bytes(whole[:kept] + bytes(len(whole) - kept))
-        with pytest.raises(ValueError, match=r"touch.jpg cannot be read as an image .its end is missing"):
-            decode(path)
-    path.write_bytes(whole + b"trailer")
-    assert decode(path).size == (64, 64)
+    middle = len(whole) // 2
+    damaged = {
+        "cut off": whole[:middle],
+        "zeros to the end": whole[:middle] + bytes(len(whole) - middle),
+        "cut off, with an end marker": whole[:middle] + end,
+        "zeros before the end marker": whole[:middle] + bytes(len(whole) - middle - 2) + end,
+        "a block of zeros": whole[:middle] + bytes(512) + whole[middle + 512 :],
+    }
+    for what, data in damaged.items():
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"touch.jpg cannot be read as an image \((Corrupt|Premature)"):
+            print(what, decode(path).size)
+
+
+def test_bytes_after_a_jpeg_and_padding_of_usb_cameras_are_allowed(tmp_path: Path) -> None:
+    path, end = tmp_path / "touch.jpg", b"\xff\xd9"
+    smooth((64, 48)).save(path)
+    whole = path.read_bytes()
+    pixels = np.asarray(decode(path))
+    for allowed in (whole + b"trailer", whole[:-2] + bytes(2) + end):
+        path.write_bytes(allowed)
+        assert np.array_equal(np.asarray(decode(path)), pixels)
+    path.write_bytes(whole[:-2] + bytes(200) + end)
+    with pytest.raises(ValueError, match=r"19\d extraneous bytes"):
+        decode(path)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "CMYK"])
+@pytest.mark.parametrize("options", [{}, {"subsampling": 0}, {"subsampling": 1}, {"progressive": True}], ids=str)
+def test_jpegs_have_the_pixels_of_pillow(tmp_path: Path, mode: str, options: dict[str, Any]) -> None:
+    path = tmp_path / "touch.jpg"
+    smooth((61, 47)).convert(mode).save(path, **options)
+    with Image.open(path) as opened:
+        assert np.array_equal(np.asarray(decode(path)), np.asarray(opened.convert("RGB")))

@@ -1,10 +1,12 @@
 """Functions on images: decode, resize to a square, subtract a background."""
 
+import re
 import struct
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import simplejpeg
 from PIL import ExifTags, Image, ImageOps
 
 
@@ -43,7 +45,7 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
             if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
                 raise ValueError(f"it holds {getattr(image, 'n_frames', 0)} frames, not one: store one image per row")
             if image.format in ("JPEG", "MPO"):
-                _check_end(image)
+                return to_rgb(_jpeg(image))
             image.load()
             return to_rgb(image)
     except FileNotFoundError:
@@ -55,18 +57,27 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
         raise ValueError(f"{name} is too large ({error})") from None
 
 
-def _check_end(image: Image.Image) -> None:
-    """ValueError if a JPEG ends without its end marker: it is cut off, or its end was overwritten by zeros.
+DAMAGE = re.compile("Corrupt JPEG data|Premature end|Inconsistent progression")
+PADDING = re.compile(r" 1?\d extraneous bytes before marker 0xd9")
+"""Of libjpeg's warnings: those of damage, and of the few bytes that USB cameras write before the end marker."""
 
-    libjpeg decodes zeros as gray, with a warning that Pillow does not show. Bytes after the marker are allowed.
-    """
+
+def _jpeg(image: Image.Image) -> Image.Image:
+    """An opened JPEG with its pixels, which are Pillow's; ValueError where libjpeg warns of damage, as Pillow does not."""
     file: BinaryIO = image.fp  # type: ignore[attr-defined]
     file.seek(0)
-    data, at = file.read(), 2
-    while 0 < at < len(data) - 4 and data[at + 1] != 0xDA:  # segments before the pixels, such as a thumbnail
-        at = at + 1 if data[at + 1] == 0xFF else at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    if data.find(b"\xff\xd9", at) < 0:
-        raise ValueError("its end is missing: it was not copied completely")
+    try:
+        pixels = simplejpeg.decode_jpeg(file.read())
+    except ValueError as error:
+        if DAMAGE.search(str(error)) and not PADDING.search(str(error)):
+            raise
+        pixels = None  # rare subsampling, which Pillow knows
+    if pixels is None or image.mode == "CMYK":
+        image.load()
+        return image
+    found = Image.fromarray(pixels)
+    found.info = image.info  # EXIF
+    return found
 
 
 def to_rgb(image: Image.Image) -> Image.Image:

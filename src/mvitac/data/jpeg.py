@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import simplejpeg
 from PIL import Image
 
 from mvitac.data.lazy import Lazy
@@ -34,17 +35,17 @@ def encode(image: np.ndarray, quality: int) -> bytes:
 
 
 def decode(jpeg: bytes, shape: tuple[int, int, int]) -> np.ndarray:
-    """Decode to uint8 ``shape`` [S, S, C]; ValueError or OSError if ``jpeg`` is truncated or has another shape.
+    """Decode to uint8 ``shape`` [S, S, C]; ValueError if ``jpeg`` has another shape or libjpeg warns of damage.
 
     Other damage gives wrong pixels without an error; a pack detects it by checksums.
     """
     if not jpeg:
         return np.zeros(shape, np.uint8)
     size, _, channels = shape
-    with Image.open(io.BytesIO(jpeg), formats=("JPEG",)) as image:
-        if (image.mode, image.size) != ("RGB", (size, size * channels // 3)):
-            raise ValueError(f"it is {image.mode} of {image.width} x {image.height}")
-        sensors = np.asarray(image).reshape(-1, size, size, 3)
+    height, width, colours, _ = simplejpeg.decode_jpeg_header(jpeg)
+    if (height, width, colours) != (size * channels // 3, size, "YCbCr"):
+        raise ValueError(f"it is {colours} of {width} x {height}")
+    sensors = simplejpeg.decode_jpeg(jpeg).reshape(-1, size, size, 3)
     return sensors.transpose(1, 2, 0, 3).reshape(shape)
 
 
@@ -78,7 +79,7 @@ class Jpegs(Lazy):
         for i, row in enumerate(rows.tolist()):
             try:
                 images[i] = decode(self.jpeg(row), self.shape[1:])
-            except Exception as error:  # Pillow raises several kinds
+            except ValueError as error:
                 raise ValueError(
                     f"{self.path}: row {row} cannot be decoded ({brief(error)}): the pack is damaged, make it again"
                 ) from None
@@ -91,5 +92,5 @@ def _num_threads() -> int:
 
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    """Return this process's pool; Pillow releases the GIL while decoding."""
+    """Return this process's pool; simplejpeg releases the GIL while decoding."""
     return ThreadPoolExecutor(_num_threads(), "jpeg")
