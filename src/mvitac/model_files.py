@@ -14,6 +14,7 @@ from mvitac.registry import from_json
 from mvitac.run import Run
 from mvitac.system.files import brief, parse_json
 
+MAX_STORED = 1024  # px: no pack holds larger images (``data.storage``)
 BEST = "model.best.safetensors"  # weights of a run that were best on split val, kept with ``Run.eval_every``
 Which = Literal["last", "best"]
 
@@ -52,6 +53,8 @@ def load(path: str | Path, which: Which = "last") -> Model:
         run = Run.load(parse_json(header["run"]))
         spec: DataSpec = from_json(DataSpec, parse_json(header["spec"]), "spec")
         stored = int(from_json(int, parse_json(header["stored"]), "stored"))
+        if not 1 <= stored <= MAX_STORED:
+            raise ValueError(f"stored {stored}: expected 1 to {MAX_STORED} px")
         # Older headers have no spec.difference; it is in the data config.
         spec = replace(spec, difference=spec.difference or bool(getattr(run.data, "difference", False)))
     except (KeyError, ValueError) as error:

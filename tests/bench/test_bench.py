@@ -24,6 +24,7 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import load
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.features import features
+from mvitac.evaluation.leaks import declared_leak
 from mvitac.evaluation.value_scores import r_squared
 from mvitac.model_files import fresh
 from mvitac.system.files import digest
@@ -230,9 +231,10 @@ def test_a_model_that_saw_the_test_groups_is_marked_and_not_ordered(
 
 def test_what_its_owner_says_of_the_training_data_is_a_leak_too(root: Path) -> None:
     toys = find_suite(str(root / "toys.toml"))
-    entry = score.Entry([], [], "x", "ImageNet; toy stripes, 2022")
-    assert entry._declared(toys.sets[0].names) == "Toy Stripes was in its owner's training, which rows is not known"
-    assert entry._declared(("Touch and Go",)) == "" and score.Entry([], [], "x", None)._declared(()) == "unknown"
+    said = "ImageNet; toy stripes, 2022"
+    assert declared_leak(said, toys.sets[0].names) == "Toy Stripes was in its owner's training, which rows is not known"
+    assert declared_leak(said, ("Touch and Go",)) == "" and declared_leak(None, ()) == "unknown"
+    assert declared_leak("Touch and Go, YCB", ("touch-and-go",)).startswith("touch-and-go was in")
 
 
 def test_the_board(results: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

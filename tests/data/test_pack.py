@@ -25,7 +25,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.partial_pack import RowFile
 from mvitac.data.source import Lost, Sample, Source
-from mvitac.datasets.pack import PackConfig
+from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.evaluation.retrieval import retrieved_rows
 from mvitac.system import locks
 from support.toy import Counting, Toy, toy_pack
@@ -208,6 +208,8 @@ def test_killed_in_the_last_clean_up(pack: Pack, tmp_path: Path, monkeypatch: py
         toy_pack(tmp_path / "p", num=60)  # another dataset
     assert (tmp_path / "p.partial").exists()
     source = Counting()
+    assert build(source, tmp_path / "p", size=32, quiet=True).digest == pack.digest and not source.seen
+    (tmp_path / "p.lock").touch()  # killed after the clean-up
     assert build(source, tmp_path / "p", size=32, quiet=True).digest == pack.digest and not source.seen
     assert [path.name for path in tmp_path.iterdir()] == ["p"]
     with pytest.raises(ValueError, match="already exists"):
@@ -407,6 +409,7 @@ def test_scoring_on_val_hides_test(pack: Pack) -> None:
     np.testing.assert_array_equal(choosing.rows("test"), whole.rows("val"))
     np.testing.assert_array_equal(choosing.rows("train", "unlabelled"), whole.rows("train", "unlabelled"))
     assert not len(choosing.rows("val"))
+    assert choosing.spec.notes == (*whole.spec.notes, ON_VAL)
     task = whole.spec.tasks[0].name
     unseen = whole.rows("test")
     assert (choosing.labels(task, "train", "val", "test")[unseen] == -1).all()

@@ -10,12 +10,14 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import safetensors
 import safetensors.torch
+import torch
 
 import mvitac
 from mvitac.bench.encoder import About, describe
@@ -23,11 +25,15 @@ from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import seal
+from mvitac.deploy.card import _harmless
 from mvitac.deploy.engine import Engine
+from mvitac.deploy.publish import publish
 from mvitac.deploy.search import Index, build
 from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.run_names import names_of
+from mvitac.nn.encoders import EncoderConfig
 from mvitac.system.files import digest, digest_file, read_json
+from support.training_runs import smoke
 
 RESULT = Path(__file__).parents[2] / "benchmarks" / "board" / "sim-v2" / "sim-v2-resnet18-random.json"
 
@@ -55,15 +61,17 @@ Change = Callable[[Path, dict[str, Any]], object]
 """Changes the run in the header of model.safetensors, given the trap and the run."""
 
 
-def forge(folder: Path, trap: Path, *, run: Change | None = None, manifest: Change | None = None) -> None:
+def forge(
+    folder: Path, trap: Path, *, run: Change | None = None, manifest: Change | None = None, stored: int = 0
+) -> None:
     """Change the artifact in ``folder``, and make every digest fit again."""
     file = folder / "model.safetensors"
-    if run:
+    if run or stored:
         with safetensors.safe_open(file, "pt") as opened:
             header = opened.metadata()
         value = json.loads(header["run"])
-        run(trap, value)
-        header["run"] = json.dumps(value)
+        (run or data("pack"))(trap, value)
+        header |= {"run": json.dumps(value), "stored": str(stored or header["stored"])}
         header["header_digest"] = digest([header["run"], header["spec"], header["stored"]])
         safetensors.torch.save_file(safetensors.torch.load_file(file), file, header)
     described = json.loads((folder / "artifact.json").read_text())
@@ -287,6 +295,7 @@ FOLDERS: list[tuple[str, str, Change, str]] = [
     ("onnx", "a number for a class", setting("classes", value={"pattern": [1]}), "expected str, got 1"),
     ("onnx", "a value without unit", setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
     ("onnx", "a number for outputs", setting("outputs", value=1e308), "is damaged"),
+    ("onnx", "no inputs", setting("inputs", value={}), "cannot be run"),
 ]
 
 
@@ -358,3 +367,41 @@ def test_names_in_results_are_text(trap: Path, tmp_path: Path, capsys: pytest.Ca
     assert "?]0;owned?<img" in (shown := capsys.readouterr().out) and "\x1b" not in shown
     assert main(["bench", "board", str(file), "--out", str(tmp_path / "x.html")]) == 0
     assert "&lt;img src" in (page := (tmp_path / "x.html").read_text()) and "<img src=http" not in page
+
+
+@pytest.mark.parametrize("stored", [-5, 30_000, 10**9])
+def test_a_size_that_no_pack_has_is_refused(copy: Path, trap: Path, stored: int) -> None:
+    """Every image would be resized to it."""
+    forge(copy, trap, stored=stored, manifest=setting("preprocessing", "stored", value=stored))
+    with pytest.raises(ValueError, match=f"stored {stored}: expected 1 to 1024 px"):
+        mvitac.load(str(copy))
+
+
+def test_a_probe_without_dimensions_is_refused(copy: Path, trap: Path) -> None:
+    file = copy / "probes.safetensors"
+    tensors = safetensors.torch.load_file(file)
+    name = next(name for name in tensors if name.endswith(".weight"))
+    safetensors.torch.save_file({**tensors, name: torch.tensor(1.0)}, file)
+    forge(copy, trap)
+    with pytest.raises(ValueError, match=r"weights of shape \(\)"):
+        mvitac.load(str(copy))
+
+
+@pytest.mark.parametrize("weights", ["imagenet", "{trap}/w.safetensors"])
+def test_weights_that_an_artifact_names_are_not_opened(
+    pack: Pack, trap: Path, tmp_path: Path, touched: list[str], weights: str
+) -> None:
+    """Of a trunk that timm has weights for. Its controls are of random weights."""
+    encoder_ = EncoderConfig(trunk="test_resnet.r160_in1k", weights="scratch")
+    mvitac.train(replace(smoke(pack, steps=1, eval_every=0), encoder=encoder_), tmp_path / "run", quiet=True)
+    made = publish(tmp_path / "run", tmp_path / "made", pack)
+    forge(made, trap, run=encoder(weights=weights))
+    touched.clear()
+    publish(made, tmp_path / "again", pack, allow_leak=True)
+    check(list(touched), trap)
+    assert "| untrained |" in (tmp_path / "again" / "README.md").read_text()
+
+
+def test_a_card_shows_labels_as_text() -> None:
+    line = "Note: <img src=http://x/y.png> ![a](http://x) [b](javascript:1)\x1b[31m\n# title"
+    assert _harmless(line) == "Note: &lt;img src=http://x/y.png> ![a]\\(http://x) [b]\\(javascript:1) [31m # title"

@@ -17,8 +17,10 @@ from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import number_hint
 from mvitac.data.source import Sample
+from mvitac.data.spec import DataSpec
+from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.deploy.publish import publish
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.leaks import FILE, Scored, leaks_of, read_sources, source_of, write_sources
 from mvitac.evaluation.score_text import with_interval
 from mvitac.evaluation.scores import pool, summarise
@@ -155,12 +157,58 @@ def test_numbers_mean_nothing_outside_their_dataset(pack: Pack) -> None:
     """Ids of the striped pairs are numbers; those of its groups are names."""
     elsewhere = Pack(pack.path)
     elsewhere.spec = replace(pack.spec, name="other")
-    leak = Scored(elsewhere).leak([source_of(pack, pack.rows("train"))], pack.rows("train"))
+    nameless = replace(source_of(pack, pack.rows("train")), images=np.zeros(0, np.uint64))
+    leak = Scored(elsewhere).leak([nameless], pack.rows("train"))
     assert leak.startswith(f"0 of {len(pack.rows('train'))} test rows and ")
     assert number_hint("toy", pack) and not number_hint("toy", elsewhere)
     again = Pack(pack.path)
     again.spec = replace(pack.spec, name="toy (another split)")
     assert Scored(again).leak([source_of(pack, pack.rows("train"))], pack.rows("train")).startswith("72 of 72 test")
+
+
+@dataclass
+class Renamed(Toy):
+    """The same images in another order, with other ids and every row its own group."""
+
+    def spec(self) -> DataSpec:
+        return replace(super().spec(), name="other")
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(self.num - 1 - item)
+        return [replace(sample, columns={**sample.columns, "id": f"row {item}", "group": f"new {item}"})]
+
+
+def test_the_same_images_under_other_names_leak(pack: Pack, tmp_path: Path) -> None:
+    renamed = build(Renamed(), tmp_path / "renamed", size=32, quiet=True)
+    learned = source_of(pack, pack.rows("train"))
+    write_sources(tmp_path, [learned])
+    (read,) = read_sources(tmp_path, smoke(pack), None, pack) or ()
+    assert np.array_equal(read.images, learned.images) and len(read.images) == len(pack.rows("train"))
+    for split, num in (("train", len(pack.rows("train"))), ("test", 0)):
+        rows = renamed.rows(split)
+        leak = Scored(renamed).leak([read], rows)
+        assert leak.startswith(f"{num} of {len(rows)} test rows and 0 of") if num else leak == ""
+
+
+def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:
+    """Of 100,000 and 100,000 images of one modality, two have the same CRC-32."""
+    scored = Scored(pack)
+    scored._images = np.arange(1, 121, dtype=np.uint64)  # one modality: below 2 ** 32
+    images = np.concatenate([[5], np.arange(1 << 20, (1 << 20) + (1 << 23), dtype=np.uint64)]).astype(np.uint64)
+    source = replace(source_of(pack, pack.rows("train")), ids=np.ones(1, np.uint64), groups=np.ones(1, np.uint64))
+    rows = np.arange(120)
+    assert scored.leak([replace(source, images=images)], rows) == ""
+    assert scored.leak([replace(source, images=images[:1])], rows).startswith("1 of 120")
+
+
+def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Path) -> None:
+    """Both are of one pack, so its digest does not tell them apart: the note does."""
+    data = PackConfig(path=pack.path, score_on="val")
+    mvitac.train(replace(smoke(pack, steps=1, eval_every=0), data=data), tmp_path / "run", quiet=True)
+    scores = probe_runs([tmp_path / "run"], ProbeConfig())
+    assert ON_VAL in scores["notes"] and ON_VAL in " ".join(str(scores).split())
+    assert stored_result([tmp_path / "run"], data.open()) is not None
+    assert stored_result([tmp_path / "run"], pack) is None
 
 
 def test_rows_of_two_joined_packs_keep_their_ids(pack: Pack, turned: Pack) -> None:

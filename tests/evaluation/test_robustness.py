@@ -25,6 +25,7 @@ from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.recipes import recipe
 from mvitac.run import Optim
+from mvitac.system.files import read_json
 from mvitac.training.loop import train
 from support.small_plans import ROWS, small
 
@@ -206,6 +207,8 @@ def test_in_a_comparison_and_on_the_command_line(
     session = ProbeConfig(tasks=("pattern",))
     work = lay_out(plan, pack, tmp_path, session)
     do_all(work, 1, lambda line: None)
+    stress = read_json(work.jobs[0].out / "stress.json", "scores")
+    assert {record["leak"] for record in stress["records"]} == {""}
     text = write_tables(gather(work, tmp_path, session), tmp_path)[0].read_text()
     block = text[text.index("**vision missing**") : text.index("**touch missing**")]
     assert "| MViTac | both |" in block and "| touch |" not in block and "untrained" not in block

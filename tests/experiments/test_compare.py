@@ -30,7 +30,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.pack import PackConfig
+from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.evaluation.score_text import pipes
@@ -40,9 +40,10 @@ from mvitac.experiments.cross_validation import lay_out_folds
 from mvitac.experiments.jobs import do, do_all
 from mvitac.experiments.paper_plans import ABLATION, PLANS, TABLE1, TABLE2, find_plan
 from mvitac.experiments.plan import Plan, Row, changed, setting, slug
-from mvitac.experiments.table import lines_of
+from mvitac.experiments.table import as_printed, lines_of
 from mvitac.experiments.table_formats import _tex, comma, latex, markdown, write_tables
 from mvitac.recipes import RECIPES, recipe
+from mvitac.registry import from_json
 from mvitac.system.files import write_json
 from mvitac.system.locks import Busy, hold_lock
 from mvitac.training.loop import Interrupted, train
@@ -317,6 +318,9 @@ def test_printed_numbers_stand_beside_the_same_split_probe_and_positives(
     for cost_ in result["cost"]:
         cost_["pairs_of"] = pairs if cost_["row"] == "MViTac" else "one row"
     lines = lines_of(result)
+    plan = from_json(Plan, result["plan"], "plan")
+    assert as_printed(result, plan) == (data == "touch-and-go (official)")
+    assert not as_printed({**result, "notes": [ON_VAL]}, plan)
     cells = [(line.source, task, cell["printed"]) for line in lines for task, cell in line.cells.items()]
     found = {(source, task): printed for source, task, printed in cells if printed}
     same = probe == "paper" and data == "touch-and-go (official)"

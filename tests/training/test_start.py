@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
+from safetensors.torch import save_file
 
 import mvitac
 from mvitac.cli.main import main
@@ -18,7 +19,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.publish import publish
-from mvitac.evaluation.leaks import read_sources
+from mvitac.evaluation.leaks import read_sources, weights_sources
 from mvitac.experiments.plan import Plan, Row
 from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
@@ -212,6 +213,22 @@ def test_leaks_through_ancestors_are_refused_and_marked(
             assert " LEAK" in capsys.readouterr().out
     card = " ".join((chain["art"] / "README.md").read_text().split())
     assert "Started from the weights of b " in card and " LEAK" in card
+
+
+def test_weights_of_a_file_are_a_leak_that_cannot_be_excluded(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With ``--encoder.weights FILE``, too: nothing says what the file was trained on."""
+    encoder = EncoderConfig(trunk="test_resnet.r160_in1k", weights="scratch")
+    file = tmp_path / "trunk.safetensors"
+    save_file(build_trunk(encoder, 3).state_dict(), file)
+    run = smoke(pack, steps=1, eval_every=0)
+    train(replace(run, encoder=replace(encoder, weights=str(file))), tmp_path / "run", quiet=True)
+    said = capsys.readouterr().err
+    assert said.startswith("mvitac: warning: nothing says what ") and "trunk.safetensors was trained on" in said
+    assert main(["probe", str(tmp_path / "run"), "--tasks", "pattern", "--no-controls"]) == 0
+    assert " LEAK?" in capsys.readouterr().out
+    assert weights_sources(replace(run, encoder=encoder)) == []
 
 
 def test_pretrain_warns_of_seen_test_rows(

@@ -21,7 +21,7 @@ from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, label_controls, pixel_controls
 from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.features import features
-from mvitac.evaluation.leaks import UNKNOWN, Scored
+from mvitac.evaluation.leaks import Scored, declared_leak
 from mvitac.evaluation.probe import joined, names_in, probe_all, split_rows
 from mvitac.evaluation.robustness import few_labels
 from mvitac.evaluation.scores import pool
@@ -151,14 +151,8 @@ class Entry:
         for place, model in zip(self.places, self.models, strict=True):
             own = isinstance(model, ExternalModel)
             sources = None if own else check_unseen([Path(place)], [model], pack, [], allow_leak=True)[0]
-            found.append(self._declared(names) if sources is None else Scored(pack).leak(sources, rows))
+            found.append(declared_leak(self.trained_on, names) if sources is None else Scored(pack).leak(sources, rows))
         return found
-
-    def _declared(self, names: Sequence[str]) -> str:
-        if self.trained_on is None:
-            return UNKNOWN
-        named = [name for name in names if name.lower() in self.trained_on.lower()]
-        return f"{named[0]} was in its owner's training, which rows is not known" if named else ""
 
 
 def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key: str) -> Iterator[dict[str, Any]]:

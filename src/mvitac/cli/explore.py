@@ -1,5 +1,6 @@
 """``mvitac explore``: a local page that shows what a run has learned."""
 
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +51,7 @@ def explore(argv: list[str]) -> None:
             raise
         raise ValueError("the explorer needs gradio: pip install -e '.[explore]' in mvitac's clone") from None
     print(f"explorer: http://{options.host}:{options.port or 7860} (or the next free port; Ctrl-C ends it)", flush=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C, which deletes uploaded pictures
     serve(blocks, host=options.host, port=options.port)
 
 

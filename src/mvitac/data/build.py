@@ -89,14 +89,15 @@ def build(
 
 
 def _clean_up(out: Path, request: dict[str, Any]) -> bool:
-    """Delete what a killed build of the same request left beside the finished pack ``out``; return whether it did."""
+    """Delete what a killed build left beside the finished pack ``out``; return whether it was of the same request."""
     partial = out.with_name(out.name + ".partial")
-    if not partial.exists() or (partial / "pack").exists():
+    if (partial / "pack").exists():
         return False
     meta = read_json(out / "pack.json", "a pack's description")
     if not isinstance(meta, dict) or {name: meta.get(name) for name in request} != json.loads(json.dumps(request)):
         return False
-    shutil.rmtree(partial)
+    if partial.exists():
+        shutil.rmtree(partial)
     return True
 
 

@@ -21,6 +21,21 @@ def row_hashes(pack: Pack) -> tuple[np.ndarray, np.ndarray]:
     return _hash(ids, name, False), _hash(groups, name, weak)
 
 
+def image_sums(pack: Pack) -> np.ndarray:
+    """uint64 [N]: the checksums (CRC-32) of all images of each row as one number; 0 where the pack has none.
+
+    Rows with the same images, stored alike at one size, have the same number, whatever their ids are.
+    """
+    if pack.parts:
+        return np.concatenate([*map(image_sums, pack.parts.values())])
+    found = np.zeros(pack.num, np.uint64)
+    names = [f"crc_{modality}" for modality in sorted(pack.spec.modalities)]
+    if set(names) <= set(pack.table.column_names):
+        for name in names:
+            found = found << np.uint64(32) | pack.column(name).astype(np.uint64)
+    return found
+
+
 def number_hint(name: str, pack: Pack) -> str:
     """What to do if rows of ``pack`` are taken for those of other data of this ``name``; "" if that cannot be.
 

@@ -1,7 +1,7 @@
 """Packs as datasets: a folder on disk (``pack``) or shards at a URL (``stream``)."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -10,6 +10,9 @@ import pyarrow as pa
 from mvitac.data.pack import Pack
 from mvitac.datasets.base import DatasetConfig
 from mvitac.system.files import cache_dir
+
+ON_VAL = "scores are on split val (--data.score-on val); split test is hidden"
+"""The note beside all scores of such data."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +36,7 @@ class PackConfig(DatasetConfig):
             for name in pack.spec.split_columns:
                 column = [{"test": "hidden", "val": "test"}.get(split, split) for split in pack.column(name)]
                 pack.table = pack.table.set_column(pack.table.schema.get_field_index(name), name, pa.array(column))
+            pack.spec = replace(pack.spec, notes=(*pack.spec.notes, ON_VAL))
         return pack
 
 

@@ -229,8 +229,8 @@ def read_probes(folder: Path, manifest: dict[str, Any], model: Model) -> dict[st
         if unknown := set(info.modalities) - set(model.encoders):
             raise ValueError(f"{path}: probe {info.name} needs {unknown}, which this model has no encoder for")
         dim = sum(int(model.encoders[m].num_features) for m in info.modalities)  # type: ignore[arg-type]
-        weight = tensors[f"{info.name}.weight"]
-        if weight.shape[-1] != dim:
-            raise ValueError(f"{path}: probe {info.name} reads {weight.shape[-1]} features, the model gives {dim}")
-        probes[info.name] = LinearProbe(info, weight, tensors[f"{info.name}.bias"])
+        probe = LinearProbe(info, tensors[f"{info.name}.weight"], tensors[f"{info.name}.bias"])
+        if probe.weight.shape[1] != dim:
+            raise ValueError(f"{path}: probe {info.name} reads {probe.weight.shape[1]} features, the model gives {dim}")
+        probes[info.name] = probe
     return probes

@@ -35,7 +35,13 @@ def card(model: Model, manifest: dict[str, Any]) -> str:
         "",
     ]
     about = _about(model, learned["name"], data["name"], manifest["scores"])
-    return "\n".join([*header, *about, *_usage(manifest["preprocessing"]), *end])
+    return "\n".join(map(_harmless, [*header, *about, *_usage(manifest["preprocessing"]), *end]))
+
+
+def _harmless(line: str) -> str:
+    """One line of Markdown in which labels and notes of the data make no HTML, image, link or terminal escape."""
+    text = "".join(c if c.isprintable() else " " for c in line)
+    return text.replace("<", "&lt;").replace("](", r"]\(")
 
 
 def _start(start: dict[str, Any] | None) -> list[str]:

@@ -81,7 +81,10 @@ class Engine:
         from_json(tuple[str, ...], self.sensors, "sensors")
         self._call = open_engine(folder, self.meta["kind"], self.meta["precision"], threads)
         check = safetensors.numpy.load_file(folder / CHECK)
-        found = self(**{m: check[f"input_{m}"] for m in self.inputs})
+        try:
+            found = self(**{m: check[f"input_{m}"] for m in self.inputs})
+        except (RuntimeError, ValueError) as error:  # the model has other inputs than export.json says
+            raise ValueError(f"{folder} cannot be run ({brief(error)}): export it again") from None
         for name in (n for n in self.meta["outputs"] if n.startswith("embedding_")):
             least = float(cosines(found[name], check[name]).min())
             if not least >= self.meta["tolerance"]["min_cosine"]:

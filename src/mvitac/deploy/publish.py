@@ -13,7 +13,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
 from mvitac.deploy.card import card
-from mvitac.evaluation.controls import Records, controls_of
+from mvitac.evaluation.controls import Records, controls_of, scratch
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
@@ -23,7 +23,7 @@ from mvitac.evaluation.sensors import sensors_of
 from mvitac.evaluation.value_scores import error_by_range
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.nn.encoders import SCRATCH, build_trunk
+from mvitac.nn.encoders import build_trunk
 from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import to_json
 from mvitac.run import load_run
@@ -112,11 +112,12 @@ def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, 
 
 def _controls(model: Model, pack: Pack, records: Records) -> Records:
     """The controls of the (task, modality) of ``records``. Without its weights, the ImageNet trunk is left out."""
-    run, controls = model.run, []
+    # The initial weights that an artifact names may be any file or download.
+    run, controls = scratch(model.run) if model.foreign else model.run, []
     try:
         build_trunk(run.encoder, 3)
     except ValueError:
-        run = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
+        run = scratch(run)
     sources: dict[tuple[str, ...], list[AnyTask]] = {}
     for task in pack.spec.all_tasks:
         sources.setdefault(tuple(r["modality"] for r in records if r["task"] == task.name), []).append(task)

@@ -216,7 +216,9 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
         result = read_json(paths[0] / "probe.json", "a probe result")
         asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
         scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
-        same = result["pack"] == pack.digest and result["models"] == _digests(paths)
+        # Of one pack, the notes tell scores on val from those on test.
+        same = (result["pack"], result["notes"]) == (pack.digest, list(pack.spec.notes))
+        same &= result["models"] == _digests(paths)
     except (ValueError, KeyError, TypeError) as error:  # 0.1.0 wrote the scores of the run alone
         if isinstance(error, ValueError) and (paths[0] / "probe.json").exists():
             print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)

@@ -1,14 +1,15 @@
 """Test rows that a model was trained on: what a run learned from is kept beside it, and compared with what is scored.
 
     <run>/trained_on.safetensors    for each source i: <i>.ids and <i>.groups, sorted hashes (uint64) of the ids and groups
-                                    of the rows trained on; its name in the header. sha256: digest of all
+                                    of the rows trained on, and <i>.images, their images' checksums, which older files
+                                    lack; its name in the header. sha256: digest of all
 
 The first source of a run is its own training rows. A run that starts from another model's weights adds the sources of that
 model. A source without rows stands for weights of which nothing says what they were trained on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,16 @@ import safetensors
 import safetensors.numpy
 
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import row_hashes
+from mvitac.data.row_hashes import image_sums, row_hashes
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.model_files import is_foreign
+from mvitac.nn.encoders import IMAGENET, SCRATCH
 from mvitac.run import Run
 from mvitac.system.files import SEAL, brief, digest, write_atomic
 
 FILE = "trained_on.safetensors"
+KEYS = ("ids", "groups", "images")
 UNKNOWN = "unknown"  # a leak that cannot be checked, because nothing says what the run was trained on
 
 
@@ -35,11 +38,13 @@ class Source:
     name: str  # name of the dataset
     ids: np.ndarray  # uint64, sorted: hashes of the rows' ids
     groups: np.ndarray  # uint64, sorted: hashes of the rows' groups
+    images: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint64))  # uint64, sorted: ``image_sums``
 
 
 def source_of(pack: Pack, rows: np.ndarray) -> Source:
     """The source that pack ``rows`` are."""
-    return Source(pack.spec.name, *(np.unique(found[rows]) for found in row_hashes(pack)))
+    ids, groups, images = (np.unique(found[rows]) for found in (*row_hashes(pack), image_sums(pack)))
+    return Source(pack.spec.name, ids, groups, images[images > 0])
 
 
 def unknown_source(name: str) -> Source:
@@ -47,12 +52,18 @@ def unknown_source(name: str) -> Source:
     return Source(name, np.zeros(0, np.uint64), np.zeros(0, np.uint64))
 
 
+def weights_sources(run: Run) -> list[Source]:
+    """What the file of ``--encoder.weights`` learned from, if the run starts from one: nothing says it."""
+    weights = run.encoder.weights
+    return [] if weights in (IMAGENET, SCRATCH) else [unknown_source(Path(weights).name)]
+
+
 def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:
     """``own`` and those of ``ancestors`` that add rows or groups to the ones before them."""
     found = [own]
     for source in ancestors:
         if len(source.ids):
-            known = (np.isin(source.ids, o.ids).all() and np.isin(source.groups, o.groups).all() for o in found)
+            known = (all(np.isin(getattr(source, key), getattr(o, key)).all() for key in KEYS) for o in found)
         else:
             known = (not len(other.ids) and other.name == source.name for other in found)
         if not any(known):
@@ -62,7 +73,7 @@ def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:
 
 def write_sources(folder: Path, sources: Sequence[Source]) -> None:
     """Write what the run in ``folder`` learns from."""
-    arrays = {f"{i}.{key}": getattr(source, key) for i, source in enumerate(sources) for key in ("ids", "groups")}
+    arrays = {f"{i}.{key}": getattr(source, key) for i, source in enumerate(sources) for key in KEYS}
     arrays[SEAL] = _digest(sources)
     data = safetensors.numpy.save(arrays, metadata={str(i): source.name for i, source in enumerate(sources)})
     write_atomic(folder / FILE, lambda file: file.write(data))
@@ -70,7 +81,8 @@ def write_sources(folder: Path, sources: Sequence[Source]) -> None:
 
 def _digest(sources: Sequence[Source]) -> np.ndarray:
     """uint8 [32]"""
-    content = [[source.name, source.ids.tolist(), source.groups.tolist()] for source in sources]
+    each = ([source.name, *(getattr(source, key).tolist() for key in KEYS)] for source in sources)
+    content = [one if one[-1] else one[:-1] for one in each]  # older files have no images
     return np.frombuffer(bytes.fromhex(digest(content)), np.uint8)
 
 
@@ -86,7 +98,8 @@ def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list
                 names = file.metadata()
                 tensors = file.get_tensor
                 seal = tensors(SEAL) if SEAL in file.keys() else None  # noqa: SIM118 # 0.1.0 wrote none
-                found = [Source(names[i], tensors(f"{i}.ids"), tensors(f"{i}.groups")) for i in sorted(names, key=int)]
+                keys = [key for key in KEYS if f"0.{key}" in file.keys()]  # noqa: SIM118
+                found = [Source(names[i], *(tensors(f"{i}.{key}") for key in keys)) for i in sorted(names, key=int)]
             if seal is not None and not np.array_equal(seal, _digest(found)):
                 raise ValueError("it does not match its digest")
             return found
@@ -95,7 +108,7 @@ def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list
     own = pack if pack.digest == digest else _own_pack(folder, run)
     if own is None or own.digest != digest:
         return None
-    return [source_of(own, run.method.training_rows(own))]
+    return [source_of(own, run.method.training_rows(own)), *weights_sources(run)]
 
 
 def _own_pack(folder: Path, run: Run) -> Pack | None:
@@ -113,7 +126,7 @@ class Scored:
     """The rows of a pack that are scored, to be compared with what models learned from."""
 
     def __init__(self, pack: Pack) -> None:
-        self.pack, (self._ids, self._groups) = pack, row_hashes(pack)
+        self.pack, (self._ids, self._groups), self._images = pack, row_hashes(pack), image_sums(pack)
 
     def leak(self, sources: Sequence[Source] | None, rows: np.ndarray) -> str:
         """Say which of the test ``rows``, and how many of their groups, are in ``sources``; "" if none is.
@@ -125,8 +138,8 @@ class Scored:
         found = []
         for source in sources:
             groups = np.unique(self._groups[rows])
-            both = (self._ids[rows], source.ids), (groups, source.groups)
-            num_rows, num_groups = (int(np.isin(a, b).sum()) for a, b in both)
+            seen = np.isin(self._ids[rows], source.ids) | self._same_images(rows, source)
+            num_rows, num_groups = int(seen.sum()), int(np.isin(groups, source.groups).sum())
             if num_rows or num_groups:
                 by = self.pack.spec.group_by
                 found.append(
@@ -135,6 +148,28 @@ class Scored:
                 )
         unknown = any(not len(source.ids) for source in sources)
         return "; ".join(found) or (UNKNOWN if unknown else "")
+
+    def _same_images(self, rows: np.ndarray, source: Source) -> np.ndarray:
+        """bool [rows]: whether all images of a row were trained on. Checksums of single images may be equal by chance."""
+        sums = self._images[rows]
+        same = np.isin(sums, source.images)
+        chance = len(rows) * len(source.images) / 2**32 if len(sums) and sums.max() < 2**32 else 0.0
+        return same & (same.sum() > 10 * chance)
+
+
+def declared_leak(trained_on: str | None, names: Sequence[str]) -> str:
+    """The leak of an encoder whose owner only names what it was trained on, for data of these ``names``.
+
+    ``UNKNOWN`` if the owner does not. Blanks, signs and upper case do not count: "Touch and Go" is "touch-and-go".
+    """
+    if trained_on is None or trained_on == UNKNOWN:
+        return UNKNOWN
+    named = [name for name in names if _letters(name) and _letters(name) in _letters(trained_on)]
+    return f"{named[0]} was in its owner's training, which rows is not known" if named else ""
+
+
+def _letters(text: str) -> str:
+    return "".join(filter(str.isalnum, text.lower()))
 
 
 def leak_mark(leak: str) -> str:

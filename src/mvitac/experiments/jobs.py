@@ -136,7 +136,8 @@ def _do(job: Job, pack: Pack | None, quiet: bool, loggers: tuple[Logger, ...]) -
     if job.stress:
         records = stress(load(job.out), pack, *chosen(pack, job.session))
         own = {"source": job.run.method.name, "seed": job.run.seed, "run": str(job.out)}
-        found = {"asked": job.asked, "records": [{**own, **record} for record in records]}
+        leaks = {r["task"]: r["leak"] for r in result["records"] if "run" in r}
+        found = {"asked": job.asked, "records": [{**own, **r, "leak": leaks[r["task"]]} for r in records]}
         write_json(job.out / "stress.json", found, sealed=True)
     scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
     write_json(job.out / "scores.json", scores, sealed=True)

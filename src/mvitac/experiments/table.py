@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from mvitac.datasets.pack import ON_VAL
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
 from mvitac.evaluation.intervals import paired_difference
@@ -70,9 +71,15 @@ def target_lines(result: dict[str, Any], probe: str | None = None) -> dict[str, 
     return found
 
 
+def as_printed(result: dict[str, Any], plan: Plan) -> bool:
+    """Whether the test rows are the paper's: its split, scored on test, one frame at a time."""
+    windows = plan.data is not None and plan.data.frame_window().active
+    return result["data"] == plan.printed_on and ON_VAL not in result.get("notes", ()) and not windows
+
+
 def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, source: str) -> float | None:
     """The paper's number, if it has one for this split, of positives from the same image."""
-    if result["data"] != plan.printed_on:
+    if not as_printed(result, plan):
         return None
     label = source.removesuffix(END_TO_END)
     printed = {row.label: row.printed for row in plan.rows}.get(label, {}).get(modality, {})

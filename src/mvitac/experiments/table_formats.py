@@ -14,7 +14,7 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
 from mvitac.evaluation.scores import by_cell
 from mvitac.experiments.plan import Plan
-from mvitac.experiments.table import Cell, Line, lines_of, stresses_of, target_lines
+from mvitac.experiments.table import Cell, Line, as_printed, lines_of, stresses_of, target_lines
 from mvitac.registry import from_json
 from mvitac.report.figures import Dot, comparison, to_png
 from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
@@ -107,7 +107,7 @@ def _preface(result: dict[str, Any], plan: Plan, lines: Sequence[Line], shown: b
         text.append(f"{folds}: every test {result['group_by']} is scored once{unseen}.")
     if shown:
         text.append(f'"printed" is the paper\'s number on {plan.printed_on}, by the same probe and positives.')
-    elif result["data"] == plan.printed_on and plan.probes[0] != "paper":
+    elif as_printed(result, plan) and plan.probes[0] != "paper":
         text.append("The paper's numbers are of its own probe: `--probes paper` shows them.")
     text += [f"Note: {note}." for note in _notes(result)]
     if result["leaks"]:

@@ -165,13 +165,17 @@ def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
     """A random permutation of 0..num-1.
 
     With ``groups`` [num], one row of each group comes first, then a second row of each group, and so on. Any sequence not
-    longer than the number of groups then has hardly two rows of one group.
+    longer than the number of groups then has hardly two rows of one group. Groups of several sizes are spread over the
+    whole length instead (``spread_order``), as the largest would fill the last batches.
     """
     rng = np.random.default_rng(seed)
     order = rng.permutation(num)
     if groups is None:
         return order
-    return order[np.argsort(_occurrences(groups[order])[0], kind="stable")]
+    occurrence, _, counts = _occurrences(groups[order])
+    if counts.min() < counts.max():
+        return spread_order(num, groups, seed)
+    return order[np.argsort(occurrence, kind="stable")]
 
 
 def spread_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:

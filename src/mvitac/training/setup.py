@@ -14,7 +14,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.leaks import FILE, source_of, with_ancestors, write_sources
+from mvitac.evaluation.leaks import FILE, source_of, weights_sources, with_ancestors, write_sources
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model
@@ -104,12 +104,12 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
             record |= {"start": taken}
             for line in [] if quiet else [describe_start(taken)]:
                 print(f"mvitac: {line}", file=sys.stderr)
-            if found := warning(start_weights, pack):
-                print(f"mvitac: warning: {found}", file=sys.stderr)
+        if found := warning(run, start_weights, pack):
+            print(f"mvitac: warning: {found}", file=sys.stderr)
         write_json(out / "run.json", {**record, **here, **provenance()}, sealed=True)
     if world.writes and not (out / FILE).exists():
-        own = source_of(pack, rows)
-        write_sources(out, with_ancestors(own, start_weights.sources if start_weights else []))
+        before = [*(start_weights.sources if start_weights else []), *weights_sources(run)]
+        write_sources(out, with_ancestors(source_of(pack, rows), before))
     return setup
 
 

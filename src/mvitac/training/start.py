@@ -8,13 +8,13 @@ import numpy as np
 from torch import Tensor
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, read_sources, unknown_source
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, read_sources, unknown_source, weights_sources
 from mvitac.methods.base import Method
 from mvitac.model_files import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import FORMAT, read_safetensors
-from mvitac.run import read_record
+from mvitac.run import Run, read_record
 
 State = dict[str, Tensor]
 ANY = "any"  # key of a trunk's weights in a file that does not say which modality they are for
@@ -115,12 +115,14 @@ def describe(record: dict[str, Any]) -> str:
     return f"starts from {record['name']} (sha256 {record['digest'][:12]}): {', '.join(parts)}"
 
 
-def warning(start: Start, pack: Pack) -> str:
-    """A line on rows of split test that the start weights were trained on, or may have been; "" if there are none."""
+def warning(run: Run, start: Start | None, pack: Pack) -> str:
+    """A line on rows of split test that start weights were trained on, or may have been; "" if there are none."""
     tasks = pack.spec.all_tasks
     tested = [pack.rows("test", only=task.only, by=task.split) for task in tasks] or [pack.rows("test")]
     rows = np.unique(np.concatenate(tested))
-    leak = Scored(pack).leak(start.sources, rows) if len(rows) else ""
+    sources = [*(start.sources if start else []), *weights_sources(run)]
+    leak = Scored(pack).leak(sources, rows) if len(rows) else ""
+    path = start.init.path if start else run.encoder.weights
     if leak == UNKNOWN:
-        return f"nothing says what {start.init.path} was trained on: leaks of test rows cannot be excluded"
-    return leak and f"{start.init.path} has seen what this data tests: {leak}; `mvitac probe` will need --allow-leak"
+        return f"nothing says what {path} was trained on: leaks of test rows cannot be excluded"
+    return leak and f"{path} has seen what this data tests: {leak}; `mvitac probe` will need --allow-leak"

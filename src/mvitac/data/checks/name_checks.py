@@ -10,6 +10,7 @@ from mvitac.data.checks.finding import Finding, some
 from mvitac.data.checks.table_checks import KEYS, sides_of
 from mvitac.data.pack import Pack
 
+MAX_SHOWN = 20
 PREFIXED = ("group", "touch_group")  # columns in which a mix writes <part>/ before each name
 
 
@@ -64,4 +65,4 @@ def _key(name: str) -> str:
 def _shown(alike: list[list[str]]) -> str:
     # ascii() shows what looks the same on the screen: Unicode forms, non-breaking blanks.
     quoted = [" and ".join(repr(n) if n.isprintable() and n.isascii() else ascii(n) for n in names) for names in alike]
-    return some(quoted)
+    return some(quoted, MAX_SHOWN)
