@@ -110,7 +110,7 @@ class Run:
     sampler: Literal["shuffle", "one-per-touch", "spread"] = "shuffle"
     """Order of the rows. shuffle: random permutation (paper). The others keep near-duplicates from being negatives of each
     other: spread distributes the rows of a touch group over the whole epoch. one-per-touch takes one row of each group,
-    then a second one, and so on; if groups differ in size, the rows of large ones gather at the end of the epoch."""
+    then a second one, and so on, if all groups have the same size, and is the same as spread if not."""
     positives: Literal["same-image", "same-press", "same-touch", "same-touch-pairs"] = "same-image"
     """Which image is the positive. same-image: another view of the same row (paper). same-press: a view of another moment
     of the same press (rows with the same value in column press). same-touch: a view of another row of the same touch group:
