@@ -293,7 +293,7 @@ def test_method_without_shared_space_beside_one_with(tmp_path: Path) -> None:
 def test_the_comparison_sorts_methods_and_shares_the_palette() -> None:
     """Best method on top, controls below all methods, one colour per modality in every figure."""
     dots = [
-        figures.Dot("weak", "touch", False, {"mean": 0.2, "low": 0.1, "high": 0.3, "printed": None}),
+        figures.Dot("weak", "touch", False, {"mean": 0.2, "low": 0.1, "high": 0.3, "printed": None, "leak": "3 of 4"}),
         figures.Dot("strong", "touch", False, {"mean": 0.3, "low": 0.2, "high": 0.4, "printed": None}),
         figures.Dot("strong", "both", False, {"mean": 0.6, "low": 0.5, "high": 0.7, "printed": 0.65}),
         figures.Dot("pixels", "touch", True, {"mean": 0.9, "low": 0.8, "high": 1.0, "printed": None}),
@@ -301,12 +301,17 @@ def test_the_comparison_sorts_methods_and_shares_the_palette() -> None:
     ]
     axes = figures.comparison({"task": dots}).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["pixels", "weak", "strong"]  # from below
+    assert [(text.get_text(), text.xy[0]) for text in axes.texts] == [("LEAK", 20)]
     handles, labels = axes.get_legend_handles_labels()
     colours = {label: handle.get_color() for handle, label in zip(handles, labels, strict=True)}
     assert colours["touch"] == figures.colour("blue") and colours["both"] == figures.colour("green")
     assert labels.count("printed") == 1 and "majority" in labels
     whole = axes.get_ylim()
-    bars = figures.bars("x", {"touch": {"a": {"mean": 0.5, "low": 0.4, "high": 0.6}}}, {"majority": 0.1}, "%").axes[0]
+    bars = figures.bars(
+        "x", {"touch": {"a": {"mean": 0.5, "low": 0.4, "high": 0.6, "leak": "3 of 4"}}}, {"majority": 0.1}, "%"
+    )
+    bars = bars.axes[0]
+    assert "50.0 LEAK" in [text.get_text() for text in bars.texts]
     dashed = [line for line in bars.lines if line.get_linestyle() == "--"]
     assert whole and len(dashed) == 1 and min(dashed[0].get_ydata()) > 0  # below the group's name at y = 0
 

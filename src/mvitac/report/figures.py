@@ -24,6 +24,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
+from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import percent
 from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, colour
 
@@ -79,7 +80,7 @@ def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], 
 
 @matplotlib.rc_context(STYLE)
 def bars(
-    title: str, groups: Mapping[str, Mapping[str, Mapping[str, float]]], lines: Mapping[str, float], what: str
+    title: str, groups: Mapping[str, Mapping[str, Mapping[str, Any]]], lines: Mapping[str, float], what: str
 ) -> Figure:
     """Horizontal bars in percent with 95 % whiskers. Methods have their modality's colour, controls are grey.
 
@@ -133,7 +134,7 @@ def _bar(axes: Axes, y: float, source: str, cell: Mapping[str, Any], hue: str, l
     look: dict[str, Any] = {"va": "center", "textcoords": "offset points"}
     look["fontweight"] = "normal" if source in CONTROL_GREYS else "bold"
     look["bbox"] = {"facecolor": colour("card"), "edgecolor": "none", "pad": 0.5}  # no line runs through the value
-    axes.annotate(percent(cell["mean"]), (high, y), xytext=(5, 0), **look)
+    axes.annotate(percent(cell["mean"]) + leak_mark(cell.get("leak", "")), (high, y), xytext=(5, 0), **look)
 
 
 @dataclass(frozen=True)
@@ -191,6 +192,9 @@ def _dot(axes: Axes, dot: Dot, rows: Sequence[str]) -> None:
         axes.plot([100 * max(LEAST, v) for v in (low, dot.cell["high"])], [y, y], color=hue, linewidth=1.6)
     marker = "o" if mean >= LEAST else "<"  # R2 may be lower than the axis goes
     axes.plot(100 * max(LEAST, mean), y, marker, markersize=4.5, color=hue, label=dot.modality)
+    if mark := leak_mark(dot.cell.get("leak", "")).strip():
+        place = (100 * max(LEAST, mean), y)
+        axes.annotate(mark, place, (5, 0), textcoords="offset points", va="center", fontsize=7, color=colour("ink"))
     if dot.cell.get("printed") is not None:
         axes.plot(100 * dot.cell["printed"], y, "x", markersize=6, color=hue, alpha=0.6, label="printed")
 
