@@ -56,13 +56,12 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
 
     - End-to-end keys: gradients through both views instead of a momentum tower, as in SimCLR, and inter-modal losses on all
       pairs of views. With all steps of `quick`: 11 points of category, 12 of rough, and almost twice the retrieval score
-      of momentum keys. Steps take 1.4 times as long (docs/results/materials.md).
-    - No flips of touch, which no real press shows. Together with all pairs of views 3 points of category on top of
-      end-to-end keys in an earlier test (docs/results/recipes.md).
+      of momentum keys. Steps take 1.4 times as long (docs/results/materials.md). All pairs alone: no difference.
+    - No flips of touch, which no real press shows: 4 points of category with all steps of `quick`.
     - AdamW with lr 1e-3, warm-up and cosine schedule (MoCo v3): Adam at a constant .03 destroys the ImageNet weights. Also
       from scratch, 8 points of category (one seed). Biases and BatchNorm are not decayed.
     - BatchNorm in the heads (SimCLR v2, MoCo v3): prevents an early collapse of the embeddings with small batches. No
-      difference (three seeds: without it +1.2).
+      difference (three seeds: without it +.9).
     - Momentum .99 rising to 1 (BYOL, MoCo v3), for methods that have one: the keys converge with the queries. No
       difference from 0 to .999 (one seed).
     - Rows of a touch are spread over the epoch: consecutive frames of one touch are near-duplicates and wrong as negatives.
@@ -77,7 +76,7 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
     - All four losses, also with same-image positives: on simulated grasps, training without the intra-modal losses gains 5.7
       points (docs/results/grasps.md). This was seen on test data and is not adopted until another dataset confirms it.
     - bf16 where the hardware computes it, else fp32 (precision auto): where torch emulates bf16, a step takes ten times as
-      long or more. The scores of the two differ in one of nine cases only (docs/speed.md).
+      long or more. Their scores do not differ (three seeds, docs/speed.md).
     """
     phased = _is_phased(data, phased)
     base = paper(data, phased)

@@ -412,7 +412,7 @@ def damage_frames(path: Path) -> None:
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "not an image": (lambda path: path.write_text("hello"), "cannot"),
-    "truncated": (damage_truncated, "its end is missing"),
+    "truncated": (damage_truncated, "Premature end of JPEG file"),
     "broken png": (damage_png, "cannot"),
     "animation": (damage_frames, "2 frames"),
     "float": (lambda path: Image.fromarray(np.ones((8, 8), np.float32)).save(path, "TIFF"), "floating-point"),

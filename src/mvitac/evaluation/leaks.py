@@ -138,7 +138,8 @@ class Scored:
         found = []
         for source in sources:
             groups = np.unique(self._groups[rows])
-            seen = np.isin(self._ids[rows], source.ids) | self._same_images(rows, source)
+            seen = np.isin(self._ids[rows], source.ids)
+            seen[~seen] = self._same_images(rows[~seen], source)
             num_rows, num_groups = int(seen.sum()), int(np.isin(groups, source.groups).sum())
             if num_rows or num_groups:
                 by = self.pack.spec.group_by
@@ -150,10 +151,15 @@ class Scored:
         return "; ".join(found) or (UNKNOWN if unknown else "")
 
     def _same_images(self, rows: np.ndarray, source: Source) -> np.ndarray:
-        """bool [rows]: whether all images of a row were trained on. Checksums of single images may be equal by chance."""
+        """bool [rows]: whether all images of a row were trained on, and one of them shows something.
+
+        Checksums of single images may be equal by chance: as few as that are no leak.
+        """
         sums = self._images[rows]
         same = np.isin(sums, source.images)
         chance = len(rows) * len(source.images) / 2**32 if len(sums) and sums.max() < 2**32 else 0.0
+        images = self.pack.images.values()
+        same[same] = [any(np.ptp(one[row]) for one in images) for row in rows[same].tolist()]
         return same & (same.sum() > 10 * chance)
 
 
