@@ -143,10 +143,8 @@ class Scored:
             num_rows, num_groups = int(seen.sum()), int(np.isin(groups, source.groups).sum())
             if num_rows or num_groups:
                 by = self.pack.spec.group_by
-                found.append(
-                    f"{num_rows} of {len(rows)} test rows and {num_groups} of {len(groups)} test {by}s were trained on"
-                    f" ({source.name})"
-                )
+                grouped = f" and {num_groups} of {len(groups)} test {by}s" if by != "row" else ""
+                found.append(f"{num_rows} of {len(rows)} test rows{grouped} were trained on ({source.name})")
         unknown = any(not len(source.ids) for source in sources)
         return "; ".join(found) or (UNKNOWN if unknown else "")
 
