@@ -581,6 +581,7 @@ BAD: dict[str, tuple[Change | None, dict[str, Any], str]] = {
         {"touch": ("vision",)},
         r"column .vision. would be both vision and touch: give every image",
     ),
+    "vision is touch in one row": (one(4, left="./vision/03.png"), {}, r"row 4 has one image in two of the columns"),
 }
 
 

@@ -156,8 +156,8 @@ class Scored:
         sums = self._images[rows]
         same = np.isin(sums, source.images)
         chance = len(rows) * len(source.images) / 2**32 if len(sums) and sums.max() < 2**32 else 0.0
-        images = self.pack.images.values()
-        same[same] = [any(np.ptp(one[row]) for one in images) for row in rows[same].tolist()]
+        for i in np.flatnonzero(same):
+            same[i] = any(np.ptp(self.pack.images[modality][rows[i]]) for modality in self.pack.spec.modalities)
         return same & (same.sum() > 10 * chance)
 
 

@@ -3,10 +3,11 @@
 Row numbers count from 1, row indices from 0.
 """
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mvitac.data.pack_table import SPLITS
@@ -165,7 +166,7 @@ def check_present(
 
 
 def check_files(selected: Selection) -> tuple[list[int], dict[str, Stamp]]:
-    """Check that every image file exists and is not empty.
+    """Check that every image file exists and is not empty, and that no row has one image in two columns.
 
     Returns the file size of each image of each row (for the fingerprint), and the stamp of each file by its path.
     """
@@ -174,6 +175,12 @@ def check_files(selected: Selection) -> tuple[list[int], dict[str, Stamp]]:
     sizes: list[int] = []
     for i, number in enumerate(selected.numbers):
         named = [(column, found[i]) for column, found in selected.refs.items()]
+        images = [replace(ref, path=os.path.normpath(ref.path)) for _, ref in named if ref]
+        if len({*images}) < len(images):
+            raise ValueError(
+                f"{selected.manifest.at(number)} has one image in two of the columns {', '.join(selected.refs)}: each"
+                " needs an image of its own"
+            )
         named += [("background", ref) for b in selected.backgrounds for ref in b.get(number, ())]
         for column, ref in named:
             if ref is None:
