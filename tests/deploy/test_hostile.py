@@ -31,7 +31,7 @@ from mvitac.deploy.publish import publish
 from mvitac.deploy.search import Index, build
 from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.run_names import names_of
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import EncoderConfig, build_trunk
 from mvitac.system.files import digest, digest_file, read_json
 from support.training_runs import smoke
 
@@ -387,19 +387,22 @@ def test_a_probe_without_dimensions_is_refused(copy: Path, trap: Path) -> None:
         mvitac.load(str(copy))
 
 
-@pytest.mark.parametrize("weights", ["imagenet", "{trap}/w.safetensors"])
+@pytest.mark.parametrize("weights", ["imagenet", "{trap}/trunk.pth"])
 def test_weights_that_an_artifact_names_are_not_opened(
-    pack: Pack, trap: Path, tmp_path: Path, touched: list[str], weights: str
+    pack: Pack, trap: Path, tmp_path: Path, touched: list[str], monkeypatch: pytest.MonkeyPatch, weights: str
 ) -> None:
-    """Of a trunk that timm has weights for. Its controls are of random weights."""
-    encoder_ = EncoderConfig(trunk="test_resnet.r160_in1k", weights="scratch")
-    mvitac.train(replace(smoke(pack, steps=1, eval_every=0), encoder=encoder_), tmp_path / "run", quiet=True)
+    """Of a trunk that timm has weights for. The artifact's controls are of random weights."""
+    scratch = EncoderConfig(trunk="test_resnet.r160_in1k", weights="scratch")
+    torch.save(build_trunk(scratch, 3).state_dict(), trap / "trunk.pth")
+    mvitac.train(replace(smoke(pack, steps=1, eval_every=0), encoder=scratch), tmp_path / "run", quiet=True)
     made = publish(tmp_path / "run", tmp_path / "made", pack)
     forge(made, trap, run=encoder(weights=weights))
+    asked: list[str] = []
+    monkeypatch.setattr("mvitac.nn.encoders._with_imagenet", lambda trunk, arguments: asked.append(trunk))
     touched.clear()
     publish(made, tmp_path / "again", pack, allow_leak=True)
     check(list(touched), trap)
-    assert "| untrained |" in (tmp_path / "again" / "README.md").read_text()
+    assert not asked and "| untrained |" in (tmp_path / "again" / "README.md").read_text()
 
 
 def test_a_card_shows_labels_as_text() -> None:
