@@ -117,10 +117,12 @@ def describe(record: dict[str, Any]) -> str:
 
 def warning(run: Run, start: Start | None, pack: Pack) -> str:
     """A line on rows of split test that start weights were trained on, or may have been; "" if there are none."""
+    sources = [*(start.sources if start else []), *weights_sources(run)]
+    if not sources:
+        return ""
     tasks = pack.spec.all_tasks
     tested = [pack.rows("test", only=task.only, by=task.split) for task in tasks] or [pack.rows("test")]
     rows = np.unique(np.concatenate(tested))
-    sources = [*(start.sources if start else []), *weights_sources(run)]
     leak = Scored(pack).leak(sources, rows) if len(rows) else ""
     path = start.init.path if start else run.encoder.weights
     if leak == UNKNOWN:
