@@ -211,6 +211,16 @@ def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Pat
     assert stored_result([tmp_path / "run"], pack) is None
 
 
+def test_numbers_of_rows_are_no_groups(pack: Pack) -> None:
+    """Of two tables with ids, whose rows are their own groups, rows with one number are not the same."""
+    other = Pack(pack.path)
+    other.spec = replace(pack.spec, group_by="row")
+    scored, rows = Scored(other), pack.rows("train")
+    learned = source_of(other, rows)
+    assert scored.leak([replace(learned, ids=np.ones(1, np.uint64), images=np.zeros(0, np.uint64))], rows) == ""
+    assert scored.leak([learned], rows) == "72 of 72 test rows were trained on (toy)"
+
+
 def test_rows_of_two_joined_packs_keep_their_ids(pack: Pack, turned: Pack) -> None:
     joined = JoinedPack(pack, pack)
     assert (joined.own_ids == np.tile(pack.column("id"), 2)).all()

@@ -141,6 +141,8 @@ class Scored:
             seen = np.isin(self._ids[rows], source.ids)
             seen[~seen] = self._same_images(rows[~seen], source)
             num_rows, num_groups = int(seen.sum()), int(np.isin(groups, source.groups).sum())
+            if self.pack.spec.group_by == "row":
+                num_groups = 0  # its number in the table, which says nothing that the id does not
             if num_rows or num_groups:
                 by = self.pack.spec.group_by
                 grouped = f" and {num_groups} of {len(groups)} test {by}s" if by != "row" else ""
