@@ -16,16 +16,18 @@ import tempfile
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import torch
 
-from benchmarks.streaming import Noise, epoch
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
+from mvitac.data.source import Sample, Source
+from mvitac.data.spec import DataSpec
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.mix import MixConfig
 from mvitac.datasets.pack import PackConfig
@@ -39,6 +41,39 @@ from mvitac.training.step import Step
 from mvitac.training.views import load_chunks
 
 MIXES: dict[str, dict[str, Any]] = {"mix": {}, "mix, one part per batch": {"batches": "one-part"}}
+
+
+@dataclass
+class Noise(Source):
+    """Pairs of noise images, eight per touch."""
+
+    num: int
+    size: int
+
+    def spec(self) -> DataSpec:
+        words = {"name": "noise", "group_by": "touch", "licence": "none", "source": "benchmarks/mix.py"}
+        return DataSpec(vision_channels=3, touch_channels=3, tasks=(), **words)  # type: ignore[arg-type]
+
+    def items(self) -> list[str]:
+        return [str(row) for row in range(self.num)]
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"noise": [self.num, self.size]}
+
+    def read(self, item: int) -> list[Sample]:
+        pixels = np.random.default_rng(item).integers(0, 256, (2, self.size, self.size, 3), np.uint8)
+        columns = {"id": str(item), "group": str(item // 8), "split": "train"}
+        return [Sample(vision=pixels[0], touch=pixels[1], columns=columns)]
+
+
+def epoch(run: Run, pack: Pack, number: int) -> float:
+    """Return the seconds of reading the batches of one epoch."""
+    rows = run.method.training_rows(pack)
+    per_epoch, began = run.steps_per_epoch(len(rows)), time.perf_counter()
+    for batch in batches(run, pack, rows, number * per_epoch, (number + 1) * per_epoch):
+        for modality in pack.spec.modalities:
+            pack.images[modality][batch]
+    return time.perf_counter() - began
 
 
 def steps_of(run: Run) -> Callable[[int], float]:
@@ -107,7 +142,7 @@ def main() -> None:
         reading: dict[str, list[float]] = {name: [] for name in runs}
         for number in range(options.rounds):
             for name, pack in opened.items():
-                reading[name].append(epoch(runs[name], pack, number, 0.0))
+                reading[name].append(epoch(runs[name], pack, number))
         pairs = base.steps_per_epoch(options.num) * options.batch
         medians = {name: statistics.median(found) for name, found in times.items()}
         ratios = {n: statistics.median([p / t for p, t in zip(times["pack"], times[n], strict=True)]) for n in times}

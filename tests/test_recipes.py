@@ -15,7 +15,6 @@ from PIL import Image
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.sharding import write_shards
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
@@ -147,10 +146,9 @@ def test_a_recipe_takes_an_open_pack(pack: Pack) -> None:
 
 @pytest.fixture(scope="module")
 def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four simulated grasps as a pack, as shards, as files with a manifest, and as a parquet file of the Hub."""
+    """Four simulated grasps as a pack, as files with a manifest, and as a parquet file of the Hub."""
     root = tmp_path_factory.mktemp("grasps")
     pack = build(GraspsConfig(num=4, size=32).source(), root / "pack", size=32, quiet=True)
-    write_shards(pack, str(root / "stream"), quiet=True)
     rows, cells = [], []
     for i in range(pack.num):
         names = {"vision": f"v{i}.png", "left": f"l{i}.png", "right": f"r{i}.png"}
@@ -166,24 +164,21 @@ def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("name", ["pack", "stream", "folder", "hub"])
+@pytest.mark.parametrize("name", ["pack", "folder", "hub"])
 def test_grasps_have_the_recipe_of_the_simulator_however_they_are_read(
     name: str, grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The opened pack decides: in Python, and in `mvitac pretrain`, where single fields still come after the recipe."""
-    where = {"pack": "path=pack", "stream": "url=stream", "folder": "path=folder.csv", "hub": "path=hub.parquet"}
-    option, value = where[name].split("=")
-    config = find(DatasetConfig, name)(size=32, **{option: str(grasps / value) if name == "stream" else grasps / value})
+    file = {"pack": "pack", "folder": "folder.csv", "hub": "hub.parquet"}[name]
+    config = find(DatasetConfig, name)(size=32, path=grasps / file)
     for one in RECIPES:
         expected, found = recipe(one, GraspsConfig()), recipe(one, config)
         assert replace(found, data=expected.data) == expected, one
     monkeypatch.chdir(grasps)
-    words = ["--data", name, f"--data.{option}", value, "--recipe", "smoke", "--batch-size", "2", "--steps", "1"]
+    words = ["--data", name, "--data.path", file, "--recipe", "smoke", "--batch-size", "2", "--steps", "1"]
     words += ["--data.size", "32", "--quiet", "--log-every", "5", "--augment.touch.grayscale", "0.1"]
     if name in ("folder", "hub"):
         words += ["--data.test-share", "0", "--data.val-share", "0", "--data.touch-group", "touch_group"]
-    elif name == "stream":
-        words += ["--data.window", "1"]
     assert main(["pretrain", *words, "--out", str(tmp_path / "run")]) == 0
     run, _ = load_run(tmp_path / "run")
     assert (run.positives, run.log_every) == ("same-image", 5)

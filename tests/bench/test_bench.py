@@ -426,7 +426,6 @@ def test_shipped_suites_keep_their_definitions() -> None:
         (SUITE.replace('"clone" }', '"../clone" }', 1), "not a place below --data-root"),
         (SUITE.replace('"clone" }', '"/clone" }', 1), "not a place below --data-root"),
         (SUITE.replace('name = "pack" }', 'name = "pack", path = "/etc" }', 1), "names a place in 'path'"),
-        (SUITE.replace(FORM, 'data = { name = "stream", url = "http://198.51.100.7/x" }', 1), "a place in 'url'"),
         (SUITE.replace(FORM, 'data = { name = "mix", parts = ["/a", "/b"] }', 1), "a place in 'parts'"),
         (SUITE.replace(RANDOM.format(1), "external:python:antigravity:fly"), "weights=random"),
         (SUITE.replace(RANDOM.format(1), "external:timm/resnet18"), "weights=random"),

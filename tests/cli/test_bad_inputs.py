@@ -512,12 +512,6 @@ def test_out_may_not_be_written(
     refused([*command, "{tmp}/locked/out"], "locked", os.strerror(number), "choose another")
 
 
-def test_shards_without_a_place(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An empty URL is the working folder for fsspec."""
-    monkeypatch.chdir(tmp_path)
-    refused(["data", "shard", "{pack}", ""], "the URL of the shards is empty", "s3://")
-
-
 def test_cache_that_is_a_file(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     occupy(tmp_path)
     monkeypatch.setenv("MVITAC_CACHE", str(tmp_path / "file"))

@@ -101,15 +101,8 @@ COMMANDS = {
     "live": ["live", "{artifact}", "--seconds", "1"],
     "publish": ["publish", "{artifact}", "{out}"],
 }
-STREAM = data("stream", url="http://198.51.100.7/shards")
 PLACES: list[tuple[str, Change]] = [
-    *((command, STREAM) for command in COMMANDS),
-    ("export", data("stream", url="s3://bucket/shards")),
-    ("explore", data("stream", url="file://{trap}")),
-    ("probe", data("stream", url="{trap}", cache="{trap}")),
-    ("live", data("stream", url="http://198.51.100.7/shards", cache="{trap}")),
-    ("report", data("stream", url="ftp://198.51.100.7/shards")),
-    ("export", data("pack", path="{trap}")),
+    *((command, data("pack", path="{trap}")) for command in COMMANDS),
     ("explore", data("pack", path="{trap}/../trap")),
     ("probe", data("folder", path="{trap}/pairs.csv")),
     ("live", data("hub", path="{trap}")),
@@ -124,7 +117,7 @@ PLACES: list[tuple[str, Change]] = [
 
 @pytest.fixture
 def trap(tmp_path: Path) -> Path:
-    """A folder of somebody's files, as a killed streaming process leaves them: such folders are deleted by the next."""
+    """A folder of somebody's files."""
     folder = tmp_path / "trap"
     (folder / "process-0").mkdir(parents=True)
     (folder / "process-1").mkdir()

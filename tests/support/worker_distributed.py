@@ -9,7 +9,7 @@ import torch
 import torch.distributed as dist
 
 from mvitac.datasets.mix import MixConfig
-from mvitac.datasets.pack import PackConfig, StreamConfig
+from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
 from mvitac.nn.memory_bank import shard_banks
 from mvitac.system.distributed import join, synchronise_norms
@@ -41,13 +41,10 @@ def step(folder: Path) -> None:
 def train(place: str, out: Path, die_after: int, name: str) -> None:
     """The whole loop; every process dies after its ``die_after``-th batch, and notes the rows it saw.
 
-    ``place`` is a pack, a folder "shards", or the parts of a mix with batches of one part.
+    ``place`` is a pack, or the parts of a mix with batches of one part.
     """
-    pack = Path(place)
-    shards = StreamConfig(url=str(pack), cache=pack.with_name("cache"), cache_gb=1e-3, window=2)
-    data = shards if pack.name == "shards" else PackConfig(path=pack)
-    if "=" in place:
-        data = MixConfig(parts=tuple(place.split()), batches="one-part")
+    mixed = "=" in place
+    data = MixConfig(parts=tuple(place.split()), batches="one-part") if mixed else PackConfig(path=Path(place))
     real, seen = batches.make_views, []
 
     def watched(*args: object) -> object:

@@ -14,7 +14,6 @@ import safetensors.torch
 import torch
 
 from mvitac.data.pack import Pack
-from mvitac.data.sharding import write_shards
 from mvitac.datasets.mix import MixConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
@@ -96,13 +95,11 @@ def test_one_process_goes_on_where_two_stopped_and_two_where_one_did(pair: Path,
 
 @pytest.mark.slow
 def test_the_loop_shares_rows_writes_once_and_resumes_bit_for_bit(pack: Pack, tmp_path: Path) -> None:
-    """Of streamed shards; the tests below do so with packs."""
-    write_shards(pack, data := str(tmp_path / "shards"), shard_mb=0.05, quiet=True)
     straight, cut = tmp_path / "straight", tmp_path / "cut"
-    together(tmp_path, "train", data, str(straight), "99", "mvitac")
-    together(tmp_path, "train", data, str(cut), "3", "mvitac", fails=True)
+    together(tmp_path, "train", str(pack.path), str(straight), "99", "mvitac")
+    together(tmp_path, "train", str(pack.path), str(cut), "3", "mvitac", fails=True)
     assert not (cut / "model.safetensors").exists()
-    together(tmp_path, "train", data, str(cut), "99", "mvitac")
+    together(tmp_path, "train", str(pack.path), str(cut), "99", "mvitac")
     a, b = (safetensors.torch.load_file(path / "model.safetensors") for path in (straight, cut))
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     for path in (straight, cut):

@@ -21,10 +21,9 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.losses import info_nce
 from mvitac.recipes import with_method
 from mvitac.registry import default
-from mvitac.system.distributed import World
 from mvitac.training.loader import Feed
 from mvitac.training.loop import train
-from mvitac.training.sampler import Batches, batches
+from mvitac.training.sampler import batches
 from mvitac.training.views import make_views
 from support.mixes import Gel, Slice, built, mix_run
 from support.small_methods import build, small
@@ -89,14 +88,6 @@ def test_batches_of_one_part(parts: dict[str, str], sampler: Any) -> None:
     assert (kinds == kinds[:, :1]).all() and 0.35 < kinds[:, 0].mean() < 0.65
     if sampler != "shuffle":
         assert np.mean([len(set(pack.touch_groups[batch])) for batch in found]) > 5.5
-
-
-def test_processes_share_the_batch_of_one(parts: dict[str, str]) -> None:
-    run = mix_run(f"{parts['a']}:1", f"{parts['b']}:3", batch_size=8)
-    pack, found = drawn(run)
-    order = [Batches(run, pack, run.method.training_rows(pack), World(rank, 2)) for rank in (0, 1)]
-    for step, batch in enumerate(found):
-        np.testing.assert_array_equal(np.concatenate([own.own(step) for own in order]), batch)
 
 
 def test_the_order_is_a_function_of_seed_and_step(parts: dict[str, str]) -> None:

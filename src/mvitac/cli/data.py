@@ -1,4 +1,4 @@
-"""``mvitac data ...``: simulate, pack and shard data, and look at what is in a pack."""
+"""``mvitac data ...``: simulate and pack data, and look at what is in a pack."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -16,7 +16,6 @@ from mvitac.data.checks.finding import some
 from mvitac.data.notebook import measured
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
-from mvitac.data.sharding import write_shards
 from mvitac.data.spec import Task, Window, listed
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.lerobot.writer import write_lerobot
@@ -136,38 +135,6 @@ def sheet(argv: list[str]) -> None:
     picture = draw(options.seed, options.side)
     write_atomic(out, lambda file: picture.save(file, "PNG"))
     print(out)
-
-
-@dataclass(frozen=True)
-class _ShardOptions:
-    """A pack in shards, for data larger than a machine's memory or disk: shards are read whole and in sequence.
-
-    mvitac data shard PACK s3://bucket/path
-
-    mvitac pretrain --data stream --data.url s3://bucket/path --data.cache /scratch/cache --data.cache-gb 50 ...
-
-    Rows of one touch stay together, touches come in random order. An interrupted shard is written again.
-    """
-
-    pack: Positional[Path]
-    """Folder of the pack."""
-    url: Positional[str]
-    """Where the shards go: a folder, file:///..., s3://bucket/path (needs mvitac[s3]), or any other URL that fsspec
-    opens."""
-    shard_mb: float = 64
-    """Maximum size of a shard in megabytes of images, camera and touch together."""
-    seed: int = 0
-    """Seed of the order of the touches."""
-    quiet: bool = False
-    """No progress bar."""
-
-
-def shard(argv: list[str]) -> None:
-    """mvitac data shard PACK URL [--shard-mb 64]"""
-    options = parse(_ShardOptions, argv, "data shard")
-    pack = Pack(options.pack)
-    num = write_shards(pack, options.url, shard_mb=options.shard_mb, seed=options.seed, quiet=options.quiet)
-    print(f"{options.url}: {pack.num} samples in {num} shards")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ COMMANDS = {
     "demo": "demo:demo",
     "data simulate": "data:simulate",
     "data pack": "data:pack",
-    "data shard": "data:shard",
     "data info": "data:info",
     "data check": "data_check:check",
     "data sheet": "data:sheet",

@@ -1,1 +1,1 @@
-"""Packs: what a dataset is, how it is written to disk, read back, sharded and checked."""
+"""Packs: what a dataset is, how it is written to disk, read back and checked."""

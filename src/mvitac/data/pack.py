@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -32,7 +32,6 @@ from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json
 
 FORMAT = "mvitac-pack"
-SHARDED = "mvitac-shards"
 
 Images = np.ndarray | Lazy
 
@@ -50,9 +49,6 @@ class Pack:
         >>> pack.images["touch"][pack.rows("test")]
     """
 
-    format: ClassVar[str] = FORMAT
-    window: int = 0
-    """Number of shards whose rows training mixes at a time; 0 = all rows (shards: ``data/streaming.py``)."""
     parts: "Mapping[str, Pack]" = MappingProxyType({})
     """Name -> pack, for several packs that are opened as one (``data/mixed_pack.py``)."""
 
@@ -67,13 +63,14 @@ class Pack:
             if FORMAT_VERSIONS[self.store] != (version := self.meta["format_version"]):
                 raise ValueError(f"store: {self.store} is not of format {version}")
             self.digests: dict[str, str] = from_json(dict[str, str], self.meta.get("digests"), "digests")
-            files = self._files()
+            files = {f"{m}{SUFFIXES[self.store]}": m for m in self.spec.modalities}
             if sorted(self.digests) != sorted(names := ("samples.parquet", *files)):
                 raise ValueError(f"digests: expected those of {', '.join(names)}")
         except ValueError as error:
             raise ValueError(f"{self.path / 'pack.json'} is damaged ({error}): re-pack it") from None
         self.table: pa.Table = self._read_table()
-        self.images: dict[str, Images] = self._open(files)
+        read = {"raw": self._map, "jpeg": self._jpegs}[self.store]
+        self.images: dict[str, Images] = {m: read(m, self._file(name)) for name, m in files.items()}
         for name, modality in files.items() if verify else ():
             self._check_digest(name, modality)
 
@@ -82,9 +79,7 @@ class Pack:
         if not self.path.is_dir():
             raise ValueError(f"no pack at {self.path}: make one with `mvitac data simulate` or `mvitac data pack`")
         meta = read_json(path := self.path / "pack.json", "a pack's description")
-        if isinstance(meta, dict) and meta.get("format") == SHARDED != self.format:
-            raise ValueError(f"{self.path} is a pack in shards: read it with --data stream --data.url {self.path}")
-        if not isinstance(meta, dict) or meta.get("format") != self.format:
+        if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             raise ValueError(f"{path} does not describe a pack: choose a folder `mvitac data` wrote")
         if (version := meta.get("format_version")) not in FORMAT_VERSIONS.values():
             known = " and ".join(map(str, FORMAT_VERSIONS.values()))
@@ -265,42 +260,18 @@ class Pack:
             self._rows_by[of] = np.split(order, np.cumsum(np.bincount(numbers))[:-1])
         return self._rows_by[of][number]
 
-    @functools.cached_property
-    def shards(self) -> np.ndarray:
-        """int [N], number of each row's shard; a pack on disk is a single shard."""
-        return np.zeros(self.num, np.int64)
-
-    def near(self, rows: np.ndarray, num: int) -> np.ndarray:
-        """Return those of ``rows`` (ascending) that are in the first shards, which hold at least ``num`` of them.
-
-        Shards are in random order, so this is a random sample that needs few shards. A pack on disk returns all rows.
-        """
-        return rows[self.shards[rows] <= self.shards[rows[:num]].max(initial=0)]
-
-    def expect(self, rows: np.ndarray) -> None:
-        """Announce that ``rows`` are read next, in this order, so that shards can be fetched ahead."""
-
-    def _files(self) -> dict[str, str]:
-        """Return image file -> modality, as described by pack.json."""
-        return {f"{m}{SUFFIXES[self.store]}": m for m in self.spec.modalities}
-
-    def _open(self, files: dict[str, str]) -> dict[str, Images]:
-        """Open the image files."""
-        reader = {"raw": self._map, "jpeg": self._jpegs}[self.store]
-        return {m: reader(m, self._file(name)) for name, m in files.items()}
-
     def _check_digest(self, name: str, modality: str = "") -> None:
         if digest_file(self._file(name)) != self.digests[name]:
             where = self._damaged_rows(modality, self.images[modality]) if modality else ""
             raise ValueError(f"{self.path / name} does not match its digest{where}: the pack is damaged, make it again")
 
-    def _damaged_rows(self, modality: str, images: Images, first: int = 0) -> str:
-        """Return a text naming the rows, from ``first`` on, that do not match their checksums; "" if there are none."""
+    def _damaged_rows(self, modality: str, images: Images) -> str:
+        """Return a text naming the rows that do not match their checksums."""
         if f"crc_{modality}" not in self.table.column_names:
             return ""
-        sums = self.table.column(f"crc_{modality}").slice(first, len(images)).to_pylist()
+        sums = self.table.column(f"crc_{modality}").to_pylist()
         stored: Any = images.jpeg if isinstance(images, Jpegs) else images.__getitem__
-        rows = [first + i for i in range(len(images)) if zlib.crc32(stored(i)) != sums[i]]
+        rows = [i for i in range(len(images)) if zlib.crc32(stored(i)) != sums[i]]
         if not rows:
             return " in its header"
         name = self.table.column("id")[rows[0]].as_py()
@@ -315,14 +286,14 @@ class Pack:
     def _shape(self, modality: str, num: int) -> tuple[int, int, int, int]:
         return num, self.size, self.size, self.spec.channels(modality)
 
-    def _jpegs(self, modality: str, path: Path, rows: slice = slice(None)) -> Jpegs:
+    def _jpegs(self, modality: str, path: Path) -> Jpegs:
         name = f"bytes_{modality}"
         if name not in self.table.column_names or not pa.types.is_uint32((column := self.table.column(name)).type):
             raise ValueError(f"{self.path / 'samples.parquet'} has no column {name} of uint32: make the pack again")
         if column.null_count:
             raise ValueError(f"{self.path / 'samples.parquet'}: column {name} has empty rows: make the pack again")
         try:
-            return Jpegs(path, self._shape(modality, len(lengths := self.column(name)[rows])), lengths)
+            return Jpegs(path, self._shape(modality, self.num), self.column(name))
         except (ValueError, OSError) as error:
             raise ValueError(f"{brief(error)}: the pack is damaged, make it again") from None
 

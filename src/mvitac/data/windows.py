@@ -33,8 +33,6 @@ def windowed(pack: Pack, window: Window) -> Pack:
         made = copy.copy(pack)
         made.spec = replace(pack.spec, window=replace(pack.spec.window, order=window.order))
         return made
-    if pack.format != Pack.format:
-        raise ValueError("frames: windows need the frames of a touch together: open a pack on disk, not shards")
     for modality in window.of:
         if modality not in pack.spec.modalities:
             raise unknown("modality of windows", modality, pack.spec.modalities)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from mvitac.data.mixed_pack import MixedPack
-from mvitac.data.pack import SHARDED, Pack
+from mvitac.data.pack import Pack
 from mvitac.data.storage import check_request
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
@@ -69,9 +69,6 @@ class MixConfig(DatasetConfig):
             raise ValueError(f"a mix needs at least two parts, got {len(given)}: --data.parts a=packs/a b=packs/b")
         parts = {}
         for name, folder, _ in given:
-            file = folder / "pack.json"
-            if "://" in str(folder) or (file.is_file() and SHARDED in file.read_text()):
-                raise ValueError(f"part {name} ({folder}) is in shards: a mix reads packs on disk, copy its pack here")
             try:
                 parts[name] = PackConfig(path=folder, score_on=self.score_on).open(quiet=quiet)
             except ValueError as error:

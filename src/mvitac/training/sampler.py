@@ -23,18 +23,13 @@ def mix(*numbers: int) -> int:
 
 
 class Batches:
-    """Pack rows of each step.
+    """Pack rows of each step. The order of an epoch depends on (seed, epoch)."""
 
-    The order of an epoch depends on (seed, epoch) and, for a pack in shards, on the number of processes.
-    """
-
-    def __init__(self, run: Run, pack: Pack, rows: np.ndarray, world: World | None = None) -> None:
-        self.rows, self.seed, self.window, self.world = rows, run.seed, pack.window, world or World()
+    def __init__(self, run: Run, pack: Pack, rows: np.ndarray) -> None:
+        self.rows, self.seed = rows, run.seed
         self.per_epoch, self.batch_size = run.steps_per_epoch(len(rows)), run.batch_size
-        self.share = run.batch_size // self.world.size
         self.touch_groups = pack.touch_groups[rows] if run.sampler != "shuffle" else None
         self.order = spread_order if run.sampler == "spread" else epoch_order
-        self.shards = pack.shards[rows]
         self._epoch = lru_cache(2)(self._order)
         weighted = isinstance(pack, MixedPack) and pack.weighted
         self.drawn = PartOrder(run, pack, rows, self.per_epoch, self.order) if weighted else None  # type: ignore[arg-type]
@@ -43,24 +38,12 @@ class Batches:
         """Rows [batch_size] of step ``step``, counted from 0."""
         return self._epoch(step // self.per_epoch)[step % self.per_epoch]
 
-    def own(self, step: int) -> np.ndarray:
-        """The part of step ``step`` that this process reads."""
-        return self[step][self.share * self.world.rank : self.share * (self.world.rank + 1)]
-
-    def num_ahead(self) -> int:
-        """Number of steps whose rows lie in the shards that are read together."""
-        return min(-(-self.window * np.bincount(self.shards).max() // self.share), self.per_epoch)
-
     def _order(self, epoch: int) -> np.ndarray:
         """[per_epoch, batch_size]"""
         seed, num = mix(self.seed, 1, epoch), self.per_epoch * self.batch_size
         if self.drawn:
             return self.drawn.epoch(epoch)
-        if not self.window:
-            return self.rows[self.order(len(self.rows), self.touch_groups, seed)[:num]].reshape(self.per_epoch, -1)
-        size = self.world.size
-        lanes = shard_order(self.shards, self.touch_groups, self.window, size, num, seed, self.order)
-        return self.rows[lanes.reshape(size, self.per_epoch, self.share).swapaxes(0, 1).reshape(self.per_epoch, -1)]
+        return self.rows[self.order(len(self.rows), self.touch_groups, seed)[:num]].reshape(self.per_epoch, -1)
 
 
 class PartOrder:
@@ -136,29 +119,11 @@ def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
         raise ValueError(f"batch_size {run.batch_size}: parts that lack a modality need at least 3")
 
 
-def batches(
-    run: Run,
-    pack: Pack,
-    rows: np.ndarray,
-    start: int,
-    num_steps: int,
-    world: World | None = None,
-    expect: Callable[[np.ndarray], None] | None = None,
-) -> Iterator[np.ndarray]:
-    """Pack rows of each step from ``start`` to ``num_steps``, as ``Batches`` orders them.
-
-    For a pack in shards, ``expect`` (``Pack.expect``) is called with the rows that this process will read next.
-    """
-    order = Batches(run, pack, rows, world)
-    num_ahead = order.num_ahead() if pack.window else 0
-    try:
-        for step in range(start, num_steps):
-            if expect and pack.window:
-                expect(np.concatenate([order.own(s) for s in range(step, min(step + num_ahead, num_steps))]))
-            yield order[step]
-    finally:
-        if expect:
-            expect(rows[:0])
+def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) -> Iterator[np.ndarray]:
+    """Pack rows of each step from ``start`` to ``num_steps``, as ``Batches`` orders them."""
+    order = Batches(run, pack, rows)
+    for step in range(start, num_steps):
+        yield order[step]
 
 
 def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
@@ -201,32 +166,6 @@ def _occurrences(groups: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return occurrence, inverse, counts
 
 
-def shard_order(
-    shards: np.ndarray,
-    groups: np.ndarray | None,
-    window: int,
-    num_lanes: int,
-    num: int,
-    seed: int,
-    order: Order = epoch_order,
-) -> np.ndarray:
-    """A random order [num_lanes, num / num_lanes] of rows 0..N-1 in which each process needs few shards at a time.
-
-    The shards are put in random order and cut into one lane per process. Within a lane, rows are shuffled by ``order``,
-    ``window`` shards at a time. Only a shard that is cut is read by two processes. ``shards`` and ``groups`` [N] are
-    the shard and the touch group of each row.
-    """
-    place = np.random.default_rng(seed).permutation(shards.max() + 1)[shards]
-    lanes = np.argsort(place, kind="stable")[:num].reshape(num_lanes, -1)
-    for number, lane in enumerate(lanes):
-        held = np.unique(place[lane])
-        windows = np.array_split(held, -(-len(held) // window))
-        firsts = np.searchsorted(place[lane], [some[0] for some in windows])
-        for i, rows in enumerate(np.split(lane, firsts[1:])):  # views of the lane
-            rows[:] = rows[order(len(rows), None if groups is None else groups[rows], mix(seed, number, i))]
-    return lanes
-
-
 def partners(
     pack: Pack,
     rows: np.ndarray,
@@ -235,20 +174,19 @@ def partners(
     within: float = 0.0,
     other_sensor: bool = False,
 ) -> np.ndarray:
-    """For each of ``rows`` a random other row of the same touch group (or press), split and shard.
+    """For each of ``rows`` a random other row of the same touch group (or press) and split.
 
     With ``within``, its distance in time is at most that; with ``other_sensor``, it is of another sensor. A row without
     such others is its own partner.
     """
     groups: np.ndarray = getattr(pack, of)
-    split, shards = pack.column("split"), pack.shards
+    split = pack.column("split")
     place = places(pack, pack.spec.window)[1] if within else np.zeros(0)
     draws = torch.rand(len(rows), generator=generator).numpy()
     found = rows.copy()
     for i, row in enumerate(rows):
         others = pack.rows_of(int(groups[row]), of)
         others = others[(others != row) & (split[others] == split[row]) & pack.whole[others]]
-        others = others[shards[others] == shards[row]]
         if within:
             others = others[abs(place[others] - place[row]) <= within + 1e-9]
         if other_sensor:

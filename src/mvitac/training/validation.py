@@ -100,10 +100,10 @@ def _validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cel
     """Scores and errors on ``pack`` alone."""
     rng = np.random.default_rng(0)  # the same rows at every step and for every seed
     modalities = pack.spec.modalities
-    train_rows = _sample(pack, pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
+    train_rows = _sample(pack.rows("train", "unlabelled", having=modalities), NUM_EVAL_TRAIN, rng)
     val_rows = np.setdiff1d(pack.rows("val", having=modalities), run.method.training_rows(pack))
     held_out = len(val_rows) > 1
-    rows = _sample(pack, val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
+    rows = _sample(val_rows, NUM_EVAL_VAL, rng) if held_out else train_rows[:NUM_EVAL_VAL]
     z = {m: pack_features(model, pack, m, rows, bf16=run.bf16) for m in model.encoders if m in modalities}
     values: dict[str, float] = {}
     cells: Cells = {}
@@ -120,8 +120,7 @@ def _validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cel
     return values, cells
 
 
-def _sample(pack: Pack, rows: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
-    rows = pack.near(rows, num)
+def _sample(rows: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
     return np.sort(rng.choice(rows, min(num, len(rows)), replace=False))
 
 

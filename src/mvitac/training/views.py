@@ -47,8 +47,7 @@ def load_chunks(
         return make_views(run, pack, own, num_views, torch.Generator().manual_seed(seed), device, feed, mirror)
 
     numbers = range(per_process * world.rank, per_process * (world.rank + 1))
-    expect = None if feed.resident else pack.expect
-    steps = enumerate(batches(run, pack, rows, start, num_steps, world, expect), start=start)
+    steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
     if per_process == 1 and (device.type == "cuda" or any(isinstance(i, Lazy) for i in pack.images.values())):
         # One chunk per step, and slow to make or needed on a GPU: make the next ones while this one is used.
         views = (make(step, batch, numbers[0]) for step, batch in steps)

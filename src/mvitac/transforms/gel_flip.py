@@ -74,7 +74,6 @@ class GelMirror:
                     f"sensor {name!r} has {len(own)} training rows with touch, learning its colours needs {MIN_ROWS}:"
                     " give --augment.gel-flip plain"
                 )
-            own = pack.near(own, NUM_ROWS)
             own = own[np.linspace(0, len(own) - 1, min(len(own), NUM_ROWS)).astype(int)]
             try:
                 gels = _shrunk(pack, own).split(3, dim=1)
