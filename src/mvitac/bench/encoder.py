@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from mvitac.bench.external import ExternalModel
 from mvitac.bench.result import read_result, sign, write_result
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite
@@ -14,7 +15,6 @@ from mvitac.deploy.artifact import load
 from mvitac.evaluation.leaks import FILE, UNKNOWN, read_sources
 from mvitac.evaluation.run_names import names_of
 from mvitac.experiments.plan import slug
-from mvitac.external import ExternalModel
 from mvitac.model import Model
 from mvitac.nn.encoders import SCRATCH, num_features
 from mvitac.run import load_run

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mvitac.bench.external import ExternalModel, open_model
 from mvitac.bench.result import trimmed
 from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
 from mvitac.data.lazy import Lazy
@@ -25,7 +26,6 @@ from mvitac.evaluation.leaks import Scored, declared_leak
 from mvitac.evaluation.probe import joined, names_in, probe_all, split_rows
 from mvitac.evaluation.robustness import few_labels
 from mvitac.evaluation.scores import pool
-from mvitac.external import ExternalModel, load_external
 from mvitac.model import Model
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.progress import work
@@ -162,7 +162,7 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
     encoder.
     """
     here = provenance()
-    random = [load_external(text) for text in suite.untrained]
+    random = [open_model(text) for text in suite.untrained]
     with work(f"{entry.name} on {suite.name}", sum(len(one.tasks) for one in suite.sets), "tasks") as advance:
         for one in suite.sets:
             opened = open_set(one, root)

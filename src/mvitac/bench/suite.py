@@ -15,13 +15,13 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
+from mvitac.bench.external.base import parse
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.table.splits import folds
 from mvitac.evaluation.probe import Probe
-from mvitac.nn.external.base import parse
 from mvitac.registry import from_json, to_json, unknown
 from mvitac.system.files import brief, digest
 

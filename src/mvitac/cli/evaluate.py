@@ -10,8 +10,8 @@ from tyro.conf import Positional
 from mvitac.cli.options import check_json, console, parse, save_json
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.evaluation.encoders import about_lines
 from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, as_trained, chosen, probe_runs
-from mvitac.evaluation.external_encoders import about_lines
 from mvitac.evaluation.robustness import STRESSES, stress
 from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.evaluation.sensors import RecolouredPack

@@ -21,6 +21,7 @@ from huggingface_hub import ModelHubMixin
 from torch import nn
 
 from mvitac import model_files
+from mvitac.evaluation.encoders import is_encoder, open_encoder
 from mvitac.model import Model
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import from_json, to_json
@@ -84,7 +85,7 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
     """Load a trained model, in eval mode; from an artifact with its probes (``Model.predict``).
 
     Args:
-        path: folder of a run or an artifact, "external:..." for an encoder of other people (``mvitac.external``), or
+        path: folder of a run or an artifact, "external:..." for an encoder of other people (``bench.external``), or
             "owner/name[@revision]" on the Hugging Face Hub. Only a ``str`` that is no folder here is looked up there.
         which: weights of a run: "last", or "best" on split val (kept with ``--eval-every``).
 
@@ -95,10 +96,8 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
         model = mvitac.load("artifacts/first")
         probabilities = model.predict(vision=photo, touch=press)
     """
-    if isinstance(path, str) and path.startswith("external:"):
-        from mvitac.external import load_external
-
-        return load_external(path)
+    if is_encoder(path):
+        return open_encoder(str(path))
     local = Path(path)
     found = HUB_ID.fullmatch(path) if isinstance(path, str) else None
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.

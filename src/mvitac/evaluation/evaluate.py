@@ -15,8 +15,8 @@ from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
+from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.events import check_event, with_event
-from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows, with_classes
 from mvitac.evaluation.probe_config import ProbeConfig

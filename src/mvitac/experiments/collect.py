@@ -22,8 +22,8 @@ import torch
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
+from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
-from mvitac.evaluation.external_encoders import open_encoders, probe_encoders
 from mvitac.experiments.jobs import Job, Work, pairs_per_second
 from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.nn.encoders import SCRATCH

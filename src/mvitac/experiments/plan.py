@@ -31,7 +31,7 @@ class Row:
     printed: Printed = field(default_factory=dict)
     """The paper's numbers for this row, with positives of the same image. Shown beside such scores of probe paper only."""
     encoder: str = field(default="", metadata=LATER)
-    """Another's encoder instead of a run, e.g. "external:timm/NAME" (``mvitac.external``). It is probed, not trained."""
+    """Another's encoder instead of a run, e.g. "external:timm/NAME" (``bench.external``). It is probed, not trained."""
 
     def __post_init__(self) -> None:
         if self.encoder and (self.method, self.recipe, self.set) != ("mvitac", None, {}):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mvitac.evaluation.external_encoders import about_lines
+from mvitac.evaluation.encoders import about_lines
 from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval

@@ -19,9 +19,9 @@ from typing import Any, ClassVar, Literal
 
 from torch import nn
 
-from mvitac.nn.external.base import Adapter, Loaded, seeded
-from mvitac.nn.external.encoder import Plain
-from mvitac.nn.external.preprocessing import Preprocessing
+from mvitac.bench.external.base import Adapter, Loaded, seeded
+from mvitac.bench.external.encoder import Plain
+from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.registry import from_json, to_json
 from mvitac.system.files import brief
 

@@ -17,7 +17,7 @@ from timm.models.resnet import BasicBlock, Bottleneck, ResNet
 from timm.models.vision_transformer import Block
 from torch import Tensor, nn
 
-from mvitac.nn.external.base import Adapter
+from mvitac.bench.external.base import Adapter
 from mvitac.nn.weights import misfit, read_safetensors
 from mvitac.system.files import brief
 

@@ -11,9 +11,9 @@ from typing import ClassVar
 
 import torch
 
-from mvitac.nn.external.base import Adapter, Loaded
-from mvitac.nn.external.preprocessing import CLIP, Preprocessing
-from mvitac.nn.external.tower import Tensors, Tower, from_clip, projection, read_tensors, shape, tower, under
+from mvitac.bench.external.base import Adapter, Loaded
+from mvitac.bench.external.preprocessing import CLIP, Preprocessing
+from mvitac.bench.external.tower import Tensors, Tower, from_clip, projection, read_tensors, shape, tower, under
 
 START = "touch_mae_model."
 NAMES = {

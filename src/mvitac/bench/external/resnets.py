@@ -10,9 +10,9 @@ import re
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mvitac.nn.external.base import UNKNOWN, Adapter, Loaded
-from mvitac.nn.external.preprocessing import Preprocessing
-from mvitac.nn.external.tower import Tensors, read_tensors, resnet, under
+from mvitac.bench.external.base import UNKNOWN, Adapter, Loaded
+from mvitac.bench.external.preprocessing import Preprocessing
+from mvitac.bench.external.tower import Tensors, read_tensors, resnet, under
 
 NUMBERS = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
 TOWERS = {"touch": "encoder.module.touch_to_image.", "vision": "encoder.module.image_to_touch."}

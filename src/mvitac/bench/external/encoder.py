@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.nn.encoders import last_map, num_features
-from mvitac.nn.external.preprocessing import Preprocessing
 from mvitac.system.files import brief
 
 

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mvitac.nn.external.base import FILES, Adapter, Loaded
-from mvitac.nn.external.encoder import Plain
-from mvitac.nn.external.preprocessing import Preprocessing
-from mvitac.nn.external.timm_models import Timm
+from mvitac.bench.external.base import FILES, Adapter, Loaded
+from mvitac.bench.external.encoder import Plain
+from mvitac.bench.external.preprocessing import Preprocessing
+from mvitac.bench.external.timm_models import Timm
 from mvitac.system.files import brief
 
 

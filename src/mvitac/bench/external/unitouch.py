@@ -12,9 +12,9 @@ from typing import ClassVar
 from timm.layers.mlp import Mlp
 from torch import Tensor, nn
 
-from mvitac.nn.external.base import Adapter, Loaded
-from mvitac.nn.external.preprocessing import CLIP, Preprocessing
-from mvitac.nn.external.tower import HEAD, projection, read_tensors, shape, tower, under
+from mvitac.bench.external.base import Adapter, Loaded
+from mvitac.bench.external.preprocessing import CLIP, Preprocessing
+from mvitac.bench.external.tower import HEAD, projection, read_tensors, shape, tower, under
 
 PREFIX = 6  # leading characters of every name in the file that the owner drops
 NAMES = {"cls_token": "front", "rgbt_stem.proj.1": "embed", "pos_embedding_helper.pos_embed": "positions"}

@@ -11,9 +11,9 @@ from typing import Any, ClassVar, Literal
 from timm.data.config import resolve_data_config
 from torch import nn
 
+from mvitac.bench.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
+from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
-from mvitac.nn.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
-from mvitac.nn.external.preprocessing import Preprocessing
 from mvitac.system.files import brief
 
 

@@ -7,9 +7,9 @@ No owner's weights were at hand; no owner's code is used.
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mvitac.nn.external.base import Adapter, Loaded
-from mvitac.nn.external.preprocessing import Preprocessing
-from mvitac.nn.external.tower import projection, read_tensors, tower, under
+from mvitac.bench.external.base import Adapter, Loaded
+from mvitac.bench.external.preprocessing import Preprocessing
+from mvitac.bench.external.tower import projection, read_tensors, tower, under
 
 NAMES = {
     "cls_token": "front",

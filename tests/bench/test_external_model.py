@@ -17,6 +17,8 @@ from onnx import TensorProto, helper
 from torch import nn
 
 import mvitac
+from mvitac.bench.external import ExternalModel, open_model
+from mvitac.bench.external.model import is_noncommercial
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
@@ -29,7 +31,6 @@ from mvitac.experiments.jobs import do
 from mvitac.experiments.plan import Row
 from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import markdown
-from mvitac.external import ExternalModel, is_noncommercial, load_external
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from support.owners import OWNERS
@@ -50,7 +51,7 @@ def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_pa
     trunk = ours.encoders["touch"]
     torch.save(trunk.state_dict(), tmp_path / "trunk.pth")
     text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32,mean=imagenet,std=imagenet"
-    theirs, same = load_external(text).on(pack)
+    theirs, same = open_model(text).on(pack)
     assert same is pack
     np.testing.assert_allclose(
         features(theirs, pack, "touch", rows(pack)), features(ours, pack, "touch", rows(pack)), atol=1e-4
@@ -58,7 +59,7 @@ def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_pa
     images = torch.from_numpy(pack.images["touch"][rows(pack)]).permute(0, 3, 1, 2)
     torch.testing.assert_close(theirs.last_map("touch", images), ours.last_map("touch", images), atol=1e-4, rtol=1e-3)
     text = f"external:{tmp_path / 'trunk.pth'},trunk=test_resnet,size=32,mean=imagenet,std=imagenet"
-    by_file = load_external(text).on(pack)[0]
+    by_file = open_model(text).on(pack)[0]
     np.testing.assert_array_equal(
         features(by_file, pack, "touch", rows(pack)), features(theirs, pack, "touch", rows(pack))
     )
@@ -80,16 +81,14 @@ def test_load_gives_a_model_that_embeds_and_is_probed(pack: Pack) -> None:
 
 
 def test_seeds_draw_other_weights_and_repeat_themselves() -> None:
-    digests = [load_external(f"{TINY},seed={seed}").weights_digest() for seed in (0, 1, 0)]
+    digests = [open_model(f"{TINY},seed={seed}").weights_digest() for seed in (0, 1, 0)]
     assert digests[0] == digests[2] != digests[1]
-    assert (
-        load_external(f"{TINY},mean=none").weights_digest() != digests[0]
-    )  # features depend on it, so their cache does
+    assert open_model(f"{TINY},mean=none").weights_digest() != digests[0]  # features depend on it, so their cache does
 
 
 def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
     two = toy_pack(tmp_path / "two", touch_channels=6, num=12)
-    model, two = load_external(f"{TINY},reads=touch").on(two)
+    model, two = open_model(f"{TINY},reads=touch").on(two)
     one = ExternalModel(model.text, model.parts, pack.spec, 32)
     both = torch.from_numpy(np.array(two.images["touch"][:3])).permute(0, 3, 1, 2)
     each = [one.features("touch", both[:, at : at + 3]) for at in (0, 3)]
@@ -101,20 +100,20 @@ def test_sensors_are_encoded_one_by_one(pack: Pack, tmp_path: Path) -> None:
 def test_windows_are_opened_where_the_data_has_an_order(pack: Pack, tmp_path: Path) -> None:
     text = f"{TINY},reads=touch,frames=2"
     frames = toy_pack(tmp_path / "frames", values=True)
-    model, own = load_external(text).on(frames)
+    model, own = open_model(text).on(frames)
     assert own.spec.window.frames == 2 and not model.notes
     later = np.flatnonzero(frames.column("frame") == 1)[:3]
     found = features(model, own, "touch", later)
-    still, plain = load_external(text).on(pack)
+    still, plain = open_model(text).on(pack)
     assert plain is pack and "repeated" in still.notes[0]
     images = torch.from_numpy(frames.images["touch"][later]).permute(0, 3, 1, 2)
     assert not np.allclose(found, still.features("touch", images).numpy(), atol=1e-3)
     with pytest.raises(ValueError, match="order of its frames"):
-        load_external(f"{text},stride=1").on(pack)
+        open_model(f"{text},stride=1").on(pack)
 
 
 def test_backgrounds_are_subtracted_where_the_pack_has_them(pack: Pack) -> None:
-    model = load_external(f"{TINY},reads=touch,background=minus,mean=none,std=none")
+    model = open_model(f"{TINY},reads=touch,background=minus,mean=none,std=none")
     assert "no" in model.on(pack)[0].notes[0]
     changed = ExternalModel(model.text, model.parts, replace(pack.spec, difference=True), 32)
     grey = torch.full((1, 3, 32, 32), 128, dtype=torch.uint8)
@@ -125,12 +124,12 @@ def test_backgrounds_are_subtracted_where_the_pack_has_them(pack: Pack) -> None:
 
 
 def test_one_encoder_for_each_sense(pack: Pack) -> None:
-    model = load_external(f"{TINY},reads=touch,title=a+{TINY},seed=1,title=b")
+    model = open_model(f"{TINY},reads=touch,title=a+{TINY},seed=1,title=b")
     assert {m: part.loaded.title for m, part in model.parts.items()} == {"vision": "b", "touch": "a"}
-    assert set(load_external(f"{TINY},reads=vision").encoders) == {"vision"}
+    assert set(open_model(f"{TINY},reads=vision").encoders) == {"vision"}
     for text in (f"{TINY}+{TINY}", f"{TINY},reads=touch+{TINY},reads=touch"):
         with pytest.raises(ValueError, match="one encoder"):
-            load_external(text)
+            open_model(text)
 
 
 @pytest.mark.parametrize("owner", OWNERS)
@@ -138,7 +137,7 @@ def test_every_owners_checkpoint_gives_features_of_a_pack(
     owner: Callable[..., Any], pack: Pack, tmp_path: Path
 ) -> None:
     text, _ = owner(tmp_path)
-    model, own = load_external(text).on(pack)
+    model, own = open_model(text).on(pack)
     found = features(model, own, "touch", rows(pack))
     assert (
         found.shape == (6, model.encoders["touch"].num_features) and np.isfinite(found).all() and found.std(0).max() > 0
@@ -205,26 +204,26 @@ def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypat
     (tmp_path / "nets_here.py").write_text(FACTORY)
     images = torch.from_numpy(pack.images["touch"][rows(pack)]).permute(0, 3, 1, 2)
     plain = images.float() / 255
-    found = load_external("external:mean.onnx,mean=none,std=none").on(pack)[0]
+    found = open_model("external:mean.onnx,mean=none,std=none").on(pack)[0]
     torch.testing.assert_close(found.features("touch", images), plain.mean((2, 3)))
     assert found.parts["touch"].encoder.preprocessing.size == (32, 32) and found.untrained() is None
     onnx_mean(tmp_path / "one.onnx", 32, batch=1)
-    single = load_external("external:one.onnx,mean=none,std=none").on(pack)[0]
+    single = open_model("external:one.onnx,mean=none,std=none").on(pack)[0]
     torch.testing.assert_close(single.features("touch", images), plain.mean((2, 3)))
     with pytest.raises(ValueError, match="it takes 1 channels, the images have 3"):
-        load_external(f"external:{onnx_mean(tmp_path / 'gray.onnx', 32, channels=1).name}")
+        open_model(f"external:{onnx_mean(tmp_path / 'gray.onnx', 32, channels=1).name}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch.jit is deprecated
         torch.jit.script(Means()).save("mean.ts")
-    tokens = load_external("external:mean.ts,mean=none,std=none,size=32,prefix=1").on(pack)[0]
+    tokens = open_model("external:mean.ts,mean=none,std=none,size=32,prefix=1").on(pack)[0]
     torch.testing.assert_close(tokens.features("touch", images), plain.mean(3)[:, 1:].mean(1))  # three tokens of 32
     assert tokens.last_map("touch", images).shape == (6, 3, 32)
-    net = load_external("external:python:nets_here:good").on(pack)[0]
+    net = open_model("external:python:nets_here:good").on(pack)[0]
     about = net.describe()["encoders"]["touch"]
     assert (about["title"], about["licence"], about["features"], about["trained_on"]) == ("net", "MIT", 5, "ours")
     assert net.last_map("touch", images).shape == (6, 16, 5)
     with pytest.raises(ValueError, match="NaN or infinite features of touch"):
-        load_external("external:python:nets_here:nan").on(pack)[0].features("touch", images)
+        open_model("external:python:nets_here:nan").on(pack)[0].features("touch", images)
     for name, words in (
         ("bare", "a torch module and a dict"),
         ("wrong", "'sides'"),
@@ -232,7 +231,7 @@ def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypat
         ("no", "cannot be imported"),
     ):
         with pytest.raises(ValueError, match=words):
-            load_external(f"external:python:nets_here:{name}")
+            open_model(f"external:python:nets_here:{name}")
 
 
 @pytest.mark.parametrize(
@@ -265,7 +264,7 @@ def test_bad_encoders_are_named_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=words.replace("{", r"\{").replace("}", r"\}")) as caught:
-        load_external(text)
+        open_model(text)
     assert len(str(caught.value).splitlines()) == 1
     assert main(["probe", "--encoder", text, "--on", str(pack.path)]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
@@ -275,7 +274,7 @@ def test_a_damaged_file_of_each_kind_is_one_line(tmp_path: Path) -> None:
     for name in ("net.onnx", "net.ts", "net.safetensors,trunk=mvitac_tiny"):
         (tmp_path / name.split(",")[0]).write_bytes(b"something else")
         with pytest.raises(ValueError, match="net") as caught:
-            load_external(f"external:{tmp_path / name}")
+            open_model(f"external:{tmp_path / name}")
         assert len(str(caught.value).splitlines()) == 1
 
 
@@ -283,7 +282,7 @@ def test_probe_writes_what_is_needed_to_check_an_encoder(
     pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (weights := tmp_path / "w.pth").parent.mkdir(exist_ok=True)
-    network = load_external("external:timm/test_resnet,weights=random").parts["touch"].loaded.network
+    network = open_model("external:timm/test_resnet,weights=random").parts["touch"].loaded.network
     torch.save(network.state_dict(), weights)
     encoder = f"external:{weights},trunk=test_resnet,size=32,licence=CC-BY-NC-4.0,title=theirs,reads=touch"
     out = tmp_path / "scores.json"

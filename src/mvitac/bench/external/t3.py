@@ -10,9 +10,9 @@ from typing import ClassVar
 
 from torch import nn
 
-from mvitac.nn.external.base import Adapter, Loaded
-from mvitac.nn.external.preprocessing import IMAGENET, Preprocessing, Three
-from mvitac.nn.external.tower import depth, read_tensors, tower, under
+from mvitac.bench.external.base import Adapter, Loaded
+from mvitac.bench.external.preprocessing import IMAGENET, Preprocessing, Three
+from mvitac.bench.external.tower import depth, read_tensors, tower, under
 
 NAMES = {"cls_token": "front", "pos_embed": "positions", "patch_embed.proj": "embed"}
 STATISTICS: dict[str, tuple[Three, Three]] = {

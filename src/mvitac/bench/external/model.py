@@ -4,8 +4,7 @@
     model, pack = model.on(mvitac.Pack("packs/materials"))     # for the channels, frames and backgrounds of this data
     records = probe_model(model, pack, pack.spec.all_tasks, ["touch"], ["linear"])
 
-``nn/external`` has the adapters. Two encoders, one for each sense, are joined by "+":
-"external:sparsh:FILE+external:timm/resnet18".
+Two encoders, one for each sense, are joined by "+": "external:sparsh:FILE+external:timm/resnet18".
 """
 
 from typing import Any, NoReturn
@@ -13,12 +12,12 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
+from mvitac.bench.external.base import START, UNKNOWN, OpenEncoder, open_encoder
+from mvitac.bench.external.encoder import Layout
 from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, DataSpec, Window
 from mvitac.data.windows import windowed
 from mvitac.model import Model
-from mvitac.nn.external import Layout, open_encoder
-from mvitac.nn.external.base import START, UNKNOWN, OpenEncoder
 from mvitac.registry import to_json
 from mvitac.system.files import digest_file
 
@@ -187,7 +186,7 @@ def is_noncommercial(licence: str) -> bool:
     return "nc" in licence.lower().split(" (")[0].replace("_", "-").split("-")
 
 
-def load_external(text: str) -> ExternalModel:
+def open_model(text: str) -> ExternalModel:
     """Open the encoders that ``text`` names: one, or one for each sense joined by "+".
 
     ValueError if there is no such encoder, or two encoders read the same sense.

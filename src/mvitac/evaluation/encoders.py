@@ -1,5 +1,9 @@
-"""Probes of other people's encoders (``mvitac.external``), beside those of our runs and under the same protocol."""
+"""Encoders of other people: opened by name, and probed beside our runs under the same protocol.
 
+Nothing here or below imports what opens them (``bench.external``). Another package plugs in by one entry of ``OPENERS``.
+"""
+
+import importlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,10 +12,24 @@ from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records
 from mvitac.evaluation.leaks import UNKNOWN, declared_leak
 from mvitac.evaluation.probe import probe_model, probes_of
-from mvitac.external import ExternalModel, load_external
+from mvitac.registry import unknown
 from mvitac.system.progress import work
 
-Bound = tuple[ExternalModel, Pack]  # an encoder and the data, bound to each other
+OPENERS = {"external": "mvitac.bench.external"}
+"""How the text that names an encoder begins, before ":" -> the module whose ``open_model`` opens it."""
+Bound = tuple[Any, Pack]  # an encoder, as ``bench.external.ExternalModel``, and the data, bound to each other
+
+
+def is_encoder(text: object) -> bool:
+    """Whether ``text`` names an encoder of other people."""
+    return isinstance(text, str) and text.partition(":")[0] in OPENERS
+
+
+def open_encoder(text: str) -> Any:
+    """The encoder that ``text`` names, a model; ValueError if there is none."""
+    if not is_encoder(text):
+        raise unknown("encoder", text, [f"{start}:..." for start in OPENERS])
+    return importlib.import_module(OPENERS[text.partition(":")[0]]).open_model(text)
 
 
 def open_encoders(texts: Sequence[str], pack: Pack | None) -> list[Bound]:
@@ -19,7 +37,7 @@ def open_encoders(texts: Sequence[str], pack: Pack | None) -> list[Bound]:
     if texts and pack is None:
         raise ValueError("an encoder has no data of its own: name a pack with --on PACK")
     found: list[Bound] = []
-    for model in map(load_external, texts):
+    for model in map(open_encoder, texts):
         if any((model.title, model.seed) == (other.title, other.seed) for other, _ in found):
             who = f"{model.title!r} with seed {model.seed}"
             raise ValueError(f"{model.text}: {who} is given twice: give it a title=NAME")

@@ -19,8 +19,8 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import nn
 
-from mvitac.nn.external.encoder import ExternalEncoder
-from mvitac.nn.external.preprocessing import CLIP, IMAGENET, PLAIN, Preprocessing
+from mvitac.bench.external.encoder import ExternalEncoder
+from mvitac.bench.external.preprocessing import CLIP, IMAGENET, PLAIN, Preprocessing
 from mvitac.registry import Registered, find, from_json, unknown
 from mvitac.system.files import digest_file, parse_json
 

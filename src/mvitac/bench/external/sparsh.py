@@ -11,9 +11,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from mvitac.nn.external.base import Adapter, Loaded
-from mvitac.nn.external.preprocessing import PLAIN, Preprocessing
-from mvitac.nn.external.tower import Tower, fill, patches, read_tensors, under
+from mvitac.bench.external.base import Adapter, Loaded
+from mvitac.bench.external.preprocessing import PLAIN, Preprocessing
+from mvitac.bench.external.tower import Tower, fill, patches, read_tensors, under
 
 TWO = Preprocessing(
     size=(320, 240), mean=PLAIN[0], std=PLAIN[1], frames=2, stride=5, offset=0.5, whole_levels=True, portrait=True

@@ -13,10 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mvitac.nn.external import open_encoder
-from mvitac.nn.external.base import OpenEncoder, parse, randomised
-from mvitac.nn.external.preprocessing import Preprocessing
-from mvitac.nn.external.tower import Tower
+from mvitac.bench.external.base import OpenEncoder, open_encoder, parse, randomised
+from mvitac.bench.external.preprocessing import Preprocessing
+from mvitac.bench.external.tower import Tower
 from support.owners import OWNERS, D, sparsh, tvl
 
 
