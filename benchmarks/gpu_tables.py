@@ -1,4 +1,4 @@
-"""Write the figures of benchmarks/gpu.sh into docs/speed.md and docs/results/gpu.md.
+"""Write the figures of benchmarks/gpu.sh into docs/speed.md.
 
     python -m benchmarks.gpu_tables [runs/gpu/gpu.json]
 
@@ -21,8 +21,7 @@ from mvitac.system.files import read_json, write_json
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = ROOT / "benchmarks" / "results" / "gpu.json"
 PAGES = {
-    ROOT / "docs" / "speed.md": ("step", "input", "memory"),
-    ROOT / "docs" / "results" / "gpu.md": ("rows", "made"),
+    ROOT / "docs" / "speed.md": ("made", "step", "input", "memory", "rows"),
 }
 STEPS = {
     "typical fp32": "typical, fp32",
@@ -133,8 +132,6 @@ def rows_table(found: dict[str, Any]) -> str:
 
 def made(found: dict[str, Any]) -> str:
     """Return what was measured where, in a sentence."""
-    if not found:
-        return "Not measured yet."
     last, data = found["sessions"][-1], found["data"]
     device = next((part["device"] for part in found["speed"].values() if "device" in part), "unknown device")
     minutes = sum(call["minutes"] for call in found["sessions"])
@@ -154,7 +151,7 @@ def filled(text: str, names: Sequence[str], found: dict[str, Any]) -> str:
         place = re.compile(rf"(<!-- gpu: {name} -->\n).*?(\n<!-- end -->)", re.DOTALL)
         if not place.search(text):
             raise ValueError(f"the page has no <!-- gpu: {name} --> ... <!-- end -->")
-        made = TABLES[name](found)
+        made = TABLES[name](found) if found else "Not measured yet."
         text = place.sub(lambda match, made=made: match[1] + made + match[2], text)
     return text
 

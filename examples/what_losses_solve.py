@@ -1,4 +1,4 @@
-"""What runs on vt60 learned (docs/results/vt60.md): probes of frozen features at the start and at the end, on split val.
+"""What runs on vt60 learned (docs/results/real.md): probes of frozen features at the start and at the end, on split val.
 
     python examples/what_losses_solve.py RUN...
 
