@@ -255,9 +255,7 @@ def readers(base: Path) -> dict[str, tuple[list[Path], Callable[[], Any]]]:
 
     def recorded() -> Any:
         found, scores = load_run(base / "run"), read_json(base / "run" / "probe.json", "scores")
-        learned = [
-            [s.name, s.ids.tolist(), s.groups.tolist()] for s in read_sources(base / "run", run, None, pack) or ()
-        ]
+        learned = [[s.name, s.ids.tolist(), s.groups.tolist()] for s in read_sources(base / "run") or ()]
         # An entry more is a flipped name of the digest itself, without which the file is read as it is.
         return found[0], [found[1][name] for name in record], [scores[name] for name in probed], learned
 

@@ -149,6 +149,25 @@ def test_what_cannot_be_compared_is_refused(pack: Pack, negative: Pack, tmp_path
         JoinedPack(*alone)
 
 
+def test_an_image_that_is_learned_from_and_scored_is_refused(pack: Pack, tmp_path: Path) -> None:
+    """Under other names, with another photo, and every row its own group."""
+
+    class Renamed(Toy):
+        def spec(self) -> DataSpec:
+            return replace(super().spec(), name="renamed", group_by="row")
+
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            split = {"train": "test", "test": "train", "val": "train"}[sample.columns["split"]]
+            names = {"id": f"new {item}", "group": f"{item + 1}", "split": split}
+            return [replace(sample, vision=np.rot90(sample.vision), columns={**sample.columns, **names})]  # type: ignore
+
+    renamed = build(Renamed(), tmp_path / "renamed", size=32, quiet=True)
+    for learn, score, row in ((pack, renamed, "new 0"), (renamed, pack, "0036")):
+        with pytest.raises(ValueError, match=rf"the touch image of row '{row}' is learned from in .* one of \d+: give"):
+            JoinedPack(learn, score)
+
+
 def test_probe_learns_on_one_pack_and_meets_another(
     pack: Pack, negative: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -186,7 +186,9 @@ def test_a_leak_between_a_mix_and_a_pack_is_found(pack: Pack, gel: Pack) -> None
 
 def test_an_image_on_two_sides_under_two_names_is_refused(pack: Pack, tmp_path: Path) -> None:
     turned = built(Turned(num=60, prefix="copy "), tmp_path / "p")
-    expected = r"one vision image has two names: it is row '0\d+' \(\S+\) in train of part a and row 'copy 0\d+' \(copy"
+    expected = (
+        r"the vision image of row 'copy 0\d+' \(copy \S+\) in test of part b is in train of part a, one of \d+: pack"
+    )
     with pytest.raises(ValueError, match=expected):
         MixedPack({"a": pack, "b": turned})
     small = built(Turned(num=60, prefix="copy "), tmp_path / "small", size=16)

@@ -29,7 +29,6 @@ from mvitac.deploy.card import _harmless
 from mvitac.deploy.engine import Engine
 from mvitac.deploy.publish import publish
 from mvitac.deploy.search import Index, build
-from mvitac.evaluation.leaks import read_sources
 from mvitac.evaluation.run_names import names_of
 from mvitac.nn.encoders import EncoderConfig, build_trunk
 from mvitac.system.files import digest, digest_file, read_json
@@ -189,21 +188,6 @@ def test_start_weights_of_another_run_are_not_opened(copy: Path, trap: Path, pac
     assert names_of([copy], [model]) == ["mvitac"]
     found = describe([model], [str(copy)], About())
     assert found["trained_on"] == "toy; starts from older, which was trained on: tag" and found["images_seen"] is None
-
-
-def test_the_pack_of_an_artifact_without_a_list_is_not_opened(
-    copy: Path, trap: Path, pack: Pack, touched: list[str]
-) -> None:
-    """A log makes it look like a run, whose own pack would say what it was trained on."""
-    forge(
-        copy, trap, run=data("pack", path="{trap}"), manifest=lambda trap, m: m["files"].pop("trained_on.safetensors")
-    )
-    (copy / "trained_on.safetensors").unlink()
-    (copy / "log.jsonl").write_text("")
-    model = mvitac.load(str(copy))
-    touched.clear()
-    assert read_sources(copy, model.run, "0" * 64, pack) is None
-    check(list(touched), trap)
 
 
 def setting(*keys: str, value: Any) -> Change:

@@ -15,18 +15,17 @@ from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import number_hint
+from mvitac.data.row_hashes import image_sums, known_images, number_hint
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
-from mvitac.evaluation.leaks import FILE, Scored, leaks_of, read_sources, source_of, write_sources
+from mvitac.evaluation.leaks import FILE, NOT_SEEN, Scored, leaks_of, read_sources, source_of, write_sources
 from mvitac.evaluation.score_text import with_interval
 from mvitac.evaluation.scores import pool, summarise
 from mvitac.report.report import write_report
 from mvitac.report.tables import unseen_groups
-from mvitac.run import load_run
 from mvitac.system.files import read_json
 from support.toy import Toy
 from support.training_runs import smoke
@@ -101,25 +100,8 @@ def test_unseen_test_rows_have_no_leak(run: Path, pack: Pack, capsys: pytest.Cap
     assert {r["leak"] for r in read_json(run / "probe.json", "scores")["records"]} == {""}
 
 
-def test_runs_without_a_list_are_compared_by_their_pack_or_unknown(
-    run: Path, pack: Pack, turned: Pack, tmp_path: Path
-) -> None:
-    """Version 0.1.0 kept no list of the rows."""
-    settings, record = load_run(run)
-    kept = read_sources(run, settings, record["pack"], turned)
+def test_without_a_list_leaks_are_unknown(run: Path, turned: Pack) -> None:
     (run / FILE).unlink()
-    for scored in (pack, turned):  # its own data, and data that its own is compared with
-        found = read_sources(run, settings, record["pack"], scored)
-        assert found and kept and found[0].name == kept[0].name == "toy"
-        assert all((getattr(found[0], k) == getattr(kept[0], k)).all() for k in ("ids", "groups"))
-    assert len(found[0].ids) == len(pack.rows("train", "unlabelled"))
-    gone = replace(settings, data=replace(settings.data, path=tmp_path / "gone"))
-    assert read_sources(run, gone, record["pack"], turned) is None
-    assert read_sources(run, settings, "another", turned) is None
-    record["run"]["data"]["path"] = str(tmp_path / "gone")
-    (run / "run.json").write_text(json.dumps(record))
-    # The model's own header still names the pack; without it on disk nothing is known.
-    (run / "log.jsonl").unlink()
     result = probe_runs([run], ProbeConfig(tasks=("pattern",), modalities=("touch",), controls=False), turned)
     assert {r["leak"] for r in result["records"]} == {"unknown"} and "unknown" in result["leaks"][0]
     assert with_interval(0.5, 0.4, 0.6, "unknown") == "50.0 [40.0, 60.0] LEAK?"
@@ -143,14 +125,13 @@ def test_groups_leak_where_no_row_does(pack: Pack) -> None:
 
 def test_every_source_of_a_run_counts(pack: Pack, tmp_path: Path) -> None:
     """A run may have several: its own rows, and those of a run whose weights it started from."""
-    settings = smoke(pack)
     own, other = source_of(pack, pack.rows("train")), replace(source_of(pack, pack.rows("test")), name="before")
     write_sources(tmp_path, [own, other])
-    read = read_sources(tmp_path, settings, None, pack)
+    read = read_sources(tmp_path)
     assert read and [source.name for source in read] == ["toy", "before"]
     leak = Scored(pack).leak(read, pack.rows("test"))
     assert leak.endswith("were trained on (before)") and "(toy)" not in leak
-    assert leaks_of([{"source": "a", "task": "t", "leak": leak}] * 2) == [f"a, t: {leak}"]
+    assert leaks_of([{"source": "a", "task": "t", "leak": leak}] * 2) == [f"a, t: {leak}", NOT_SEEN]
 
 
 def test_numbers_mean_nothing_outside_their_dataset(pack: Pack) -> None:
@@ -178,12 +159,19 @@ class Renamed(Toy):
         return [replace(sample, columns={**sample.columns, "id": f"row {item}", "group": f"new {item}"})]
 
 
-def test_the_same_images_under_other_names_leak(pack: Pack, tmp_path: Path) -> None:
-    renamed = build(Renamed(), tmp_path / "renamed", size=32, quiet=True)
-    learned = source_of(pack, pack.rows("train"))
-    write_sources(tmp_path, [learned])
-    (read,) = read_sources(tmp_path, smoke(pack), None, pack) or ()
-    assert np.array_equal(read.images, learned.images) and len(read.images) == len(pack.rows("train"))
+@pytest.mark.parametrize("kept", ["both", "touch", "touch beside another photo"])
+def test_the_same_images_under_other_names_leak(pack: Pack, tmp_path: Path, kept: str) -> None:
+    """Each image counts, whatever it is paired with."""
+
+    class Kept(Renamed):
+        def read(self, item: int) -> list[Sample]:
+            (sample,) = super().read(item)
+            return [replace(sample, vision=np.rot90(sample.vision)) if "photo" in kept else sample]  # type: ignore
+
+    renamed = build(Kept(vision_channels=3 * (kept != "touch")), tmp_path / "renamed", size=32, quiet=True)
+    write_sources(tmp_path, [source_of(pack, pack.rows("train"))])
+    (read,) = read_sources(tmp_path) or ()
+    assert len(read.images) == 2 * len(pack.rows("train"))
     for split, num in (("train", len(pack.rows("train"))), ("test", 0)):
         rows = renamed.rows(split)
         leak = Scored(renamed).leak([read], rows)
@@ -191,14 +179,13 @@ def test_the_same_images_under_other_names_leak(pack: Pack, tmp_path: Path) -> N
 
 
 def test_equal_checksums_by_chance_are_no_leak(pack: Pack) -> None:
-    """Of 100,000 and 100,000 images of one modality, two have the same CRC-32."""
-    scored = Scored(pack)
-    scored._images = np.arange(1, 121, dtype=np.uint64)  # one modality: below 2 ** 32
-    images = np.concatenate([[5], np.arange(1 << 20, (1 << 20) + (1 << 23), dtype=np.uint64)]).astype(np.uint64)
-    source = replace(source_of(pack, pack.rows("train")), ids=np.ones(1, np.uint64), groups=np.ones(1, np.uint64))
-    rows = np.arange(120)
-    assert scored.leak([replace(source, images=images)], rows) == ""
-    assert scored.leak([replace(source, images=images[:1])], rows).startswith("1 of 120")
+    """Of 100,000 and 100,000 different images, two or three have the same CRC-32."""
+    rows, sums = pack.rows("train"), image_sums(pack)
+    one = sums[rows[:1], 1]  # of touch
+    some = known_images(pack, rows, one)
+    assert some.sum() == 1 and some[0, 1]
+    others = (1 << 33) + np.arange(1 << 23, dtype=np.uint64)
+    assert not known_images(pack, rows, np.concatenate([one, others])).any()
 
 
 def test_scores_on_val_are_not_taken_for_those_on_test(pack: Pack, tmp_path: Path) -> None:

@@ -226,7 +226,7 @@ def test_a_leak_of_the_ancestor_stands_beside_the_score(ancestor: Path, pack: Pa
     assert "72 of 72 test rows" in leaks["fine-tuned, all"] and "72 of 72" in leaks[FROZEN] and leaks[SCRATCH] == ""
     scratch = tmp_path / "out" / "scratch" / "seed0"  # saw its own train alone, which the other split tests
     with pytest.raises(ValueError, match=r"has seen what .* (\d+) of \1 test rows"):
-        check_unseen([scratch], [load(scratch)], pack, pack.spec.tasks, allow_leak=False)
+        check_unseen([scratch], pack, pack.spec.tasks, allow_leak=False)
 
 
 # -- adapt --------------------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ TINY = EncoderConfig(trunk="mvitac_tiny", weights="scratch")
 def started(pack: Pack, init: Init, **changes: object) -> tuple[Run, torch.nn.Module, dict[str, list[str]]]:
     """A method before its first step, which starts from ``init``, and what it took."""
     run = smoke(pack, seed=5, init=init.resolved(), **changes)
-    start = read_start(run.init, pack)
+    start = read_start(run.init)
     torch.manual_seed(run.seed)
     method = run.method.build(pack.spec, run.encoder)
     assert start
@@ -98,7 +98,7 @@ def test_a_bare_file_and_one_modality(pack: Pack, smoke_run: Path, tmp_path: Pat
     safetensors.torch.save_file({f"encoders.touch.{k}": v for k, v in trunk.state_dict().items()}, named)
     assert started(pack, Init(path=named))[2] == {"touch": ["trunk"]}
     run = smoke(pack, init=Init(path=named).resolved())
-    found = load_start(read_start(run.init, pack), run.method.build(pack.spec, run.encoder))  # type: ignore[arg-type]
+    found = load_start(read_start(run.init), run.method.build(pack.spec, run.encoder))  # type: ignore[arg-type]
     assert describe(found).endswith(": touch trunk, not vision (it has touch only)")
     safetensors.torch.save_file(state, bare)
     with pytest.raises(ValueError, match=r"'vision\.weight' has no place in this network"):
@@ -201,7 +201,7 @@ def test_leaks_through_ancestors_are_refused_and_marked(
     pack: Pack, chain: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("c", "d"):
-        found = read_sources(chain[name], *load_run(chain[name])[:1], None, pack)
+        found = read_sources(chain[name])
         assert found and [len(source.ids) for source in found] == [len(pack.rows("train")), len(pack.rows("test"))]
         asked = ["probe", str(chain[name]), "--tasks", "pattern", "--modalities", "touch", "--no-controls"]
         if name == "c":

@@ -110,6 +110,5 @@ def _images_seen(model: Model, path: Path) -> int | None:
     if run.encoder.weights != SCRATCH or run.init.digest or not (steps or (path / FILE).exists()):
         return None
     if not steps:
-        with_rows = read_sources(path, run, None, None)  # type: ignore[arg-type]  # the file exists, no pack is needed
-        steps = run.num_steps(sum(len(source.ids) for source in with_rows or ()))
+        steps = run.num_steps(sum(len(source.ids) for source in read_sources(path) or ()))
     return steps * run.batch_size

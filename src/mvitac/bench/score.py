@@ -20,9 +20,8 @@ from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, label_controls, pixel_controls
-from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.features import features
-from mvitac.evaluation.leaks import Scored, declared_leak
+from mvitac.evaluation.leaks import Scored, declared_leak, read_sources
 from mvitac.evaluation.probe import joined, names_in, probe_all, split_rows
 from mvitac.evaluation.robustness import few_labels
 from mvitac.evaluation.scores import pool
@@ -150,7 +149,7 @@ class Entry:
         pack, found = opened.packs[0], []
         for place, model in zip(self.places, self.models, strict=True):
             own = isinstance(model, ExternalModel)
-            sources = None if own else check_unseen([Path(place)], [model], pack, [], allow_leak=True)[0]
+            sources = None if own else read_sources(Path(place))
             found.append(declared_leak(self.trained_on, names) if sources is None else Scored(pack).leak(sources, rows))
         return found
 

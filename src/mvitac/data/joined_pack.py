@@ -7,7 +7,8 @@ import pyarrow as pa
 
 from mvitac.data.lazy import Pieces
 from mvitac.data.pack import Images, Pack
-from mvitac.data.spec import AnyTask, Task, ValueTask
+from mvitac.data.row_hashes import image_sums, known_images
+from mvitac.data.spec import MODALITIES, AnyTask, Task, ValueTask
 from mvitac.registry import unknown
 from mvitac.system.files import brief
 
@@ -16,7 +17,7 @@ class JoinedPack(Pack):
     """Train and val rows of ``learn`` followed by test rows of ``score``.
 
     Tasks are those that both packs have, with the classes of ``learn``. ValueError if there is none, or the packs have
-    other image shapes, classes that ``learn`` lacks, or a group in both (its test rows would not be unseen).
+    other image shapes, classes that ``learn`` lacks, or a group or an image in both (test rows would not be unseen).
 
     Attributes:
         learn: The first pack; its rows come first.
@@ -45,16 +46,23 @@ class JoinedPack(Pack):
             m: Pieces(self._shape(m, self.num), starts, [learn.images[m], score.images[m]].__getitem__)
             for m in self.spec.modalities
         }
-        group = self.column("group").astype(str)
+        if found := self._shared():
+            raise ValueError(
+                f"{found[0]} is learned from in {learn.path} and scored in {score.path}, one of {found[1]}: give packs"
+                " whose splits agree, or leave these rows out"
+            )
+
+    def _shared(self) -> tuple[str, int] | None:
+        """A group or an image that probes learn from and are scored on, and how many there are."""
+        groups, sums, by = self.column("group").astype(str), image_sums(self), self.spec.group_by
         for task in self.spec.all_tasks:
-            seen = np.isin(self.column(task.split), ["train", "val"])
-            shared = np.intersect1d(group[seen], group[self.rows("test", by=task.split)])
-            if len(shared):
-                by = learn.spec.group_by
-                raise ValueError(
-                    f"{by} {str(shared[0])!r} is learned from in {learn.path} and scored in {score.path}, one of"
-                    f" {len(shared)}: give packs whose splits agree, or give a different {by} another name"
-                )
+            learned, scored = (self.rows(*splits, by=task.split) for splits in (("train", "val"), ("test",)))
+            if by != "row" and len(both := np.intersect1d(groups[learned], groups[scored])):
+                return f"{by} {str(both[0])!r}", len(both)
+            for same, modality in zip(known_images(self, scored, sums[learned]).T, MODALITIES, strict=True):
+                if same.any():
+                    return f"the {modality} image of row {str(self.own_ids[scored[same][0]])!r}", int(same.sum())
+        return None
 
     @property
     def own_ids(self) -> np.ndarray:
@@ -103,6 +111,7 @@ def _side(pack: Pack, tasks: list[tuple[AnyTask, AnyTask]], splits: set[str], na
     read = {
         "id",
         "group",
+        *(f"crc_{modality}" for modality in MODALITIES),
         *(c for task, _ in tasks for c in task.only),
         *(target.name for task, _ in tasks if isinstance(task, ValueTask) for target in task.targets),
         *(c for cs in pack.spec.controls.values() for c in cs),

@@ -13,7 +13,7 @@ import pyarrow as pa
 from mvitac.data.lazy import Pieces
 from mvitac.data.mixed_table import MixedTasks, mixed_spec, mixed_table, renamed_columns
 from mvitac.data.pack import Images, Pack, has_difference
-from mvitac.data.row_hashes import number_hint, row_hashes
+from mvitac.data.row_hashes import image_sums, known_images, number_hint, row_hashes
 from mvitac.data.spec import MODALITIES
 from mvitac.system.files import digest
 
@@ -165,31 +165,9 @@ def _shared(parts: Mapping[str, Pack]) -> str:
                 by = other.spec.group_by if column == "group" else "row"
                 hint = number_hint(one.spec.name, other) if column == "id" else ""
                 return f"{by} {str(what)!r} is in train of part {a} and in test of part {b}, one of {num}{hint}"
-        for modality in MODALITIES:
-            if same := _same_image(one, other, modality, learned, scored):
-                i, j, num = same
-                names = [f"{p.column('id')[row]!r} ({p.column('group')[row]})" for p, row in ((one, i), (other, j))]
-                return (
-                    f"one {modality} image has two names: it is row {names[0]} in train of part {a} and row {names[1]} in"
-                    f" test of part {b}, one of {num}"
-                )
+        same = known_images(other, scored, image_sums(one)[learned])
+        for rows, modality in zip(same.T, MODALITIES, strict=True):
+            if rows.any():
+                row = f"{other.column('id')[scored[rows][0]]!r} ({other.column('group')[scored[rows][0]]})"
+                return f"the {modality} image of row {row} in test of part {b} is in train of part {a}, one of {rows.sum()}"
     return ""
-
-
-def _same_image(
-    one: Pack, other: Pack, modality: str, ours: np.ndarray, theirs: np.ndarray
-) -> tuple[int, int, int] | None:
-    """A row of each pack with the same image, and the number of such images. None if there is none.
-
-    Only images of one size and storage can be compared. An image of a single value (nothing) is not looked at.
-    """
-    sums = f"crc_{modality}"
-    packs = (one, other)
-    if not all(sums in p.table.column_names for p in packs) or len({(p.size, p.store) for p in packs}) > 1:
-        return None
-    shared, first, second = np.intersect1d(one.column(sums)[ours], other.column(sums)[theirs], return_indices=True)
-    for i, j in zip(ours[first].tolist(), theirs[second].tolist(), strict=True):
-        image = one.images[modality][i]
-        if image.min() < image.max() and np.array_equal(image, other.images[modality][j]):
-            return i, j, len(shared)
-    return None

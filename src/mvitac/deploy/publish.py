@@ -147,7 +147,7 @@ def with_probes(model: Model, pack: Pack | None = None) -> Model:
 def _fit_and_score(run: Path, model: Model, pack: Pack, allow_leak: bool) -> tuple[list[Source] | None, dict[str, Any]]:
     """Fit the probes of ``model``; returns what it learned from, if that is known, and the scores of ``_scores``."""
     tasks = {task.name: task for task in scorable(pack)}
-    learned, scored = check_unseen([run], [model], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
+    learned, scored = check_unseen([run], pack, [*tasks.values()], allow_leak=allow_leak)[0], Scored(pack)
     fitted = _fit_all(model, pack)
     for probe, record in fitted:
         q = probe.info

@@ -117,7 +117,7 @@ def probe_runs(
     # The initial weights that an artifact names may be any file or download.
     runs = [scratch(m.run) if m.foreign else m.run for m in models]
     _check_weights(runs, session)
-    sources = check_unseen(paths, models, pack, tasks, allow_leak=allow_leak)
+    sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak)
     each = [*zip(paths, models, names, sources, strict=True)]
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
     records += probe_encoders(others, tasks, modalities, session.probes, controls=session.controls)
@@ -254,7 +254,7 @@ def check_channels(path: Path, model: Model, pack: Pack, modalities: Sequence[st
 
 
 def check_unseen(
-    paths: Sequence[Path], models: Sequence[Model], pack: Pack, tasks: Sequence[AnyTask], *, allow_leak: bool
+    paths: Sequence[Path], pack: Pack, tasks: Sequence[AnyTask], *, allow_leak: bool
 ) -> list[list[Source] | None]:
     """What each run at ``paths`` learned from; None where that is not known.
 
@@ -263,9 +263,9 @@ def check_unseen(
             its own data follows from the split that was chosen, so there the scores only say LEAK.
     """
     scored, sources = Scored(pack), []
-    for path, model in zip(paths, models, strict=True):
+    for path in paths:
         digest = (load_run(path)[1] if (path / "run.json").exists() else {}).get("pack")
-        sources.append(learned := read_sources(path, model.run, digest, pack))
+        sources.append(learned := read_sources(path))
         refused = [] if allow_leak else (learned or [])[digest == pack.digest :]
         for task in tasks if refused else ():
             if (leak := scored.leak(refused, split_rows(pack, task).test)) not in ("", UNKNOWN):

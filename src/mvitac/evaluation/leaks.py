@@ -1,15 +1,15 @@
 """Test rows that a model was trained on: what a run learned from is kept beside it, and compared with what is scored.
 
     <run>/trained_on.safetensors    for each source i: <i>.ids and <i>.groups, sorted hashes (uint64) of the ids and groups
-                                    of the rows trained on, and <i>.images, their images' checksums, which older files
-                                    lack; its name in the header. sha256: digest of all
+                                    of the rows trained on, and <i>.images, their images' checksums; its name in the
+                                    header. sha256: digest of all
 
 The first source of a run is its own training rows. A run that starts from another model's weights adds the sources of that
 model. A source without rows stands for weights of which nothing says what they were trained on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,14 @@ import safetensors
 import safetensors.numpy
 
 from mvitac.data.pack import Pack
-from mvitac.data.row_hashes import image_sums, row_hashes
-from mvitac.data.windows import windowed
-from mvitac.datasets.pack import PackConfig
-from mvitac.model_files import is_foreign
+from mvitac.data.row_hashes import image_sums, known_images, row_hashes
 from mvitac.nn.encoders import IMAGENET, SCRATCH
 from mvitac.run import Run
 from mvitac.system.files import SEAL, brief, digest, write_atomic
 
 FILE = "trained_on.safetensors"
 KEYS = ("ids", "groups", "images")
+NOT_SEEN = "copies as JPEG, resized or mirrored are not seen; `mvitac data check PACK OTHER` finds resized ones"
 UNKNOWN = "unknown"  # a leak that cannot be checked, because nothing says what the run was trained on
 
 
@@ -38,7 +36,7 @@ class Source:
     name: str  # name of the dataset
     ids: np.ndarray  # uint64, sorted: hashes of the rows' ids
     groups: np.ndarray  # uint64, sorted: hashes of the rows' groups
-    images: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint64))  # uint64, sorted: ``image_sums``
+    images: np.ndarray  # uint64, sorted: ``image_sums`` of the rows
 
 
 def source_of(pack: Pack, rows: np.ndarray) -> Source:
@@ -49,7 +47,7 @@ def source_of(pack: Pack, rows: np.ndarray) -> Source:
 
 def unknown_source(name: str) -> Source:
     """The source of weights of which nothing says what they were trained on."""
-    return Source(name, np.zeros(0, np.uint64), np.zeros(0, np.uint64))
+    return Source(name, *(np.zeros(0, np.uint64) for _ in KEYS))
 
 
 def weights_sources(run: Run) -> list[Source]:
@@ -81,86 +79,50 @@ def write_sources(folder: Path, sources: Sequence[Source]) -> None:
 
 def _digest(sources: Sequence[Source]) -> np.ndarray:
     """uint8 [32]"""
-    each = ([source.name, *(getattr(source, key).tolist() for key in KEYS)] for source in sources)
-    content = [one if one[-1] else one[:-1] for one in each]  # older files have no images
+    content = [[source.name, *(getattr(source, key).tolist() for key in KEYS)] for source in sources]
     return np.frombuffer(bytes.fromhex(digest(content)), np.uint8)
 
 
-def read_sources(folder: Path, run: Run, digest: str | None, pack: Pack) -> list[Source] | None:
-    """What the run in ``folder`` learned from; None if that is not known.
-
-    Runs of version 0.1.0 have no such file. Their rows are computed from their data, whose ``digest`` is in run.json,
-    if it is ``pack`` (the data to score) or is still there.
-    """
-    if (folder / FILE).exists():
-        try:
-            with safetensors.safe_open(folder / FILE, framework="numpy") as file:
-                names = file.metadata()
-                tensors = file.get_tensor
-                seal = tensors(SEAL) if SEAL in file.keys() else None  # noqa: SIM118 # 0.1.0 wrote none
-                keys = [key for key in KEYS if f"0.{key}" in file.keys()]  # noqa: SIM118
-                found = [Source(names[i], *(tensors(f"{i}.{key}") for key in keys)) for i in sorted(names, key=int)]
-            if seal is not None and not np.array_equal(seal, _digest(found)):
-                raise ValueError("it does not match its digest")
-            return found
-        except Exception as error:  # safetensors raises several types for damaged files
-            raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
-    own = pack if pack.digest == digest else _own_pack(folder, run)
-    if own is None or own.digest != digest:
-        return None
-    return [source_of(own, run.method.training_rows(own)), *weights_sources(run)]
-
-
-def _own_pack(folder: Path, run: Run) -> Pack | None:
-    """The pack that a run was trained on, if it is on disk. Artifacts name paths of other machines or strangers: None."""
-    if is_foreign(folder) or not (folder / "log.jsonl").exists():
+def read_sources(folder: Path) -> list[Source] | None:
+    """What the run in ``folder`` learned from; None if that is not known."""
+    if not (folder / FILE).exists():
         return None
     try:
-        place = run.data.path if isinstance(run.data, PackConfig) else run.data.place()
-        return windowed(Pack(place, verify=False), run.data.frame_window())
-    except (ValueError, OSError):
-        return None
+        with safetensors.safe_open(folder / FILE, framework="numpy") as file:
+            names = file.metadata()
+            found = [Source(names[i], *(file.get_tensor(f"{i}.{key}") for key in KEYS)) for i in sorted(names, key=int)]
+            if not np.array_equal(file.get_tensor(SEAL), _digest(found)):
+                raise ValueError("it does not match its digest")
+        return found
+    except Exception as error:  # safetensors raises several types for damaged files
+        raise ValueError(f"{folder / FILE} is damaged ({brief(error)}): copy it again, or re-train") from None
 
 
 class Scored:
     """The rows of a pack that are scored, to be compared with what models learned from."""
 
     def __init__(self, pack: Pack) -> None:
-        self.pack, (self._ids, self._groups), self._images = pack, row_hashes(pack), image_sums(pack)
+        self.pack, (self._ids, self._groups) = pack, row_hashes(pack)
 
     def leak(self, sources: Sequence[Source] | None, rows: np.ndarray) -> str:
         """Say which of the test ``rows``, and how many of their groups, are in ``sources``; "" if none is.
 
-        ``UNKNOWN`` if none is in those that are known, but not all are known.
+        A row is in a source by its id, or by any of its images. ``UNKNOWN`` if none is in those that are known, but not
+        all are known.
         """
         if sources is None:
             return UNKNOWN
-        found = []
+        found, by = [], self.pack.spec.group_by
         for source in sources:
-            groups = np.unique(self._groups[rows])
             seen = np.isin(self._ids[rows], source.ids)
-            seen[~seen] = self._same_images(rows[~seen], source)
+            seen[~seen] = known_images(self.pack, rows[~seen], source.images).any(axis=1)
+            groups = np.unique(self._groups[rows]) if by != "row" else np.zeros(0)  # a row's number says nothing more
             num_rows, num_groups = int(seen.sum()), int(np.isin(groups, source.groups).sum())
-            if self.pack.spec.group_by == "row":
-                num_groups = 0  # its number in the table, which says nothing that the id does not
             if num_rows or num_groups:
-                by = self.pack.spec.group_by
                 grouped = f" and {num_groups} of {len(groups)} test {by}s" if by != "row" else ""
                 found.append(f"{num_rows} of {len(rows)} test rows{grouped} were trained on ({source.name})")
         unknown = any(not len(source.ids) for source in sources)
         return "; ".join(found) or (UNKNOWN if unknown else "")
-
-    def _same_images(self, rows: np.ndarray, source: Source) -> np.ndarray:
-        """bool [rows]: whether all images of a row were trained on, and one of them shows something.
-
-        Checksums of single images may be equal by chance: as few as that are no leak.
-        """
-        sums = self._images[rows]
-        same = np.isin(sums, source.images)
-        chance = len(rows) * len(source.images) / 2**32 if len(sums) and sums.max() < 2**32 else 0.0
-        for i in np.flatnonzero(same):
-            same[i] = any(np.ptp(self.pack.images[modality][rows[i]]) for modality in self.pack.spec.modalities)
-        return same & (same.sum() > 10 * chance)
 
 
 def declared_leak(trained_on: str | None, names: Sequence[str]) -> str:
@@ -192,4 +154,4 @@ def leaks_of(records: Sequence[dict[str, Any]]) -> list[str]:
             lines.append(f"{record['source']}: {unknown}")
         elif record.get("leak"):
             lines.append(f"{record['source']}, {record.get('task') or 'retrieval'}: {record['leak']}")
-    return list(dict.fromkeys(lines))
+    return [*dict.fromkeys(lines), *([NOT_SEEN] if lines else [])]

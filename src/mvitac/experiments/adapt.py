@@ -78,14 +78,14 @@ def adapt(
     check_channels(ancestor, model, pack, tuple(model.encoders))
     packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
     sources = {  # refuses leaks before anything is trained
-        name: check_unseen([ancestor], [model], one, scorable(one), allow_leak=asked.allow_leak)[0]
+        name: check_unseen([ancestor], one, scorable(one), allow_leak=asked.allow_leak)[0]
         for name, one in packs.items()
     }
     train(_run_of(model, ancestor, data, pack, asked), out, resume=resume, quiet=quiet, pack=pack)
     records, after = [], load(out)
     with shown(quiet=quiet), work("scoring before and after", 2 * len(packs), "parts") as advance:
         for name, one in packs.items():
-            learned = read_sources(out, after.run, pack.digest, one)
+            learned = read_sources(out)
             for source, scored, known in (("before", model, sources[name]), ("after", after, learned)):
                 found = _scores(scored, one, known, retrieval=name in (NEW, OLD))
                 records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]

@@ -115,7 +115,7 @@ def finetune(
         _check_classes(job, task)
     if 100 in asked.fractions and len(asked.lr) + len(asked.steps) > 2 and (why := job.too_few(100)):
         raise ValueError(f"{why}: give one --lr and one --steps")
-    sources = check_unseen([ancestor], [model], pack, tasks, allow_leak=asked.allow_leak)[0]
+    sources = check_unseen([ancestor], pack, tasks, allow_leak=asked.allow_leak)[0]
     found = {percent: _fraction(job, percent, sources) for percent in asked.fractions}
     records = [record for own, _ in found.values() for record in own]
     result = {
@@ -218,7 +218,7 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
             job.say(f"{percent:g} %: {kind}, seed {seed}, {run.steps} steps of {run.batch_size}")
             train(run, path, resume=True, quiet=job.quiet, pack=job.pack, validate=False)  # all groups are learned from
             own = own_heads(load(path), job.pack, job.tasks, [job.modality])
-            own = job.named(own, kind, percent, seed, read_sources(path, run, job.pack.digest, job.pack))
+            own = job.named(own, kind, percent, seed, read_sources(path))
             own = [{**record, "run": str(path)} for record in own]
             scores = {"data": job.pack.spec.name, "pack": job.pack.digest, "records": own}
             write_json(path / "scores.json", scores, sealed=True)

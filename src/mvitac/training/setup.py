@@ -84,7 +84,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
             return None
         _check_precision(begun, asked, run, out)
 
-    start_weights = read_start(run.init, pack)
+    start_weights = read_start(run.init)
     method, taken = _build_method(run, pack, rows, device, world, start_weights)
     step = Step(run, method, device, world)
     num_steps = run.num_steps(len(rows))

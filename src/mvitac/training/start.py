@@ -14,7 +14,7 @@ from mvitac.model_files import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import FORMAT, read_safetensors
-from mvitac.run import Run, read_record
+from mvitac.run import Run
 
 State = dict[str, Tensor]
 ANY = "any"  # key of a trunk's weights in a file that does not say which modality they are for
@@ -32,8 +32,8 @@ class Start:
     sensors: tuple[str, ...] = ()  # touch sensors that they met, as far as the file says
 
 
-def read_start(init: Init, pack: Pack) -> Start | None:
-    """Read the weights of ``init``, for a run on ``pack``; None if it names none."""
+def read_start(init: Init) -> Start | None:
+    """Read the weights of ``init``; None if it names none."""
     if not init:
         return None
     header, tensors = read_safetensors(init.file)
@@ -41,7 +41,7 @@ def read_start(init: Init, pack: Pack) -> Start | None:
         model = load(init.file)
         trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
         heads = {m: head.state_dict() for m, head in model.projectors.items()}
-        learned = _learned(init.file, pack)
+        learned = _learned(init.file)
         return Start(init, trunks, heads, model.run.encoder.trunk, learned, model.spec.sensors)
     trunks = {m: _below(f"encoders.{m}.", tensors) for m in ("vision", "touch")}
     heads = {m: state for m in trunks if (state := _below(f"projectors.{m}.", tensors))}
@@ -53,13 +53,12 @@ def _below(prefix: str, tensors: State) -> State:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def _learned(file: Path, pack: Pack) -> list[Source]:
+def _learned(file: Path) -> list[Source]:
     """What the model in ``file`` learned from. Only its own folder knows: a copied file is unknown."""
     folder = file.parent
     if not file.name.startswith(MODEL.split(".")[0]) or not (folder / "run.json").exists():
         return [unknown_source(file.name)]
-    run, record = read_record(folder / "run.json")
-    found = read_sources(folder, run, record.get("pack"), pack)
+    found = read_sources(folder)
     return [unknown_source(folder.name)] if found is None else found
 
 
