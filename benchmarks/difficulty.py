@@ -12,8 +12,6 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.methods.supervised import SupervisedConfig
@@ -50,8 +48,7 @@ def main() -> None:
         for seed in range(options.seeds)
     ]
     result = probe_runs(paths, ProbeConfig())
-    console = Console()
-    print_summary(result, console)
+    print_summary(result)
     verdicts = {}
     for task, by_modality in result["summary"].items():
         supervised, untrained = by_modality["both"]["supervised"]["mean"], by_modality["both"]["untrained"]["mean"]
@@ -61,7 +58,7 @@ def main() -> None:
             "holds": supervised - untrained >= MARGIN and supervised < CEILING,
         }
         scores = f"supervised {100 * supervised:.1f}, untrained {100 * untrained:.1f}"
-        console.print(f"{task}: {scores}; the rule {'holds' if verdicts[task]['holds'] else 'DOES NOT HOLD'}")
+        print(f"{task}: {scores}; the rule {'holds' if verdicts[task]['holds'] else 'DOES NOT HOLD'}")
     if options.json:
         write_json(
             options.json,

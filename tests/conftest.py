@@ -62,11 +62,11 @@ def ctrl_c() -> Iterator[None]:
 
 @pytest.fixture
 def forked_pools(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pools of processes begin at once (``support.processes``); new ones would import torch, 5 s of CPU each."""
-    from mvitac.system import processes
+    """Processes of a comparison begin at once (``support.processes``); new ones would import torch, 5 s of CPU each."""
+    from mvitac.experiments import jobs
     from support.processes import CONTEXT
 
-    monkeypatch.setattr(processes, "_Context", lambda: CONTEXT)
+    monkeypatch.setattr(jobs, "SPAWN", CONTEXT)
 
 
 @pytest.fixture

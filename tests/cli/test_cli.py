@@ -104,7 +104,6 @@ def test_the_whole_road(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
 
 
-@pytest.mark.usefixtures("forked_pools")
 def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -129,7 +128,6 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     assert "recipe quick: " in shown and "2 steps of 16 pairs" in shown
     assert "report.html" in shown and "majority" in shown and "materials: force" in shown
     assert (tmp_path / "demo" / "report" / "figures" / "probe-force.png").exists()
-    assert "pre-training: 4/4 steps in" in shown  # of both seeds; no terminal: a line instead of bars
     weights = tmp_path / "demo" / "seed1" / "model.safetensors"
     before = weights.stat().st_mtime_ns
     monkeypatch.setattr("mvitac.experiments.demo.probe_runs", None)  # calling it would raise

@@ -33,8 +33,7 @@ def test_help_is_golden(command: str, capsys: pytest.CaptureFixture[str], monkey
         path.write_text(text)
     assert text == path.read_text()
     assert main([*command.split(), "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert "".join(shown.split()) == "".join(text.split()) and all(len(line) <= 80 for line in shown.splitlines())
+    assert capsys.readouterr().out == text
 
 
 def test_help_imports_nothing_heavy() -> None:

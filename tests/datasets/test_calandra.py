@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
@@ -15,7 +16,6 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from rich.console import Console
 
 from mvitac.bench.suite import find_suite, open_set
 from mvitac.cli.main import main
@@ -388,10 +388,8 @@ def test_after_reaches_no_probe_unless_named_and_then_every_table_says_so(leakin
         run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=2, eval_every=1)
         session = ProbeConfig(probes=("linear", "knn"), modalities=("touch",))
         result = probe_runs([train(run, tmp_path / f"run-{ask[0]}", quiet=True)], session)
-        console = Console(record=True, width=120, file=(tmp_path / "out.txt").open("w"))
-        print_summary(result, console)
-        tables = console.export_text()
-        console.file.close()
+        print_summary(result, file := io.StringIO())
+        tables = file.getvalue()
         log = (tmp_path / f"run-{ask[0]}" / "log.jsonl").read_text()
         shown[ask[0]] = result["summary"], tables, log
     honest, leaked = shown["during"], shown["after"]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from rich.console import Console
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -82,7 +82,8 @@ def test_the_command_continues_a_finished_one_and_prints_one_table(
         assert main(["finetune", str(ancestor), "--data", "pack", "--data.path", str(pack.path), *words.split()]) == 0
     assert (tuned / "scores.json").read_text() == before
     said = capsys.readouterr().out
-    rows = {line.split("│")[1].strip(): line.split("│")[2:4] for line in said.splitlines() if line.count("│") == 4}
+    cells = [re.split("  +", line) for line in said.splitlines() if line.count("[") == 2]
+    rows = {name: scores for name, *scores in cells}
     gains = [f"gain over {SCRATCH}", f"gain over {FROZEN}"]
     assert list(rows) == ["fine-tuned, all", SCRATCH, FROZEN, *gains]
     assert "40 % of instances" in said and "100 % of instances" in said and f"mvitac publish {tuned / 'seed0'}" in said
@@ -97,7 +98,7 @@ def test_a_loss_against_the_frozen_probe_is_said_with_what_to_do(lost: bool) -> 
     ours, frozen = (low, high) if lost else (high, low)
     records = [{**ours, "source": "fine-tuned, all"}, {**frozen, "source": FROZEN}]
     result = {"data": "d", "group_by": "object", "ancestor": "runs/a", "records": records, "notes": [], "leaks": []}
-    print_finetuning(result, Console(file=(file := io.StringIO()), width=120, markup=False))
+    print_finetuning(result, file := io.StringIO())
     assert ("use the frozen probe of runs/a instead, with `mvitac publish --on PACK`" in file.getvalue()) == lost
 
 

@@ -20,6 +20,7 @@ import pyarrow as pa
 import pytest
 from av.error import FFmpegError
 from PIL import Image
+from rich.console import Console
 
 from mvitac.cli.live import _engine, _print_touch, _run, sources, view
 from mvitac.cli.main import main
@@ -37,7 +38,6 @@ from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.model import Model
 from mvitac.report.value_figures import over_time
-from mvitac.system.console import Console
 from support.faults import Clock, Rig, World, faulty
 from support.films import film, shade
 

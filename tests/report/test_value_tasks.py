@@ -16,7 +16,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -77,7 +76,7 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pack, dict[s
 
 def said(result: dict[str, Any], probe: str = "linear") -> str:
     file = io.StringIO()
-    print_summary(result, Console(file=file, width=200, markup=False), probe=probe)
+    print_summary(result, file, probe=probe)
     return file.getvalue()
 
 

@@ -24,7 +24,7 @@ from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.engine import open_engine
 from mvitac.deploy.export import ExportConfig, export
 from mvitac.evaluation.evaluate import ProbeConfig
-from mvitac.experiments.collect import forecast, gather, lay_out
+from mvitac.experiments.collect import gather, lay_out, outline
 from mvitac.experiments.jobs import do, do_all
 from mvitac.experiments.plan import Plan, Row
 from mvitac.experiments.table import lines_of
@@ -231,13 +231,13 @@ def test_compare_says_where_runs_differ(pack: Pack, tmp_path: Path, hardware: Ha
     out, session = tmp_path / "out", ProbeConfig(controls=False)
     hardware(False)
     work = lay_out(plan, pack, out, session)
-    assert [line for line in forecast(work) if "precision" in line] == [
+    assert [line for line in outline(work) if "precision" in line] == [
         "on this machine: precision: fp32 (auto, as this CPU does not compute bf16 itself)",
         "on this machine: precision: fp32",
     ]
     do(work.jobs[0])
     hardware(True)  # another machine does the rest
-    do_all(lay_out(plan, pack, out, session), 1, lambda line: None)
+    do_all(lay_out(plan, pack, out, session), quiet=True)
     result = gather(work, out, session)
     said = "the networks of 'MViTac, seed 1' in bf16, those of all other runs in fp32"
     lines = lines_of(result)

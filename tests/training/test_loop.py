@@ -29,7 +29,6 @@ from mvitac.run import Optim, Run
 from mvitac.system import files
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.loader import Feed
-from mvitac.training.log import last_line
 from mvitac.training.loop import Diverged, train
 from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order
 from mvitac.training.validation import validate
@@ -489,14 +488,6 @@ def test_learning_rate_schedules() -> None:
     assert warm.rate(55, 100, 0) == pytest.approx(0.5)
     step = Optim(lr=1.0, schedule="step")
     assert [step.rate(0, 1, e) for e in (0, 9, 10, 25)] == pytest.approx([1, 1, 0.9, 0.81])
-
-
-def test_last_line_is_the_last_one_about_losses(tmp_path: Path) -> None:
-    assert last_line(tmp_path) == {}
-    told = {"step": 20, "loss": 3.456, "pairs_per_s": 81.6}
-    lines = [{**told, "step": 10}, told, {"step": 20, "eval": {}}, {"step": 21, "eval": {}}, {"step": 22, "eval": {}}]
-    (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"step": 30, "lo')
-    assert last_line(tmp_path) == told
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ from mvitac.cli.options import parse
 from mvitac.evaluation.leaks import leaks_of
 from mvitac.evaluation.scores import summarise
 from mvitac.report.tables import print_summary
-from mvitac.system.console import Console
 from mvitac.system.files import check_place, fields_of
 from mvitac.system.progress import shown
 
@@ -65,16 +64,16 @@ def bench(argv: list[str]) -> None:
     suite = find_suite(options.suite)
     if options.data_root and not options.data_root.is_dir():
         raise ValueError(f"--data-root {options.data_root} is not a folder: give the one with the clones of real data")
-    with shown(Console(stderr=True)):
+    with shown():
         path = run_bench(options.models, suite, options.out, options.data_root, options.about)
-    console, result = Console(markup=False, highlight=False), read_result(path)
+    result = read_result(path)
     for block in result["blocks"]:
         if "not_run" in block:
             print(f"{block['set']}, {block['task']}: not run, {block['not_run']}")
             continue
         records = records_of(block, result["encoder"])
         shown_ = {"data": block["set"], "group_by": block["group_by"], "summary": summarise(records, suite.probes[0])}
-        print_summary({**shown_, "leaks": leaks_of(records)}, console)
+        print_summary({**shown_, "leaks": leaks_of(records)})
     print(f"written: {path} (digest {result['digest'][:16]})")
 
 

@@ -10,15 +10,14 @@ from mvitac.cli.options import parse, selectors
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.evaluate import ProbeConfig
 from mvitac.evaluation.probe import Probe
-from mvitac.experiments.collect import forecast
+from mvitac.experiments.collect import outline
 from mvitac.experiments.cross_validation import gather_folds, lay_out_folds, together
-from mvitac.experiments.jobs import do_all, submit
+from mvitac.experiments.jobs import do_all
 from mvitac.experiments.paper_plans import PLANS, find_plan
 from mvitac.experiments.plan import Plan, setting
 from mvitac.experiments.table_formats import write_tables
 from mvitac.recipes import RECIPES
 from mvitac.registry import default, to_json, unknown
-from mvitac.system.console import Console
 from mvitac.system.device import pick_device
 from mvitac.system.files import check_place, write_json
 
@@ -49,19 +48,13 @@ class _Options:
     """auto, cpu, cuda or cuda:N; with several jobs and GPUs each job has its own."""
     imagenet: Path | None = None
     """ImageNet weights of the trunk (a file), for the frozen-ImageNet control."""
-    stress: bool
-    """Also score 1 % and 10 % of the labels, noisy test images, a modality missing at test time, and a leaking split."""
     dry_run: bool = False
-    """Print the plan, what is finished, what is left and how long it will take, and stop. The time is measured on a few
-    steps of one run where none is finished."""
+    """Print the plan, what is finished and what is left, and stop."""
     tables_only: bool = False
     """Make the tables of what is finished and train nothing."""
-    slurm: str | None = None
-    """Submit the unfinished runs as a SLURM array (extra: slurm) with these submitit parameters, e.g.
-    slurm_partition=gpu,timeout_min=600,gpus_per_node=1, and stop; the same command without it makes the tables."""
 
 
-_SAME = ("seeds", "folds", "probes", "stress")  # fields of a plan that are options, too
+_SAME = ("seeds", "folds", "probes")  # fields of a plan that are options, too
 _MANUAL = """Many runs into one table: methods x settings x seeds, next to controls and the paper's numbers.
 
     First choose, then change single fields below:
@@ -99,16 +92,13 @@ def compare(argv: list[str]) -> None:
         check_place(options.out / "plan.json")
     works = lay_out_folds(plan, options.out, config, options.device)
     work = together(works)
-    print("\n".join(forecast(work, measure=options.dry_run)), flush=True)
+    print("\n".join(outline(work)), flush=True)
     if options.dry_run:
         return
     write_json(options.out / "plan.json", to_json(plan))
-    if options.slurm is not None:
-        print(submit(work, options.slurm))
-        return
     if not options.tables_only:
         jobs = options.jobs or max(1, torch.cuda.device_count())
-        do_all(work, jobs, lambda text: print(text, flush=True), Console(markup=False))
+        do_all(work, jobs)
     written = write_tables(gather_folds(plan, works, options.out, config), options.out)
     print(written[0].read_text(), *(f"written: {path}" for path in written), sep="\n")
 

@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from rich.table import Table
+from tabulate import tabulate
 from tyro.conf import Positional
 
-from mvitac.cli.options import asks_help, check_json, console, parse, save_json, selectors, short
+from mvitac.cli.options import asks_help, check_json, parse, printed_to, save_json, selectors, short
 from mvitac.data.build import build
 from mvitac.data.checks.finding import some
 from mvitac.data.notebook import measured
@@ -81,7 +81,7 @@ def _build(config: Any, argv: list[str], prog: str) -> None:
     if lost := pack.meta["damaged"]:
         first = ": ".join(lost[0])
         print(f'{len(lost)} left out, listed under "damaged" in {pack.path / "pack.json"}; first {first}')
-    console(None).print(_groups(pack))
+    print(_groups(pack))
     for note in pack.spec.notes:
         print(f"note: {note}")
 
@@ -152,26 +152,26 @@ def info(argv: list[str]) -> None:
     options = parse(_InfoOptions, argv, "data info")
     check_json(options.json)
     pack = open_packs(options.pack)
-    found, say = _describe(pack), console(options.json)
+    found, say = _describe(pack), printed_to(options.json)
     stored = "" if pack.store == "raw" else f", JPEG of quality {pack.meta['quality']}"
     title = f"{pack.path}: {pack.spec.name}, {pack.num} samples at {pack.size} px{stored}"
     groups = "groups" if pack.spec.group_by == "row" else f"{pack.spec.group_by}s"
     values = [f"{v['target']}, {v['unit']}" for v in next(iter(found["splits"].values()), {}).get("values", ())]
     heads = ("split", "rows", groups, *(f"{t.name}: majority" for t in pack.spec.tasks), *values)
-    table = Table(*heads, title=title, title_justify="left")
+    rows = []
     for name, split in found["splits"].items():
         cells = [f"{m['class']} {100 * m['share']:.1f} %" if m else "" for m in split["majority"].values()]
         cells += [f"{v['low']:.3g} to {v['high']:.3g}" if v["rows"] else "" for v in split.get("values", ())]
-        table.add_row(name, str(split["rows"]), str(split["groups"]), *cells)
-    say.print(table)
+        rows.append([name, split["rows"], split["groups"], *cells])
+    print(title, tabulate(rows, heads), "", sep="\n", file=say)
     if lacking := ", ".join(f"{num} rows without {m}" for m, num in found["rows_without"].items()):
-        say.print(f"{lacking}; {found['whole_pairs']} whole pairs")
-    say.print(_groups(pack))
+        print(f"{lacking}; {found['whole_pairs']} whole pairs", file=say)
+    print(_groups(pack), file=say)
     if names := found.get("sensors"):
-        say.print(f"touch sensors: {listed(names)}")
-    say.print(f"source {pack.spec.source}; licence {pack.spec.licence}")
+        print(f"touch sensors: {listed(names)}", file=say)
+    print(f"source {pack.spec.source}; licence {pack.spec.licence}", file=say)
     for note in pack.spec.notes:
-        say.print(f"note: {note}")
+        print(f"note: {note}", file=say)
     save_json(options.json, found)
 
 

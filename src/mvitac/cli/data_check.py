@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.table import Table
-from rich.text import Text
+from tabulate import tabulate
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, console, parse, save_json, selectors, short
+from mvitac.cli.options import check_json, parse, printed_to, save_json, selectors, short
 from mvitac.data.checks.examine import examine_open, examine_pack, examine_source
 from mvitac.data.checks.finding import exit_code
 from mvitac.data.image_grid import Block, draw
@@ -22,7 +21,6 @@ from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
 from mvitac.system.files import check_place, write_atomic
 
-_COLOURS = {"ok": "green", "look": "yellow", "broken": "bold red", "not checkable": "dim"}
 _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step;
     values with glitches or outside train.
 
@@ -100,16 +98,12 @@ def _check_places(options: _Options) -> None:
 def _report(what: str, findings: Sequence[Any], blocks: Sequence[Block], options: _Options) -> int:
     """Print the findings, write the files that ``options`` name, and return the exit code."""
     code = exit_code(findings)
-    table = Table(title=f"{what}: {('ok', 'look', 'broken')[code]}", title_justify="left")
-    for column in ("", "item", "what was found"):
-        table.add_column(column, overflow="fold")
-    for finding in findings:
-        text = finding.evidence + (f"\n-> {finding.advice}" if finding.advice else "")
-        table.add_row(Text(finding.verdict, style=_COLOURS[finding.verdict]), finding.item, text)
-    say = console(options.json)
-    say.print(table)
+    rows = [[f.verdict, f.item, f.evidence + (f"\n-> {f.advice}" if f.advice else "")] for f in findings]
+    table = tabulate(rows, ["", "item", "what was found"], disable_numparse=True, maxcolwidths=[None, 20, 80])
+    say = printed_to(options.json)
+    print(f"{what}: {('ok', 'look', 'broken')[code]}", table, "", sep="\n", file=say)
     save_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
     if options.sheet:
         write_atomic(options.sheet, lambda file: draw(what, blocks).save(file, format="PNG"))
-        say.print(f"written: {options.sheet}", soft_wrap=True)
+        print(f"written: {options.sheet}", file=say)
     return code

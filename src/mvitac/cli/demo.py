@@ -10,7 +10,6 @@ from mvitac.cli.options import parse, selectors
 from mvitac.experiments.demo import run_demo
 from mvitac.recipes import RECIPES, recipe
 from mvitac.run import Run
-from mvitac.system.console import Console
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,4 +30,4 @@ def demo(argv: list[str]) -> None:
     """
     usual = _Options(run=recipe(chosen.get("--recipe", "quick")))
     options = parse(_Options, rest, "demo", default=usual, description=about)
-    run_demo(options.run, options.out, options.seeds, Console(markup=False))
+    run_demo(options.run, options.out, options.seeds)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.table import Table
 from tyro.conf import Positional
 
 from mvitac.cli.options import parse
@@ -16,8 +15,7 @@ from mvitac.deploy.publish import own_data, with_probes
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
 from mvitac.evaluation.evaluate import as_trained
-from mvitac.report.tables import print_summary
-from mvitac.system.console import Console
+from mvitac.report.tables import print_summary, text_table
 from mvitac.system.progress import shown
 
 
@@ -42,10 +40,10 @@ class _PublishOptions:
 def publish(argv: list[str]) -> None:
     """mvitac publish RUN OUT [--on PACK] [--push OWNER/NAME]"""
     options = parse(_PublishOptions, argv, "publish")
-    with shown(Console(stderr=True)):
+    with shown():
         pack = Pack(options.on) if options.on else None
         out = write_artifact(options.run, options.out, pack, allow_leak=options.allow_leak)
-    print_summary(read_manifest(out)["scores"], Console(markup=False))
+    print_summary(read_manifest(out)["scores"])
     print(f"written: {out}")
     if options.push:
         print(f"pushed: {push_artifact(out, options.push, private=options.private)}")
@@ -86,28 +84,28 @@ def export(argv: list[str]) -> None:
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on a pack, --on PACK")
     pack = as_trained(model, pack)
-    with shown(Console(stderr=True)):
+    with shown():
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
         new = Pack(options.new_sensor) if options.new_sensor else None
         report = exports.export(with_probes(model, pack), pack, options.out, config, calibrate=calibrate, new=new)
-    Console(markup=False).print(_table(options.out, report, new.path if new else None))
+    print(_table(options.out, report, new.path if new else None))
 
 
-def _table(out: Path, report: dict[str, Any], new: Path | None) -> Table:
+def _table(out: Path, report: dict[str, Any], new: Path | None) -> str:
     title = f"{out}: checked on {report['num_rows']} {f'rows of {new}' if new else 'test rows'}"
-    table = Table("", "original", "export", title=title, title_justify="left")
+    rows = []
     for task, values in report["accuracy"].items():
-        table.add_row(f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}")
+        rows.append([f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}"])
     for target in (target for targets in report.get("values", {}).values() for target in targets):
         if target["num"]:
             cells = (f"{target[key]:.3g}" for key in ("original", "export"))
-            table.add_row(f"{target['name']}, mean absolute error, {target['unit']}", *cells)
-        table.add_row(f"{target['name']}, change, {target['unit']}", "", f"{target['change']:.2g}")
+            rows.append([f"{target['name']}, mean absolute error, {target['unit']}", *cells])
+        rows.append([f"{target['name']}, change, {target['unit']}", "", f"{target['change']:.2g}"])
     for name, values in report["cosine"].items():
-        table.add_row(f"{name}, lowest cosine", "", f"{values['min']:.5f}")
+        rows.append([f"{name}, lowest cosine", "", f"{values['min']:.5f}"])
     if target := report.get("target"):
         bits = {"avx2": "any CPU, 7-bit weights", "vnni": "with VNNI, 8-bit weights"}[target]
-        table.add_row("target CPU", "", f"{target}: {bits}")
-    table.add_row("size, MB", "", f"{report['size_mb']}")
-    table.add_row("latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"]))
-    return table
+        rows.append(["target CPU", "", f"{target}: {bits}"])
+    rows.append(["size, MB", "", f"{report['size_mb']}"])
+    rows.append(["latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"])])
+    return text_table(title, ["", "original", "export"], rows)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, console, parse, save_json
+from mvitac.cli.options import check_json, parse, printed_to, save_json
 from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
 from mvitac.evaluation.encoders import about_lines
@@ -18,7 +18,6 @@ from mvitac.evaluation.sensors import RecolouredPack
 from mvitac.model_files import load
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_sensors, print_summary
-from mvitac.system.console import Console
 from mvitac.system.files import read_json
 from mvitac.system.progress import shown, work
 
@@ -62,10 +61,10 @@ def probe(argv: list[str]) -> None:
         pack = join(Pack(options.learn_on), pack)
     elif "colours" in options.config.standardise:
         raise ValueError("--standardise colours shows a new sensor as one of --learn-on: name that pack as well")
-    with shown(Console(stderr=True)):
+    with shown():
         more = {"allow_leak": options.allow_leak, "weights": options.weights, "encoders": options.encoder}
         result = probe_runs(options.runs, options.config, pack, **more)
-    say, stressed = console(options.json), _stress(options, pack, result) if options.stress else []
+    say, stressed = printed_to(options.json), _stress(options, pack, result) if options.stress else []
     print_summary(result, say, probe=options.config.probes[0])
     for kind in options.config.probes[1:]:
         print_summary({**result, "summary": summarise_again(result["records"], kind)}, say, probe=kind)
@@ -74,7 +73,7 @@ def probe(argv: list[str]) -> None:
         if mine := [r for r in stressed if r["probe"] == kind]:
             print_summary({**result, "summary": summarise(mine + majority, kind)}, say, probe=kind)
     for line in about_lines(result["encoders"]):
-        say.print(f"encoder: {line}")
+        print(f"encoder: {line}", file=say)
     print_retrieval(result, say)
     print_sensors(result, say)
     result["records"] += stressed
@@ -87,7 +86,7 @@ def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -
     records = []
     for i, path in enumerate(options.runs, start=1):
         what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
-        with shown(Console(stderr=True)), work(what):
+        with shown(), work(what):
             model = load(path, options.weights)
             data = as_trained(model, pack) if pack else model.open_data()
             own = {"source": names.get(str(path), ""), "seed": model.seed, "run": str(path)}

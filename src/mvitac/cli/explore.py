@@ -9,7 +9,6 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
-from mvitac.system.console import Console
 from mvitac.system.progress import shown, work
 
 if TYPE_CHECKING:
@@ -69,9 +68,9 @@ def _page(options: _Options) -> "gradio.Blocks":
     runs = {}
     for name, model in zip(_names(options.runs), models, strict=True):
         print(f"{name}: features of up to {min(options.rows, pack.num)} pairs, and its probes", flush=True)
-        with shown(Console(stderr=True)):
+        with shown():
             runs[name] = ExplorerData(model, pack, limit=options.rows)
-    with shown(Console(stderr=True)), work("drawing the page"):
+    with shown(), work("drawing the page"):
         return page(runs)
 
 

@@ -1,7 +1,6 @@
 """``mvitac finetune`` and ``mvitac adapt``."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +15,6 @@ from mvitac.experiments.finetune import Finetuning
 from mvitac.experiments.finetune import finetune as run_finetune
 from mvitac.registry import default
 from mvitac.report.tables import print_adaptation, print_finetuning
-from mvitac.system.console import Console
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,10 +51,9 @@ def _run(kind: type[Any], work: Any, show: Any, argv: list[str], name: str, abou
     options = parse(kind, rest, name, default=usual, description=f"{about}\n\n  --data {names}  (required)")
     if options.model == usual.model:
         raise ValueError(f"name the model: the folder of a run or an artifact (see mvitac {name} --help)")
-    console = Console(markup=False, highlight=False)
-    more = {"resume": options.resume, "quiet": options.quiet, "say": partial(console.print, soft_wrap=True)}
+    more = {"resume": options.resume, "quiet": options.quiet, "say": print}
     result = work(options.model, options.data, options.config, options.out, **more)
-    show(result, console)
+    show(result)
     return options, result
 
 

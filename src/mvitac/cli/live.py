@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Group
+from rich.console import Console, Group
 from rich.live import Live as Screen
 from rich.table import Table
 from rich.text import Text
@@ -26,7 +26,6 @@ from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.registry import to_json
-from mvitac.system.console import Console
 from mvitac.system.files import cache_dir, digest, write_atomic, write_json
 
 _REDRAW = 0.1  # seconds between two pictures of the terminal or the window

@@ -6,12 +6,9 @@ A mistake of the user ends in one line on stderr and exit code 2, Ctrl-C in 130.
 import importlib
 import os
 import re
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-
-from mvitac.system.terminal import plain_output, wrapped
 
 HELP = (Path(__file__).parent / "help.txt").read_text(encoding="utf-8")
 
@@ -53,11 +50,6 @@ _NO_MEMORY = "(out of|can(no|')t allocate) memory|failed to map segment|can't st
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     _wait_briefly()
-    with plain_output():
-        return _main(argv)
-
-
-def _main(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         code = _run(arguments)
@@ -87,9 +79,7 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def _complain(text: str) -> None:
-    """Print ``text`` on stderr: in one line, but broken between words on a terminal."""
-    text = f"mvitac: {text}"
-    print(wrapped(text, shutil.get_terminal_size().columns) if sys.stderr.isatty() else text, file=sys.stderr)
+    print(f"mvitac: {text}", file=sys.stderr)
 
 
 def _run(arguments: list[str]) -> int:
@@ -116,7 +106,7 @@ def _run(arguments: list[str]) -> int:
         raise unknown("command", name, COMMANDS)
     text = help_file(name)
     if rest in (["--help"], ["-h"]) and text.exists():
-        print(wrapped(text.read_text(encoding="utf-8")), end="")
+        print(text.read_text(encoding="utf-8"), end="")
         return 0
     module, function = COMMANDS[name].split(":")
     _check_memory()

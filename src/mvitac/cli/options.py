@@ -10,12 +10,11 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TextIO, TypeVar
 
 import tyro
 
 from mvitac.registry import unknown
-from mvitac.system.console import Console
 from mvitac.system.files import check_place, write_json
 
 T = TypeVar("T")
@@ -46,7 +45,7 @@ def parse(
         with contextlib.redirect_stderr(boxed):
             if {"-h", "--help"} & set(argv):
                 # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
-                with _joined_lines(), contextlib.redirect_stdout(getattr(sys.stdout, "rich_proxied_file", sys.stdout)):
+                with _joined_lines(), contextlib.nullcontext():
                     return tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff,))  # type: ignore[arg-type]
             with _columns("10000"):  # the lines of an error must not be wrapped
                 return tyro.cli(kind, **options)  # type: ignore[arg-type]
@@ -115,9 +114,9 @@ def check_json(path: Path | None, option: str = "--json") -> None:
             raise ValueError(f"{option} {path} is a folder: give another place, the name of a file")
 
 
-def console(json_file: Path | None) -> Console:
+def printed_to(json_file: Path | None) -> TextIO:
     """Where a command prints: stdout, or stderr if its JSON goes to stdout."""
-    return Console(markup=False, highlight=False, stderr=json_file == STDOUT)
+    return sys.stderr if json_file == STDOUT else sys.stdout
 
 
 def save_json(path: Path | None, value: Any, *, sealed: bool = False) -> None:

@@ -12,15 +12,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import tyro
-from rich.table import Table
+from tabulate import tabulate
 from tyro.conf import Positional
 
-from mvitac.cli.options import check_json, console, parse, save_json
+from mvitac.cli.options import check_json, parse, printed_to, save_json
 from mvitac.data.image_grid import GAP, Block, Tile, draw, side_by_side
 from mvitac.data.images import decode, fit
 from mvitac.data.pack import Pack
 from mvitac.report.palette import colour
-from mvitac.system.console import Console
 from mvitac.system.files import check_place, write_atomic
 from mvitac.system.progress import shown
 
@@ -63,7 +62,7 @@ def embed(argv: list[str]) -> None:
     pack, found = as_trained(model, Pack(options.pack)), {}
     for m in check_pack(model, pack):
         rows = np.flatnonzero(pack.has(m))
-        with shown(Console(stderr=True)):
+        with shown():
             x = np.concatenate(list(embeddings(model, pack, m, rows, shared=options.shared)))
         found[m] = np.full((pack.num, x.shape[1]), np.nan, np.float32)
         found[m][rows] = x
@@ -101,7 +100,7 @@ def index(argv: list[str]) -> None:
     from mvitac.deploy.search import build
     from mvitac.evaluation.evaluate import as_trained
 
-    with shown(Console(stderr=True)):
+    with shown():
         model = load(options.model)
         made = build(model, as_trained(model, Pack(options.pack)), options.out, options.splits)
     shapes = ", ".join(f"{m} {bank.shape}" for m, bank in made.banks.items())
@@ -155,11 +154,10 @@ def find(argv: list[str]) -> None:
         for row, score in zip(rows[0].tolist(), scores[0], strict=True)
     ]
     title = f"{options.source} -> {options.target} in {options.index}"
-    table = Table("cosine", "id", "group", *index.meta["classes"], title=title, title_justify="left")
-    for one in found:
-        labels = (one["labels"].get(task, "") for task in index.meta["classes"])
-        table.add_row(f"{one['cosine']:.3f}", one["id"], one["group"], *labels)
-    console(options.json).print(table)
+    tasks = index.meta["classes"]
+    rows = [[f"{o['cosine']:.3f}", o["id"], o["group"], *(o["labels"].get(task, "") for task in tasks)] for o in found]
+    table = tabulate(rows, ["cosine", "id", "group", *tasks], disable_numparse=True)
+    print(title, table, "", sep="\n", file=printed_to(options.json))
     save_json(options.json, {"from": options.source, "to": options.target, "found": found})
     if options.picture:
         _draw(options.picture, query, index, options, found)

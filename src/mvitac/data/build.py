@@ -19,7 +19,6 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from rich.filesize import decimal
 
 from mvitac.data.build_parts import Work, make_parts
 from mvitac.data.pack import FORMAT, Pack
@@ -28,7 +27,6 @@ from mvitac.data.partial_pack import JpegFile, Part, RowFile
 from mvitac.data.source import Source
 from mvitac.data.storage import FORMAT_VERSIONS, QUALITY, SUFFIXES, Store, check_request, stored_as
 from mvitac.registry import to_json
-from mvitac.system.console import Console
 from mvitac.system.files import brief, digest, digest_file, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.progress import shown
@@ -116,8 +114,7 @@ def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max
     disk = _check_disk(out, list(files.values()))
     _claim(partial, request, source.sizes_at)
     if not quiet:
-        text = f"packing {num} samples at {size} px into {out}: {disk}"
-        Console().print(text, soft_wrap=True, highlight=False, markup=False)
+        print(f"packing {num} samples at {size} px into {out}: {disk}")
     for rows in files.values():
         rows.create()
     parts = _parts(source, partial)
@@ -164,7 +161,7 @@ def _write_parts(work: Work, parts: Sequence[Part], workers: int, quiet: bool) -
     sums = {modality: hashlib.sha256(rows.header(rows.num)) for modality, rows in work.files.items()}
     with (
         shown(quiet=quiet),
-        progress(f"packing {work.spec.name}", len(work.counts), "items", announce=False) as advance,
+        progress(f"packing {work.spec.name}", len(work.counts), "items") as advance,
     ):
         for part, num in zip(parts, make_parts(work, parts, workers), strict=True):
             for modality, rows in work.files.items():
@@ -179,8 +176,8 @@ def _check_disk(out: Path, files: Sequence[RowFile | JpegFile]) -> str:
     parent = next(p for p in [out.absolute().parent, *out.absolute().parents] if p.exists())
     free = shutil.disk_usage(parent).free
     if need > free:
-        raise ValueError(f"packing needs about {decimal(need)}, {parent} has {decimal(free)} free")
-    return f"needs about {decimal(need)} of disk, {decimal(free)} are free"
+        raise ValueError(f"packing needs about {need / 1e9:,.2f} GB, {parent} has {free / 1e9:,.2f} GB free")
+    return f"needs about {need / 1e9:,.2f} GB of disk, {free / 1e9:,.2f} GB are free"
 
 
 @dataclass

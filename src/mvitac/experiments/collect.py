@@ -24,14 +24,13 @@ from mvitac.data.spec import AnyTask
 from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.evaluate import ProbeConfig, chosen
-from mvitac.experiments.jobs import Job, Work, pairs_per_second
+from mvitac.experiments.jobs import Job, Work
 from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
 from mvitac.system.files import digest, read_json, write_json
-from mvitac.system.progress import duration
 from mvitac.system.provenance import provenance
 from mvitac.training.setup import check_same
 from mvitac.training.views import gel_mirror
@@ -72,7 +71,7 @@ def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str
     for seed in range(plan.seeds):
         for row, own in possible:
             run = replace(plan.run(row, plan.data, seed, pack.phased), device=device)
-            job = Job(row.label, run, out / "runs" / slug(row.label) / f"seed{seed}", session, plan.stress)
+            job = Job(row.label, run, out / "runs" / slug(row.label) / f"seed{seed}", session)
             if (job.out / "run.json").exists():
                 check_same(job.run, own, job.out)
             jobs.append(job)
@@ -138,8 +137,6 @@ def _scores(job: Job) -> tuple[Records, Records]:
     """Probe and retrieval records of a finished job, named by its row."""
     scores = read_json(job.out / "scores.json", "a run's scores")
     records = scores["records"]
-    if job.stress:
-        records = records + read_json(job.out / "stress.json", "a run's stress")["records"]
     method = job.run.method.name
     named = [{**record, "source": job.label + record["source"].removeprefix(method)} for record in records]
     return named, [{**found, "source": job.label} for found in scores["retrieval"]]
@@ -226,20 +223,15 @@ def pairs_of(run: Run, views: int, pack: Pack) -> str:
     return f"two rows of a {'press' if press else 'touch'}" if other and several else ONE_ROW
 
 
-def forecast(work: Work, *, measure: bool = False) -> list[str]:
-    """Lines that describe the plan: runs, steps, pairs, what is finished, and the time left.
-
-    The time comes from finished runs. Without any, ``measure`` trains a few steps of one run and keeps nothing of them.
-    """
+def outline(work: Work) -> list[str]:
+    """Lines that describe the plan: rows, runs, steps, pairs, what is finished and what is left out."""
     rows = {label: next(job for job in work.jobs if job.label == label) for label in _labels(work.jobs)}
     num = len({job.fold for job in work.jobs})
     folds = f" x {num} folds" if num > 1 else ""
     lines = [f"plan {work.plan.name}: {len(rows)} rows x {work.plan.seeds} seeds{folds} = {len(work.jobs)} runs"]
-    images = {}
     for label, job in rows.items():
         num = len(job.run.method.training_rows(work.pack))
         steps = job.run.num_steps(num)
-        images[label] = steps * job.run.batch_size * _images_per_pair(job.run, work.pack)
         mine = [j for j in work.jobs if j.label == label]
         lines.append(
             f"  {label}: {job.run.method.name}, {steps} steps x {job.run.batch_size} pairs of {num} rows,"
@@ -250,33 +242,4 @@ def forecast(work: Work, *, measure: bool = False) -> list[str]:
     for asked, run in {job.run.precision: job.run for job in todo}.items():
         device = pick_device(run.device)
         lines.append(f"on this machine: {describe_precision(asked, pick_precision(asked, device), device)}")
-    return [*lines, _time_left(work, todo, images, measure)]
-
-
-def _images_per_pair(run: Run, pack: Pack) -> int:
-    """Views of all modalities that a step reads for one pair."""
-    method = run.method.on_tiny_trunk(pack.spec, run.encoder)
-    return method.views * len(method.encoders())
-
-
-def _time_left(work: Work, todo: Sequence[Job], images: dict[str, int], measure: bool) -> str:
-    """How many runs are left, and the time of their training. ``images``: row -> images that one run sees."""
-    if not todo:
-        return "all runs are finished"
-    speeds: dict[str, list[float]] = {}  # row -> images per second of its finished runs
-    for job in work.jobs:
-        if job.done and not job.failure and (seconds := job.seconds()):
-            speeds.setdefault(job.label, []).append(images[job.label] / seconds)
-    told = "by the finished runs; a row without one is assumed to take as long per image as the others"
-    if not speeds and measure:
-        job = next((job for job in todo if job.run.data == work.plan.data), todo[0])
-        pack = work.pack if job.run.data == work.plan.data else job.run.data.open(quiet=True)
-        speeds[job.label] = [pairs_per_second(job.run, pack) * _images_per_pair(job.run, pack)]
-        told = f"by the first steps of {job.name}, measured now; other rows are assumed to take as long per image"
-    if not speeds:
-        return f"{len(todo)} runs left"
-    usual = statistics.fmean(1 / speed for found in speeds.values() for speed in found)
-    paces = {label: statistics.fmean(1 / speed for speed in found) for label, found in speeds.items()}
-    seconds = sum(images[job.label] * paces.get(job.label, usual) for job in todo)
-    left = f"{len(todo)} runs left, about {duration(seconds)} of training one after another"
-    return f"{left} ({told}); scoring comes on top"
+    return [*lines, f"{len(todo)} runs left" if todo else "all runs are finished"]

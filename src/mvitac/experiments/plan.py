@@ -67,8 +67,6 @@ class Plan:
     """Tasks to score. Default: all of the data."""
     modalities: tuple[Literal["touch", "vision", "both"], ...] = ()
     """Modalities to score. Default: all."""
-    stress: bool = False
-    """Also run stress tests: few labels, noisy images, a missing modality, a leaking split (``evaluation.robustness``)."""
     printed_on: str = ""
     """Name of the dataset of the paper's numbers, with its split: they are shown beside scores on this data only."""
     printed_majority: dict[str, float] = field(default_factory=dict)

@@ -7,7 +7,6 @@ from mvitac.datasets.pack import ON_VAL
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.evaluate import END_TO_END
 from mvitac.evaluation.intervals import paired_difference
-from mvitac.evaluation.robustness import STRESSES
 from mvitac.evaluation.score_text import MODALITY_ORDER
 from mvitac.evaluation.scores import by_cell, summarise
 from mvitac.evaluation.value_scores import one_target
@@ -89,10 +88,3 @@ def _printed(result: dict[str, Any], plan: Plan, task: str, modality: str, sourc
     elif pairs.get(label) != ONE_ROW:
         return None
     return printed[task] / 100 if task in printed else None
-
-
-def stresses_of(result: dict[str, Any]) -> dict[str, list[Line]]:
-    """The lines of every stress test that was scored (``robustness``), and the only comparable control: one answer."""
-    majority = [r for r in result["records"] if r["source"] in ("majority", "mean")]
-    scored = {kind: [r for r in result["records"] if r["probe"] == kind] for kind in STRESSES}
-    return {kind: lines_of({**result, "records": mine + majority}, kind) for kind, mine in scored.items() if mine}

@@ -3,18 +3,25 @@
 import csv
 import io
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+<<<<<<< HEAD
 from mvitac.evaluation.encoders import about_lines
+=======
+from tabulate import SEPARATING_LINE, tabulate
+
+from mvitac.evaluation.external_encoders import about_lines
+>>>>>>> b5a9cb4 (Progress by tqdm, tables of the terminal and LaTeX by tabulate; compare --jobs starts processes that share runs by their locks)
 from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
 from mvitac.evaluation.scores import by_cell
 from mvitac.experiments.plan import Plan
-from mvitac.experiments.table import Cell, Line, as_printed, lines_of, stresses_of, target_lines
+from mvitac.experiments.table import Cell, Line, as_printed, lines_of, target_lines
 from mvitac.registry import from_json
 from mvitac.report.figures import Dot, comparison, to_png
 from mvitac.report.tables import RETRIEVAL, probe_name, retrieval_rows
@@ -37,7 +44,7 @@ def _plan(result: dict[str, Any]) -> Plan:
 
 
 def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
-    """The whole comparison as Markdown: what was compared, the tables, stress tests, AUROC, retrieval and cost."""
+    """The whole comparison as Markdown: what was compared, the tables, AUROC, retrieval and cost."""
     plan = _plan(result)
     shown = any(cell["printed"] is not None for line in lines for cell in line.cells.values())
     text = [f"# {plan.title or plan.name}", "", *_preface(result, plan, lines, shown), ""]
@@ -45,8 +52,6 @@ def markdown(result: dict[str, Any], lines: Sequence[Line]) -> str:
     for task, each in target_lines(result).items():
         rows = _table(each, plan.reference, False, targets=True)
         text += [f"**{task}**: every target, and its mean absolute error", "", *rows]
-    for kind, worse in stresses_of(result).items():
-        text += [f"**{kind}**", "", *_table(worse, plan.reference, False)]
     text += _auroc(result, plan, lines)
     if rows := retrieval_rows(result["retrieval"]):
         text += pipes(["retrieval", "", *(f"{name} %" for name in RETRIEVAL)], rows)
@@ -139,8 +144,8 @@ def _significance(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> 
 
 def _notes(result: dict[str, Any]) -> list[str]:
     """Notes of the data, and the runs whose precision differs from that of most runs."""
-    precisions: dict[str, str] = result.get("run_precisions", {})  # by name of the run; not in older results
-    notes = list(result.get("notes", ()))
+    precisions: dict[str, str] = result["run_precisions"]  # by name of the run
+    notes = list(result["notes"])
     if len(set(precisions.values())) > 1:
         most, *others = [precision for precision, _ in Counter(precisions.values()).most_common()]
         runs = {other: ", ".join(repr(name) for name in precisions if precisions[name] == other) for other in others}
@@ -161,15 +166,15 @@ def _budget(result: dict[str, Any]) -> str:
 
 
 def _made(result: dict[str, Any]) -> str:
-    """Commits and devices of the runs, and the commit of the tables if it differs. Results of 0.1.0 have only that one."""
+    """Commits and devices of the runs, and the commit of the tables if it differs."""
 
     def short(commit: str | None) -> str:
         return f"{commit[:12]}{'+' * commit.endswith('+')}" if commit else "unknown"  # +: with local changes
 
     tables = short(result["commit"])
-    runs = list(dict.fromkeys(short(commit) for commit in result.get("run_commits", ()))) or [tables]
+    runs = list(dict.fromkeys(short(commit) for commit in result["run_commits"]))
     code = f"code {tables}" if runs == [tables] else f"runs at commits {', '.join(runs)}; tables at {tables}"
-    return ", ".join([code, *(result.get("run_devices") or [result["device"]])])
+    return ", ".join([code, *result["run_devices"]])
 
 
 def _auroc(result: dict[str, Any], plan: Plan, lines: Sequence[Line]) -> list[str]:
@@ -199,7 +204,7 @@ def _cost(result: dict[str, Any]) -> list[str]:
         weights = f"{c['trained_parameters'] / 1e6:.2f} M"
         rows.append([c["row"], c["pairs_of"], *numbers, weights, f"{c['seconds']:.0f}", peak])
     text = pipes([*heads, "peak GPU MiB"], rows)
-    return [*text, *(f"- {line}" for line in about_lines(result.get("encoders", ())))]
+    return [*text, *(f"- {line}" for line in about_lines(result["encoders"]))]
 
 
 NAMES = {"touch": "Tactile", "vision": "Visual", "both": "Tactile + Visual", "none": "-"}
@@ -211,9 +216,9 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     A further table for each task with values has its targets.
     """
     plan = _plan(result)
-    text = _tabular(lines)
+    tables = [_tabular(lines)]
     for task, each in target_lines(result).items():
-        text += ["", f"% {_tex(task)}: every target, and its mean absolute error", *_tabular(each, targets=True)]
+        tables.append(f"% {task}: every target, and its mean absolute error\n{_tabular(each, targets=True)}")
     note = f"% {plan.title or plan.name}; data {result['data']}"
     if any(cell["printed"] is not None for line in lines for cell in line.cells.values()):
         note += f"; in parentheses: printed in the paper on {plan.printed_on}"
@@ -221,51 +226,35 @@ def latex(result: dict[str, Any], lines: Sequence[Line]) -> str:
     notes = [note, *(f"% Note: {note}." for note in _notes(result)), intervals]
     if result["leaks"]:
         notes.append(f"% LEAK: {result['leaks']}.")
-    return "\n".join([*(" ".join(line.split()) for line in notes), *text]) + "\n"
+    return "\n".join([*(" ".join(line.split()) for line in notes), "\n\n".join(tables)]) + "\n"
 
 
-def _tabular(lines: Sequence[Line], *, targets: bool = False) -> list[str]:
-    """Lines as one LaTeX table, with the error of ``targets``."""
-    heads = ["Method", "Modality"]
+def _tabular(lines: Sequence[Line], *, targets: bool = False) -> str:
+    """Lines as one LaTeX table, with the error of ``targets``; controls are below a rule."""
+    heads, rows = ["Method", "Modality"], [[line.source, NAMES[line.modality]] for line in lines]
     for task, score in _columns(lines).items():
-        heads += [f"{_tex(task)} ({'$R^2$, ' * (score == 'R2')}\\%)", *["error"] * targets]
-    text = [
-        r"\begin{tabular}{ll" + "r" * (len(heads) - 2) + "}",
-        r"\toprule",
-        " & ".join(heads) + r" \\",
-        r"\midrule",
-    ]
-    for number, line in enumerate(lines):
-        if line.control and not any(earlier.control for earlier in lines[:number]):
-            text.append(r"\midrule")
-        row = [_tex(line.source), NAMES[line.modality]]
-        for task in _columns(lines):
-            error = _tex(error_text(line.cells[task]["targets"][0])) if targets and task in line.cells else ""
-            row += [_tex_cell(line, task, lines), *[error] * targets]
-        text.append(" & ".join(row) + r" \\")
-    return [*text, r"\bottomrule", r"\end{tabular}"]
+        heads += [f"{task} ({'R2, ' * (score == 'R2')}%)", *["error"] * targets]
+        for line, row in zip(lines, rows, strict=True):
+            row.append(_tex_cell(line, task, lines))
+            if targets:
+                row.append(error_text(line.cells[task]["targets"][0]) if task in line.cells else "")
+    num = sum(not line.control for line in lines)
+    shown = [*rows[:num], *([SEPARATING_LINE] if 0 < num < len(rows) else ()), *rows[num:]]
+    align = ["left", "left", *["right"] * (len(heads) - 2)]
+    text = tabulate(shown, heads, "latex_booktabs", disable_numparse=True, colalign=align)
+    return re.sub(r"\*\*(.*?)\*\*", r"\\textbf{\1}", text).replace("(R2, ", "($R^2$, ")
 
 
 def _tex_cell(line: Line, task: str, lines: Sequence[Line]) -> str:
-    """A score and its interval; the best method of a modality is bold."""
+    """A score and its interval; the best method of a modality is bold, between asterisks."""
     cell = line.cells.get(task)
     if cell is None:
         return ""
     best = max(x.cells[task]["mean"] for x in lines if x.modality == line.modality and task in x.cells)
     number, _, ends = with_interval(cell["mean"], cell["low"], cell["high"]).partition(" ")
-    number = rf"\textbf{{{number}}}" if not line.control and cell["mean"] == best else number
+    number = f"**{number}**" if not line.control and cell["mean"] == best else number
     paper = f" ({percent(cell['printed'])})" if cell["printed"] is not None else ""
     return f"{number} {ends}{paper}{leak_mark(cell.get('leak', ''))}"
-
-
-_TEX = str.maketrans(
-    {sign: f"\\{sign}" for sign in "&%_#${}"} | {"\\": r"\textbackslash{}", "^": r"\^{}", "~": r"\~{}"}
-)
-"""What LaTeX would obey in a name or a unit."""
-
-
-def _tex(text: str) -> str:
-    return " ".join(text.split()).translate(_TEX)
 
 
 def comma(result: dict[str, Any]) -> str:
@@ -283,7 +272,6 @@ def comma(result: dict[str, Any]) -> str:
     probes = _plan(result).probes
     tables = [("", probe, lines_of(result, probe)) for probe in probes]
     tables += [(task, probe, lines) for probe in probes for task, lines in target_lines(result, probe).items()]
-    tables += [("", kind, lines) for kind, lines in stresses_of(result).items()]
     scored: dict[tuple[str, str], dict[str, None]] = {}  # source and task -> its probes
     for record in result["records"]:
         scored.setdefault((record["source"], record["task"]), {})[record["probe"]] = None

@@ -26,7 +26,6 @@ from mvitac.report import html as page
 from mvitac.report import sections as evidence
 from mvitac.report.sections import WORDS, Finished, Study
 from mvitac.run import load_run, precision_of
-from mvitac.system.console import Console
 from mvitac.system.files import read_json, write_atomic
 from mvitac.system.progress import duration, shown, work
 from mvitac.training.log import read_log, seconds_of
@@ -56,7 +55,7 @@ def write_report(
         if not quiet:
             print(f"scores: {paths[0] / 'probe.json'}")
     elif result is None:
-        with shown(Console(stderr=True), quiet=quiet):
+        with shown(quiet=quiet):
             result = _probe(runs, pack)
     elif not isinstance(result, dict) or {"pack", "records", "retrieval", "summary", "classes"} - set(result):
         raise ValueError("this is not a probe result: make one with `mvitac probe RUN... --json FILE`")
@@ -68,7 +67,7 @@ def write_report(
     if result["records"]:  # a file's own summary may be of another version, with other intervals
         result = {**result, "summary": summarise(result["records"], result["records"][0]["probe"])}
     runs = _as_scored(runs, result)
-    with shown(Console(stderr=True), quiet=quiet):
+    with shown(quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
     write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
     return Path(out) / "report.html"

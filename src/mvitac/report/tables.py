@@ -1,9 +1,9 @@
 """Probe results as tables for a terminal 80 columns wide, and the rows that every table of results shares."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TextIO
 
-from rich.table import Table
+from tabulate import tabulate
 
 from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.leaks import leak_mark
@@ -21,7 +21,6 @@ from mvitac.evaluation.score_text import (
     with_interval,
 )
 from mvitac.evaluation.scores import leaks_in
-from mvitac.system.console import Console
 
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 VALUE_PROBE_NAMES = {"linear": "ridge regression"}
@@ -43,8 +42,11 @@ def probe_name(kind: str, score: str) -> str:
     return PROBE_NAMES.get(kind, kind)
 
 
-def print_summary(result: dict[str, Any], console: Console, *, probe: str = "linear") -> None:
-    """Print one table per task: accuracy or R2 in percent, mean and 95 % interval. Values have a table of targets too."""
+def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: str = "linear") -> None:
+    """Print one table per task: accuracy or R2 in percent, mean and 95 % interval. Values have a table of targets too.
+
+    ``file``: where to, default stdout; likewise below.
+    """
     trained = []
     for name, task in result["summary"].items():
         trained += [{"source": s, "seed": seed} for m in task.values() for s, v in m.items() for seed in v["seeds"]]
@@ -54,29 +56,30 @@ def print_summary(result: dict[str, Any], console: Console, *, probe: str = "lin
         title = f"{result['data']}: {name} ({about})"
         # LEAK on a line of its own, else the table is too wide.
         cells = [[s, *(cell_text(task, s, m).replace(" LEAK", "\nLEAK") for m in modalities)] for s in sources_of(task)]
-        console.print(_table(title, [f"{score} %", *modalities], cells))
+        print(text_table(title, [f"{score} %", *modalities], cells), file=file)
         if score == "R2":
-            console.print(_targets(name, task))
+            print(_targets(name, task), file=file)
         if events := event_rows(task):
-            console.print(_table(event_title(name, task), EVENT, events, words=2))
-    console.print(f"95 % intervals: {covered(result['group_by'], trained)}.", style="dim")
-    for note in result.get("notes", ()):
-        console.print(f"note: {note}", markup=False, highlight=False)
-    for leak in result.get("leaks", ()):
-        console.print(f"LEAK: {leak}", markup=False, highlight=False)
+            print(text_table(event_title(name, task), EVENT, events, words=2), file=file)
+    _print_notes(result, trained, file)
 
 
-def _targets(name: str, task: dict[str, Any]) -> Table:
-    """R2 in percent and mean absolute error of each target."""
-    table = _table(f"{name}: R2 % and mean absolute error", ["", *columns_of(task)])
-    rows = target_rows(task)
-    above = "" if len({target for target, _, _ in rows}) > 1 else rows[0][0]  # the only target needs no row of its own
-    for target, source, cells in rows:
-        if target != above:
-            table.add_section()
-            table.add_row(above := target, style="bold")
-        table.add_row(source, *(f"{percent(cell['mean'])}, {error_text(cell)}" if cell else "" for cell in cells))
-    return table
+def _print_notes(result: dict[str, Any], records: Sequence[dict[str, Any]], file: TextIO | None) -> None:
+    """Print what the intervals of ``records`` cover, and what limits the result."""
+    print(f"95 % intervals: {covered(result['group_by'], records)}.", file=file)
+    for kind, key in (("note", "notes"), ("LEAK", "leaks")):
+        for text in result.get(key, ()):
+            print(f"{kind}: {text}", file=file)
+
+
+def _targets(name: str, task: dict[str, Any]) -> str:
+    """A table of R2 in percent and mean absolute error of each target."""
+    rows, above = [], ""
+    for target, source, cells in target_rows(task):
+        scores = (f"{percent(cell['mean'])}, {error_text(cell)}" if cell else "" for cell in cells)
+        rows.append([target * (target != above), source, *scores])
+        above = target
+    return text_table(f"{name}: R2 % and mean absolute error", ["", "", *columns_of(task)], rows, words=2)
 
 
 def event_rows(task: dict[str, Any]) -> list[list[str]]:
@@ -110,26 +113,27 @@ def target_rows(task: dict[str, Any]) -> list[tuple[str, str, list[dict[str, Any
     return rows
 
 
-def print_retrieval(result: dict[str, Any], console: Console) -> None:
+def print_retrieval(result: dict[str, Any], file: TextIO | None = None) -> None:
     """Print cross-modal retrieval as one table, if the methods have a shared space."""
     if not result["retrieval"]:
         return
     unseen = unseen_groups(result["group_by"], result["retrieval"])
     columns = ("", "query -> found", *(f"{column} %" for column in RETRIEVAL))
-    console.print(_table(f"retrieval over {unseen}", columns, retrieval_rows(result["retrieval"]), words=2))
+    rows = retrieval_rows(result["retrieval"])
+    print(text_table(f"retrieval over {unseen}", columns, rows, words=2), file=file)
 
 
-def print_sensors(result: dict[str, Any], console: Console) -> None:
+def print_sensors(result: dict[str, Any], file: TextIO | None = None) -> None:
     """Print which touch sensors are new, which statistics were used, and what features tell of the sensor, if known."""
     for line in result.get("statistics", ()):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        print(line, file=file)
     rows = []
     for source, name in dict.fromkeys((r["source"], r["name"]) for r in result.get("sensors", ())):
         found = [r for r in result["sensors"] if (r["source"], r["name"]) == (source, name)]
         shown = [percent(sum(r[key] for r in found) / len(found)) for key in ("score", "chance")]
         rows.append([source, "R@5: " * (name != "which sensor") + name, *shown])
     if rows:
-        console.print(_table("touch sensors", ["", "", "%", "chance %"], rows, words=2))
+        print(text_table("touch sensors", ["", "", "%", "chance %"], rows, words=2), file=file)
 
 
 def retrieval_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
@@ -157,7 +161,7 @@ def by_direction(records: Sequence[dict[str, Any]]) -> dict[tuple[str, str], lis
     return found
 
 
-def print_finetuning(result: dict[str, Any], console: Console) -> None:
+def print_finetuning(result: dict[str, Any], file: TextIO | None = None) -> None:
     """Print the result of ``experiments.finetune``: a table per task, with a column for each share of the labels."""
     tasks: dict[str, dict[str, dict[float, list[dict[str, Any]]]]] = {}
     for record in result["records"]:
@@ -168,42 +172,35 @@ def print_finetuning(result: dict[str, Any], console: Console) -> None:
         score = "R2" if "r2" in next(iter(ours.values()))[0] else "accuracy"
         columns = [f"{score} %", *(f"{f:g} % of {result['group_by']}s" for f in ours)]
         rows = [[source, *map(_score_text, found.values())] for source, found in cells.items()]
-        table = _table(f"{result['data']}: {task}", columns, rows)
-        table.add_section()
-        for source, found in others:
-            table.add_row(f"gain over {source}", *(_gain_text(ours[f], found[f]) for f in ours))
-        console.print(table)
+        rows += [[f"gain over {s}", *(_gain_text(ours[f], found[f]) for f in ours)] for s, found in others]
+        print(text_table(f"{result['data']}: {task}", columns, rows), file=file)
         last = [*ours][-1]  # the models that are published
         if any(s.startswith("frozen") and paired_difference(ours[last], found[last])[2] < 0 for s, found in others):
             advice = f"use the frozen probe of {result['ancestor']} instead, with `mvitac publish --on PACK`"
-            console.print(f"{task}: fine-tuning lost against the frozen probe; {advice}", soft_wrap=True)
-    console.print(f"95 % intervals: {covered(result['group_by'], result['records'])}.", style="dim")
-    for note in [*(f"note: {note}" for note in result["notes"]), *(f"LEAK: {leak}" for leak in result["leaks"])]:
-        console.print(note, markup=False, highlight=False)
+            print(f"{task}: fine-tuning lost against the frozen probe; {advice}", file=file)
+    _print_notes(result, result["records"], file)
 
 
-def print_adaptation(result: dict[str, Any], console: Console) -> None:
+def print_adaptation(result: dict[str, Any], file: TextIO | None = None) -> None:
     """Print the result of ``experiments.adapt``: a table for each data, before and after."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for record in result["records"]:
         found.setdefault(record["data"], {}).setdefault(f"{record['task']}, {record['modality']}", []).append(record)
     for name, rows in found.items():
         cells = [[w, _score_text([a]), _score_text([b]), _gain_text([b], [a])] for w, (a, b) in rows.items()]
-        console.print(_table(f"{name}: test {result['group_by']}s", ["score %", "before", "after", "change"], cells))
+        title = f"{name}: test {result['group_by']}s"
+        print(text_table(title, ["score %", "before", "after", "change"], cells), file=file)
     if not found:
-        console.print("nothing to score: the data has no labels and no shared space of two modalities")
+        print("nothing to score: the data has no labels and no shared space of two modalities", file=file)
     about = f"95 % intervals: over test {result['group_by']}s only, for this one run; R2 of values, else accuracy."
-    console.print(about, style="dim")
+    print(about, file=file)
 
 
-def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]] = (), words: int = 1) -> Table:
-    """A table whose first columns are ``words`` and the others numbers, which wrap only beside two columns of words."""
-    table = Table(*columns[:words], title=title, title_justify="left", title_style="bold")
-    for column in columns[words:]:
-        table.add_column(column, justify="right", no_wrap=words == 1)
-    for row in rows:
-        table.add_row(*row)
-    return table
+def text_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:
+    """A table for the terminal, its first columns ``words`` and the others numbers."""
+    align = ["left"] * words + ["right"] * (len(columns) - words)
+    table = tabulate(rows, columns, "simple", disable_numparse=True, colalign=align if rows else None)
+    return f"{title}\n{table}\n"
 
 
 def _score_text(records: Sequence[dict[str, Any]]) -> str:

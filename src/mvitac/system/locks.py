@@ -10,7 +10,6 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from mvitac.system.console import Console
 from mvitac.system.files import check_place, naming
 
 _held: ContextVar[frozenset[Path]] = ContextVar("_held", default=frozenset())  # paths whose locks this thread holds
@@ -39,7 +38,7 @@ def hold_lock(place: Path, busy: str, *, wait: bool, quiet: bool = False) -> Ite
         if not wait:
             raise Busy(busy) from None
         if not quiet:
-            Console().print(busy, soft_wrap=True, highlight=False, markup=False)
+            print(busy)
         lock.acquire()
     except OSError as error:
         if error.errno != errno.ENOSYS:

@@ -11,7 +11,7 @@ from typing import Any
 from mvitac.registry import to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import naming, parse_json, write_atomic
-from mvitac.system.progress import WIDE, shown
+from mvitac.system.progress import say, shown, work
 
 Logger = Callable[[int, dict[str, float]], None]  # called with a step and the values logged at it
 EARLY = 3  # step of the first log line, so that the speed is known soon
@@ -34,17 +34,17 @@ class Log:
         self.file = self.path.open("a")
         self.loggers, self.start, self.since, self.since_step = loggers, start, time.perf_counter(), start
         self.num_steps, self.batch_size, self.quiet, self.stack = num_steps, batch_size, quiet, ExitStack()
+        self.advance_bar: Callable[[int, str], None] = lambda num, text: None
+        self.beside = ""  # text beside the bar
 
     def __enter__(self) -> "Log":
-        self.bars = self.stack.enter_context(shown(quiet=self.quiet))
-        if self.bars:
-            rate = {"unit": "steps", "rate": "pairs", "scale": self.batch_size}
-            self.bar = self.bars.add_task("pre-training", total=self.num_steps, completed=self.start, **rate)
+        if not self.quiet:
+            self.stack.enter_context(shown())
+            bar = work("pre-training", self.num_steps, "steps", done=self.start)
+            self.advance_bar = self.stack.enter_context(bar)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.bars:
-            self.bars.end(self.bar)
         self.stack.close()
         with naming(self.path):
             self.file.close()
@@ -54,15 +54,12 @@ class Log:
         speed = (step - self.since_step) * self.batch_size / max(1e-9, now - self.since)
         self.since, self.since_step = now, step
         self._write({"step": step, **losses, "lr": lr, "pairs_per_s": round(speed, 1)})
-        if self.bars:
-            shown_losses = losses if self.bars.console.width >= WIDE else {"loss": losses["loss"]}
-            self.bars.update(self.bar, text=" ".join(f"{name} {value:.2f}" for name, value in shown_losses.items()))
+        self.beside = f"loss {losses['loss']:.2f}, {speed:.0f} pairs/s"
 
     def advance(self, step: int) -> None:
         if step == self.start + 1:  # the first step includes start-up: do not measure it
             self.since, self.since_step = time.perf_counter(), step
-        if self.bars:
-            self.bars.update(self.bar, completed=step)
+        self.advance_bar(1, self.beside)
 
     def evaluation(self, step: int, values: dict[str, float], verdict: str = "") -> None:
         """Log ``values`` of an evaluation, each beside that of step 0; ``verdict`` is a sentence about the whole run."""
@@ -82,8 +79,8 @@ class Log:
 
     def say(self, text: str) -> None:
         """Print ``text`` on a line above the progress bar."""
-        if self.bars:
-            self.bars.say(text)
+        if not self.quiet:
+            say(text)
 
     def _write(self, entry: dict[str, Any]) -> None:
         with naming(self.path):
@@ -116,31 +113,6 @@ def seconds_of(entries: Iterable[dict[str, Any]], batch_size: int) -> float:
             total += (entry["step"] - before) * batch_size / entry["pairs_per_s"]
             before = entry["step"]
     return total
-
-
-def last_line(run: Path) -> dict[str, Any]:
-    """The last line with losses in the log.jsonl of a run's folder; {} if there is none yet."""
-    try:
-        lines = (run / "log.jsonl").read_text().splitlines()
-    except OSError:  # it does not exist yet
-        return {}
-    for line in reversed(lines):
-        try:
-            entry = parse_json(line)
-        except ValueError:  # the line is being written
-            continue
-        if "loss" in entry:
-            return entry
-    return {}
-
-
-def in_a_bar(line: dict[str, Any], num_steps: int, batch_size: int) -> dict[str, Any]:
-    """Fields of a progress bar (``progress.Bars``) for a run in another process, from the last ``line`` of its log."""
-    if not line:
-        return {"completed": 0, "left": None, "speed": None}
-    step, speed = line["step"], line["pairs_per_s"]
-    left = (num_steps - step) * batch_size / max(speed, 1e-9)
-    return {"completed": step, "left": left, "speed": speed, "text": f"loss {line['loss']:.2f}"}
 
 
 LOGGERS = ("tensorboard", "wandb", "trackio")
