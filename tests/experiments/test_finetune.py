@@ -345,7 +345,6 @@ def test_unlabelled_data_is_scored_by_retrieval(
     assert {(r["data"], r["task"]) for r in records if r["data"] == NEW} == {(NEW, "R@5")}
     assert {r["data"] for r in records} == {NEW, OLD}
     said = capsys.readouterr().out
-    assert "scoring before and after: 4 parts" in said
     assert "new data: test instances" in said and "R@5, vision" in said and "pattern, both" in said
 
 

@@ -9,13 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-<<<<<<< HEAD
-from mvitac.evaluation.encoders import about_lines
-=======
 from tabulate import SEPARATING_LINE, tabulate
 
-from mvitac.evaluation.external_encoders import about_lines
->>>>>>> b5a9cb4 (Progress by tqdm, tables of the terminal and LaTeX by tabulate; compare --jobs starts processes that share runs by their locks)
+from mvitac.evaluation.encoders import about_lines
 from mvitac.evaluation.intervals import least_p, num_groups_of
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import covered, error_text, percent, pipes, with_interval
