@@ -36,7 +36,6 @@ from PIL import Image
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data import build as packing
-from mvitac.data import build_parts
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
@@ -105,7 +104,7 @@ def refused(
         if not work:
             for module, name in (
                 (batches_module, "make_views"),
-                (build_parts, "_write_part"),
+                (packing, "read_parts"),
                 (probe_module, "features"),
             ):
                 monkeypatch.setattr(module, name, trap(name))
@@ -526,7 +525,7 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     real = Path.open
 
     def opened(self: Path, mode: str = "r", *args: Any, **options: Any) -> Any:
-        if name in self.name and (mode[0] == ("a" if name == "log.jsonl" else "w") or "+" in mode):
+        if name in self.name and (mode[0] in ("a" if name == "log.jsonl" else "wa") or "+" in mode):
             real(self, mode).close()
             return real(Path("/dev/full"), mode, *args, **options)
         return real(self, mode, *args, **options)
@@ -537,7 +536,7 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
 TRAIN_ONE = PRETRAIN + "--steps 1 --eval-every 0"
 FULL: list[tuple[str, str, str, tuple[str, ...]]] = [
     ("pack-request", "request.json", " ".join(SIMULATE) + " {out}", ()),
-    ("pack-part", "part-000000.json", " ".join(SIMULATE) + " {out}", ("out.partial",)),
+    ("pack-part", "parts.jsonl", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-images", "touch.npy", " ".join(SIMULATE) + " {out}", ("out.partial",)),
     ("pack-jpegs", "touch.jpegs", " ".join(SIMULATE) + " {out} --store jpeg", ("out.partial",)),
     ("pack-table", "samples.parquet", " ".join(SIMULATE) + " {out}", ("out.partial",)),
@@ -866,15 +865,27 @@ SAMPLES: list[tuple[str, Any, str]] = [
     ("gray-image", at(3, "vision", lambda image: image[..., 0]), r"\(32, 32\)"),
     ("alpha-image", at(3, "vision", lambda image: image[..., [0, 1, 2, 2]]), r"\(32, 32, 4\)"),
     ("empty-image", at(3, "vision", lambda image: image[:0]), r"\(0, 32, 3\)"),
-    ("label-nan", at(3, "columns", lambda c: {**c, "label_pattern": float("nan")}), "label_pattern is nan"),
-    ("label-text", at(3, "columns", lambda c: {**c, "label_pattern": "rows"}), "label_pattern is 'rows'"),
-    ("label-none", at(3, "columns", lambda c: {**c, "label_pattern": None}), "label_pattern is None"),
-    ("label-fraction", at(3, "columns", lambda c: {**c, "label_pattern": 0.5}), "label_pattern is 0.5"),
+    (
+        "label-nan",
+        at(3, "columns", lambda c: {**c, "label_pattern": float("nan")}),
+        "column label_pattern holds double",
+    ),
+    (
+        "label-text",
+        at(3, "columns", lambda c: {**c, "label_pattern": "rows"}),
+        "the rows from item 0 on: column 'label_pattern' mixes",
+    ),
+    ("label-none", at(3, "columns", lambda c: {**c, "label_pattern": None}), "column label_pattern is empty in row 3"),
+    ("label-fraction", at(3, "columns", lambda c: {**c, "label_pattern": 0.5}), "column label_pattern holds double"),
     ("label-large", at(3, "columns", lambda c: {**c, "label_pattern": 7}), "label_pattern is 7.*0 to 2"),
     ("split-unknown", at(3, "columns", lambda c: {**c, "split": "tset"}), "'tset'.*did you mean 'test'"),
-    ("split-none", at(3, "columns", lambda c: {**c, "split": None}), "split 'None'"),
-    ("no-group", at(3, "columns", lambda c: {k: v for k, v in c.items() if k != "group"}), "'group' is missing"),
-    ("group-none", at(3, "columns", lambda c: {**c, "group": None}), "group.*None"),
+    ("split-none", at(3, "columns", lambda c: {**c, "split": None}), "column split is empty in row 3"),
+    (
+        "no-group",
+        at(3, "columns", lambda c: {k: v for k, v in c.items() if k != "group"}),
+        "column group is empty in row 3",
+    ),
+    ("group-none", at(3, "columns", lambda c: {**c, "group": None}), "column group is empty in row 3"),
     ("id-twice", at(3, "columns", lambda c: {**c, "id": "0004"}), "'0004'.*twice"),
     ("mixed-types", at(3, "columns", lambda c: {**c, "noise": "loud"}), "noise"),
 ]
@@ -892,13 +903,13 @@ def test_bad_samples_make_no_pack(tmp_path: Path, change: Any, says: str) -> Non
     ("name", "damage"),
     [
         *(("request.json", damage) for damage in ("empty", "truncated", "garbage", "folder")),
-        ("part-000001.json", "folder"),
+        ("parts.jsonl", "folder"),
     ],
 )
 def test_unfinished_pack_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str) -> None:
-    """A damaged leftover is named (a part's file that is only damaged is made again: tests/data/test_pack.py)."""
+    """A damaged leftover is named (a list that is only damaged is made again: tests/data/test_pack.py)."""
     with monkeypatch.context() as patch:
-        patch.setattr(packing, "_finish", trap("finish"))
+        patch.setattr(packing._Partial, "finish", trap("finish"))
         with pytest.raises(WorkBegan):
             build(Toy(num=40), tmp_path / "p", size=32, quiet=True)
     DAMAGES[damage](tmp_path / "p.partial" / name)

@@ -7,9 +7,14 @@ import errno
 import fcntl
 import io
 import json
+import os
 import shutil
+import subprocess
+import sys
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +28,6 @@ from PIL import Image
 from mvitac.data import build as packing
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.partial_pack import RowFile
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.pack import ON_VAL, PackConfig
 from mvitac.evaluation.retrieval import retrieved_rows
@@ -57,34 +61,38 @@ def test_two_processes_give_the_bytes_of_one(pack: Pack, tmp_path: Path) -> None
     assert contents(tmp_path / "two") == contents(pack.path)
 
 
-class Stop:
-    """Raises instead of the ``after``-th call of the method ``name`` of a pack's image files, which then does nothing."""
+@contextmanager
+def stop(after: int, error: BaseException) -> Iterator[None]:
+    """``error`` in the middle of the ``after``-th write to a file of the unfinished pack."""
+    left, real = iter(range(after)), packing._append
 
-    def __init__(self, name: str, after: int, error: BaseException) -> None:
-        self.name, self.after, self.error, self.real = name, after, error, getattr(RowFile, name)
+    def stopping(path: Path, data: bytes) -> None:
+        if next(left, None) is None:
+            real(path, data[: len(data) // 2])
+            raise error
+        real(path, data)
 
-    def __enter__(self) -> None:
-        def stopping(*args: Any) -> Any:
-            self.after -= 1
-            if self.after < 0:
-                raise self.error
-            return self.real(*args)
-
-        setattr(RowFile, self.name, stopping)
-
-    def __exit__(self, *_: object) -> None:
-        setattr(RowFile, self.name, self.real)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(packing, "_append", stopping)
+        yield
 
 
-@pytest.mark.parametrize("writes_before_the_kill", [0, 1, 64, 100, 239])
-def test_interrupted_build_resumes_to_the_same_bytes(pack: Pack, tmp_path: Path, writes_before_the_kill: int) -> None:
-    with pytest.raises(KeyboardInterrupt), Stop("write", writes_before_the_kill, KeyboardInterrupt()):
-        toy_pack(tmp_path / "p")
+@pytest.mark.parametrize("store", ["raw", "jpeg"])
+@pytest.mark.parametrize("writes_before_the_kill", [0, 1, 2, 3, 10, 11])
+def test_interrupted_build_resumes_to_the_same_bytes(
+    pack: Pack, tmp_path: Path, writes_before_the_kill: int, store: Any
+) -> None:
+    """A part of 32 rows is three writes: vision, touch, list."""
+    options: dict[str, Any] = {"size": 32, "quiet": True, "store": store}
+    with pytest.raises(KeyboardInterrupt), stop(writes_before_the_kill, KeyboardInterrupt()):
+        build(Toy(), tmp_path / "p", **options)
     assert not (tmp_path / "p").exists()
     source = Counting()
-    build(source, tmp_path / "p", size=32, quiet=True)
-    done = writes_before_the_kill // 64 * 32  # an item is two writes, a part 32 items
-    assert source.seen == list(range(done, 120)), "what was done is not read again"
+    again = build(source, tmp_path / "p", **options)
+    assert source.seen == list(range(writes_before_the_kill // 3 * 32, 120)), "what was done is not read again"
+    if store == "jpeg":
+        assert again.digest == build(Toy(), tmp_path / "straight", **options).digest
+        return
     assert contents(tmp_path / "p") == contents(pack.path)
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == sorted([*FILES, "provenance.json"])
     assert not (tmp_path / "p.partial").exists()
@@ -147,56 +155,77 @@ def test_packs_where_files_cannot_be_locked(pack: Pack, tmp_path: Path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["p"]
 
 
+def killed(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def almost_finished(path: Path, source: Source) -> Path:
     """What is left of packing ``source`` if the build is killed after the last part."""
 
-    def killed(*_: object) -> None:
-        raise KeyboardInterrupt
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(packing, "_finish", killed)
+        patch.setattr(packing._Partial, "finish", killed)
         with pytest.raises(KeyboardInterrupt):
             build(source, path, size=32, quiet=True)
     return path.with_name(path.name + ".partial")
 
 
-@pytest.mark.parametrize("lost", ["row", "end of the images", "part's file", "half of the part's file"])
+@pytest.mark.parametrize("lost", ["row", "end of the images", "list", "half of the list", "end of a line", "a stamp"])
 def test_what_lost_power_took_is_read_again(pack: Pack, tmp_path: Path, lost: str) -> None:
     partial = almost_finished(tmp_path / "p", Toy())
-    images, part = partial / "pack" / "touch.npy", partial / "part-000001.json"
+    images, parts = partial / "pack" / "touch.npy", partial / "parts.jsonl"
+    lines = parts.read_bytes().splitlines(keepends=True)
     if lost == "row":
         with images.open("r+b") as file:
             file.seek(128 + 40 * 32 * 32 * 3)
             file.write(bytes(32 * 32 * 3))
     elif lost == "end of the images":
-        with images.open("r+b") as file:
-            file.truncate(128 + 40 * 32 * 32 * 3)
+        os.truncate(images, 128 + 40 * 32 * 32 * 3)
+    elif lost == "half of the list":
+        parts.write_bytes(lines[0] + lines[1][:500])
+    elif lost == "end of a line":
+        parts.write_bytes(lines[0] + lines[1][:-1])
+    elif lost == "a stamp":
+        parts.write_bytes(lines[0] + lines[1].replace(b'"stamp": null', b'"stamp": "x"'))
     else:
-        part.write_bytes(part.read_bytes()[: 500 * (lost != "part's file")])
+        parts.unlink()
     source = Counting()
     build(source, tmp_path / "p", size=32, quiet=True)
-    assert source.seen == list(range(32, 120 if lost == "end of the images" else 64))
+    assert source.seen == list(range(0 if lost == "list" else 32, 120))
     assert contents(tmp_path / "p") == contents(pack.path)
 
 
-@pytest.mark.parametrize("writes_before_the_kill", [0, 1, 2, 4])
-def test_killed_while_holes_are_closed(tmp_path: Path, writes_before_the_kill: int) -> None:
-    """Three of the four parts move up, first those of vision, then those of touch."""
-    source = Toy(damaged=(3, 40))
+@dataclass
+class Stamped(Counting):
+    """The toy as if read from a file per item."""
+
+    changed: tuple[int, ...] = ()
+
+    def stamps(self) -> list[int]:
+        return [int(item in self.changed) for item in range(self.num)]
+
+
+def test_killed_while_it_is_finished(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the headers were written for fewer rows than were expected."""
     options: dict[str, Any] = {"size": 32, "max_damaged": 0.05, "quiet": True}
-    straight = build(source, tmp_path / "straight", **options)
-    almost_finished(tmp_path / "p", source)
-    with pytest.raises(KeyboardInterrupt), Stop("write", writes_before_the_kill, KeyboardInterrupt()):
-        build(source, tmp_path / "p", **options)
-    build(source, tmp_path / "p", **options)
+    with monkeypatch.context() as patch:
+        patch.setattr(packing, "digest_file", killed)
+        for name in ("p", "q"):
+            with pytest.raises(KeyboardInterrupt):
+                build(Stamped(damaged=(3, 40)), tmp_path / name, **options)
+    again = Stamped(damaged=(3, 40))
+    build(again, tmp_path / "p", **options)
+    assert not again.seen
+    straight = build(Toy(damaged=(3, 40)), tmp_path / "straight", **options)
     assert contents(tmp_path / "p") == contents(straight.path)
+    build(Stamped(changed=(3, 40)), tmp_path / "q", **options)  # repaired
+    assert contents(tmp_path / "q") == contents(pack.path)
 
 
 def test_killed_in_the_last_clean_up(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The pack is there, what it was made from is not all deleted: the same command again deletes the rest."""
 
     def killed(path: Path) -> None:
-        next(path.glob("part-*.json")).unlink()
+        (path / "parts.jsonl").unlink()
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -217,9 +246,9 @@ def test_killed_in_the_last_clean_up(pack: Pack, tmp_path: Path, monkeypatch: py
 
 
 def test_leftovers_in_the_folder_do_not_get_into_the_pack(pack: Pack, tmp_path: Path) -> None:
-    """Those of a build that was killed at its very end, or of a version that kept images in its parts."""
+    """Those of a build that was killed at its very end."""
     partial = almost_finished(tmp_path / "p", Toy())
-    for name in ("pack/pack.json", "pack/.pack.json.1.tmp", "part-000001.npz", "part-000002.json", "pack/vision.npy"):
+    for name in ("pack/pack.json", "pack/.pack.json.1.tmp", "pack/vision.npy"):
         (partial / name).write_bytes(b"of old")
     toy_pack(tmp_path / "p")
     assert contents(tmp_path / "p") == contents(pack.path)
@@ -232,35 +261,13 @@ def test_unfinished_pack_of_something_else_is_not_continued(tmp_path: Path) -> N
         toy_pack(tmp_path / "p", num=60)
 
 
-@dataclass
-class Stamped(Counting):
-    """The toy as if read from a file per item."""
-
-    changed: tuple[int, ...] = ()
-
-    def stamps(self) -> list[int]:
-        return [int(item in self.changed) for item in range(self.num)]
-
-
-def test_only_parts_whose_files_have_changed_are_made_again(pack: Pack, tmp_path: Path) -> None:
+def test_parts_are_made_again_from_the_first_whose_files_have_changed(pack: Pack, tmp_path: Path) -> None:
     partial = almost_finished(tmp_path / "p", Stamped())
     source = Stamped(changed=(40, 119))
     build(source, tmp_path / "p", size=32, quiet=True)
-    assert source.seen == [*range(32, 64), *range(96, 120)]
+    assert source.seen == list(range(32, 120))
     assert not partial.exists()
     assert contents(tmp_path / "p") == contents(pack.path), "no pack tells when its files were written"
-
-
-def test_parts_that_remember_no_files_are_made_again(pack: Pack, tmp_path: Path) -> None:
-    """Those of a version that did not ask when they were written."""
-    part = almost_finished(tmp_path / "p", Stamped()) / "part-000001.json"
-    known = json.loads(part.read_text())
-    del known["stamp"]
-    part.write_text(json.dumps(known))
-    source = Stamped()
-    build(source, tmp_path / "p", size=32, quiet=True)
-    assert source.seen == list(range(32, 64))
-    assert contents(tmp_path / "p") == contents(pack.path)
 
 
 def test_damaged_items_stop_or_are_listed(tmp_path: Path) -> None:
@@ -302,16 +309,10 @@ class Strings(Toy):
 
 @pytest.mark.parametrize("part", [1, 2, 32])
 def test_lost_samples_leave_no_hole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
-    monkeypatch.setattr(packing, "NUM_PART_ITEMS", 7 * part)
+    monkeypatch.setattr(packing, "NUM_PART_ROWS", 7 * part)
     found = build(Strings(), tmp_path / "p", size=32, max_damaged=0.2, quiet=True)
     check_images(found, [i for i in range(41) if i not in (0, 20, 21, 22, 33)])
     assert found.meta["damaged"] == [[f"sample {i}", "torn"] for i in (0, 20, 21, 22, 33)]
-
-
-def test_more_samples_than_promised_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Strings, "samples_per_item", lambda _: [5] * 6)
-    with pytest.raises(ValueError, match="item 0 gives 6 samples, its source promised 5"):
-        build(Strings(), tmp_path / "p", size=32, max_damaged=0.2, quiet=True)
 
 
 def test_repaired_items_are_read_on_the_next_try(pack: Pack, tmp_path: Path) -> None:
@@ -319,6 +320,19 @@ def test_repaired_items_are_read_on_the_next_try(pack: Pack, tmp_path: Path) -> 
         build(Toy(damaged=(3,)), tmp_path / "p", size=32, quiet=True)
     build(Toy(), tmp_path / "p", size=32, quiet=True)
     assert contents(tmp_path / "p") == contents(pack.path)
+
+
+def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
+    """Each of its packing processes would run it again and wait for the first."""
+    script = tmp_path / "script.py"
+    call = f"build(Toy(), {str(tmp_path / 'p')!r}, size=32, workers=2)"
+    script.write_text(f"from mvitac.data.build import build\nfrom support.toy import Toy\n{call}\n")
+    path = os.pathsep.join(sys.path)
+    done = subprocess.run(
+        [sys.executable, script], env=os.environ | {"PYTHONPATH": path}, capture_output=True, timeout=60
+    )
+    assert b"ValueError: a packing process died: out of memory, or a script without `if __name__" in done.stderr
+    assert done.stderr.count(b"Traceback") == 1
 
 
 def copy_of(pack: Pack, path: Path) -> Path:
@@ -395,9 +409,8 @@ def test_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_full_disk_leaves_no_half_part(pack: Pack, tmp_path: Path) -> None:
-    with Stop("write", 101, OSError(28, "No space left on device")), pytest.raises(OSError, match="No space"):
+    with stop(4, OSError(28, "No space left on device")), pytest.raises(OSError, match="No space"):
         toy_pack(tmp_path / "p")
-    assert sorted(p.name for p in (tmp_path / "p.partial").iterdir()) == ["pack", "part-000000.json", "request.json"]
     toy_pack(tmp_path / "p")
     assert contents(tmp_path / "p") == contents(pack.path)
 

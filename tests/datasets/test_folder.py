@@ -182,17 +182,19 @@ def seen_while_packing(options: FolderConfig, out: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("suffix", ["bmp", "png"])
-def test_a_repaired_image_costs_its_part_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+def test_a_repaired_image_costs_what_comes_from_its_part_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
     """Of the same size (BMP) or not (PNG)."""
     options = write_plain(tmp_path / "set", 200, 10, suffix=suffix)
-    bad = tmp_path / "set" / f"5.{suffix}"
+    bad = tmp_path / "set" / f"35.{suffix}"
     good = bad.read_bytes()
     bad.write_bytes(b"x" * (len(good) if suffix == "bmp" else 7))
-    with pytest.raises(ValueError, match=r"1 of 40 items cannot be read, first row 6: .*repair it"):
+    with pytest.raises(ValueError, match=r"1 of 40 items cannot be read, first row 36: .*repair it"):
         packed(options, tmp_path / "p")
     bad.write_bytes(good)
     os.utime(bad, (20, 20))
-    assert seen_while_packing(options, tmp_path / "p", monkeypatch) == list(range(32))
+    assert seen_while_packing(options, tmp_path / "p", monkeypatch) == list(range(32, 40))
     assert (Pack(tmp_path / "p").images["touch"][:, :, :, 0] == 200).all()
 
 

@@ -1,39 +1,46 @@
 """Builds packs: reads the items of a source, resizes and checks the images, and writes them to disk.
 
-``build`` writes to ``<pack>.partial`` (see ``data/partial_pack.py``). A killed build resumes there and gives the same
-bytes. The finished folder is renamed, so a folder with a pack.json is a complete pack. If several processes want the same
-pack, one builds it and the others wait.
+    <pack>.partial/request.json    what is packed
+                   parts.jsonl     of each part that is on disk: its items, their columns, the checksums of their images
+                   pack/           the image files of the new pack, to which parts are appended in order
+
+A part is a few items. It is in the list once its images are in the files, so a killed build goes on after the last part
+whose images have their checksums, and gives the same bytes. The finished folder is renamed: a folder with a pack.json is
+a complete pack. If several processes want the same pack, one builds it and the others wait.
 """
 
 import contextlib
 import hashlib
 import io
 import json
+import math
 import os
 import shutil
+import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mvitac.data.build_parts import Work, make_parts
 from mvitac.data.pack import FORMAT, Pack
 from mvitac.data.pack_table import check_table
-from mvitac.data.partial_pack import JpegFile, Part, RowFile
+from mvitac.data.read_samples import Part, Reader, Stored, read_parts, stop_second_build, table_of
 from mvitac.data.source import Source
+from mvitac.data.spec import DataSpec
 from mvitac.data.storage import FORMAT_VERSIONS, QUALITY, SUFFIXES, Store, check_request, stored_as
 from mvitac.registry import to_json
-from mvitac.system.files import brief, digest, digest_file, read_json, write_atomic, write_json
+from mvitac.system.files import digest, digest_file, naming, parse_json, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.progress import shown
 from mvitac.system.progress import work as progress
 from mvitac.system.provenance import provenance
 
-NUM_PART_ITEMS = 32  # samples per part: the most that an interruption costs each process
+NUM_PART_ROWS = 32  # the most that an interruption costs each process
+LIKELY_RATIO = 3
+"""Assumed compression ratio of JPEG. It is a low estimate: real frames have 4 at 64 px and 6 to 10 at 256 px."""
 
 
 def build(
@@ -69,6 +76,7 @@ def build(
     Example:
         >>> build(MaterialsConfig(num=100).source(), "packs/materials", size=72)
     """
+    stop_second_build()
     out = Path(out)
     check_request(size, workers, max_damaged, store=store, quality=quality)
     beside = [out.absolute().with_name(f"{out.absolute().name}{left}") for left in (".partial", ".lock")]
@@ -101,31 +109,32 @@ def _clean_up(out: Path, request: dict[str, Any]) -> bool:
 
 def _build(source: Source, out: Path, request: dict[str, Any], workers: int, max_damaged: float, quiet: bool) -> Pack:
     """Build the pack in the process that holds the lock."""
-    spec, counts, size = source.spec(), source.samples_per_item(), request["size"]
-    num = sum(counts)
+    spec, items, counts = source.spec(), source.items(), source.samples_per_item()
+    num, size = sum(counts), request["size"]
     if not num:
         raise ValueError(f"dataset {spec.name!r} has no samples to pack")
-    partial = out.with_name(out.name + ".partial")
-    files: dict[str, RowFile | JpegFile] = {}
-    for modality in spec.modalities:
-        name = f"{modality}{SUFFIXES[request.get('store', 'raw')]}"
-        place = partial / "pack" / name, num, (size, size, spec.channels(modality))
-        files[modality] = JpegFile(*place, request["quality"]) if "store" in request else RowFile(*place)
-    disk = _check_disk(out, list(files.values()))
-    _claim(partial, request, source.sizes_at)
+    partial = _Partial(out.with_name(out.name + ".partial"), spec, num, request)
+    disk = partial.check_disk()
+    _claim(partial.folder, request, source.sizes_at)
     if not quiet:
         print(f"packing {num} samples at {size} px into {out}: {disk}")
-    for rows in files.values():
-        rows.create()
-    parts = _parts(source, partial)
-    job = Work(source, spec, size, counts, files)
-    digests = _write_parts(job, parts, workers, quiet)
-    _finish(partial / "pack", job, parts, digests, request, max_damaged)
+    step = max(1, NUM_PART_ROWS * len(items) // max(len(items), num))
+    parts = [(first, min(first + step, len(items))) for first in range(0, len(items), step)]
+    stamps = source.stamps()
+    stamp = {part: None if stamps is None else digest([items[slice(*part)], stamps[slice(*part)]]) for part in parts}
+    todo = parts[partial.resume([(*part, stamp[part]) for part in parts]) :]
+    reader = Reader(source, spec, items, size, request.get("quality"))
+    done = todo[0][0] if todo else len(items)
+    with shown(quiet=quiet), progress(f"packing {spec.name}", len(items), "items", done=done) as advance:
+        for part, stored in read_parts(reader, todo, workers):
+            partial.append(part, stamp[part.first, part.end], stored)
+            advance(part.end - part.first)
+    partial.finish(len(items), max_damaged)
     with contextlib.suppress(FileExistsError):
         out.parent.mkdir(parents=True)
-    os.rename(partial / "pack", out)
+    os.rename(partial.folder / "pack", out)
     pack = Pack(out, verify=False)
-    shutil.rmtree(partial)
+    shutil.rmtree(partial.folder)
     return pack
 
 
@@ -142,133 +151,159 @@ def _claim(partial: Path, request: dict[str, Any], sizes_at: str | None) -> None
         raise ValueError(f"{partial} is an unfinished pack of something else: delete it or choose another --out")
 
 
-def _parts(source: Source, partial: Path) -> list[Part]:
-    """Divide the items into parts of about ``NUM_PART_ITEMS`` samples."""
-    items, counts, stamps = source.items(), source.samples_per_item(), source.stamps()
-    step = max(1, NUM_PART_ITEMS * len(items) // max(len(items), sum(counts)))
-    firsts = [0, *accumulate(counts)]
-    parts = []
-    for i, start in enumerate(range(0, len(items), step)):
-        end = min(start + step, len(items))
-        stamp = None if stamps is None else digest([items[start:end], stamps[start:end]])
-        parts.append(Part(partial / f"part-{i:06d}.json", (start, end), firsts[start], stamp))
-    return parts
+def _append(path: Path, data: bytes) -> None:
+    with naming(path), path.open("ab") as file:
+        file.write(data)
 
 
-def _write_parts(work: Work, parts: Sequence[Part], workers: int, quiet: bool) -> dict[str, str]:
-    """Write all parts and return the digest of each image file by its name."""
-    # Parts are done in order, so digests are computed while other processes work, from rows still in memory.
-    sums = {modality: hashlib.sha256(rows.header(rows.num)) for modality, rows in work.files.items()}
-    with (
-        shown(quiet=quiet),
-        progress(f"packing {work.spec.name}", len(work.counts), "items") as advance,
-    ):
-        for part, num in zip(parts, make_parts(work, parts, workers), strict=True):
-            for modality, rows in work.files.items():
-                sums[modality].update(rows.join(part, num))
-            advance(part.items[1] - part.items[0])
-    return {rows.path.name: sums[modality].hexdigest() for modality, rows in work.files.items()}
+class _Partial:
+    """An unfinished pack: image files, and the list of the parts in them."""
 
+    def __init__(self, folder: Path, spec: DataSpec, num: int, request: dict[str, Any]) -> None:
+        """``num`` is the number of rows if nothing is damaged."""
+        self.folder, self.spec, self.num, self.request = folder, spec, num, request
+        self.store, size = request.get("store", "raw"), request["size"]
+        self.list = folder / "parts.jsonl"
+        self.shapes = {m: (size, size, spec.channels(m)) for m in spec.modalities}
+        self.files = {m: folder / "pack" / f"{m}{SUFFIXES[self.store]}" for m in spec.modalities}
+        self.sums = {m: hashlib.sha256(self._header(m, num)) for m in spec.modalities}
+        self.parts: list[Part] = []
 
-def _check_disk(out: Path, files: Sequence[RowFile | JpegFile]) -> str:
-    """Return a text with the disk space needed and available; ValueError if it is not enough."""
-    need = sum(rows.need() for rows in files)  # without what an interrupted build has written
-    parent = next(p for p in [out.absolute().parent, *out.absolute().parents] if p.exists())
-    free = shutil.disk_usage(parent).free
-    if need > free:
-        raise ValueError(f"packing needs about {need / 1e9:,.2f} GB, {parent} has {free / 1e9:,.2f} GB free")
-    return f"needs about {need / 1e9:,.2f} GB of disk, {free / 1e9:,.2f} GB are free"
+    def _header(self, modality: str, num: int) -> bytes:
+        """Return the .npy header of ``num`` rows; numpy pads it, so its length does not depend on ``num``."""
+        if self.store == "jpeg":
+            return b""
+        buffer, shape = io.BytesIO(), (num, *self.shapes[modality])
+        np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
+        return buffer.getvalue()
 
+    def _write_headers(self, num: int) -> None:
+        for modality, path in self.files.items():
+            if header := self._header(modality, num):
+                with naming(path), path.open("r+b") as file:
+                    file.write(header)
 
-@dataclass
-class _Contents:
-    """What all parts together say of the pack's rows."""
+    def check_disk(self) -> str:
+        """Return a text with the disk space needed and available; ValueError if it is not enough."""
+        share = 1 if self.store == "raw" else LIKELY_RATIO
+        whole = sum(len(self._header(m, 0)) + self.num * math.prod(shape) // share for m, shape in self.shapes.items())
+        need = max(0, whole - sum(path.stat().st_size for path in self.files.values() if path.exists()))
+        parent = next(p for p in self.folder.absolute().parents if p.exists())
+        free = shutil.disk_usage(parent).free
+        if need > free:
+            raise ValueError(f"packing needs about {need / 1e9:,.2f} GB, {parent} has {free / 1e9:,.2f} GB free")
+        return f"needs about {need / 1e9:,.2f} GB of disk, {free / 1e9:,.2f} GB are free"
 
-    columns: list[dict[str, Any]] = field(default_factory=list)
-    damaged: list[list[Any]] = field(default_factory=list)  # item number and reason
-    lost: list[list[str]] = field(default_factory=list)  # sample name and reason
-    runs: list[tuple[int, int]] = field(default_factory=list)  # first row and number of rows of each part
-    numbers: dict[str, list[int]] = field(default_factory=dict)
-    """Columns crc_<modality> and, of JPEGs, bytes_<modality>."""
+    def resume(self, expected: Sequence[tuple[int, int, str | None]]) -> int:
+        """Take up the parts of an interrupted build and return their number; what comes after them is cut off.
 
-    def add(self, part: Part) -> None:
-        known = part.read()
-        self.runs.append((part.first, len(known["columns"])))
-        self.columns += known["columns"]
-        self.damaged += known["damaged"]
-        self.lost += known["lost"]
-        for kind in ("crc", "bytes"):
-            for modality, values in known.get(kind, {}).items():
-                self.numbers.setdefault(f"{kind}_{modality}", []).extend(values)
+        ``expected``: first item, end and stamp of each part. A part counts if all its images are on disk (a machine that
+        lost power may have lost some), and the files that it was read from have not changed since.
+        """
+        (self.folder / "pack").mkdir(parents=True, exist_ok=True)
+        for path in (self.list, *self.files.values()):
+            path.touch()
+        kept, ends = 0, {m: len(self._header(m, 0)) for m in self.files}
+        lines = self.list.read_bytes().splitlines(keepends=True)
+        for line, wanted in zip(lines, expected, strict=False):
+            found = self._on_disk(line, wanted, ends)
+            if found is None:
+                break
+            part, stored = found
+            self._add(part, stored)
+            kept += len(line)
+            ends = {m: end + len(stored[m]) for m, end in ends.items()}
+        os.truncate(self.list, kept)
+        for modality, path in self.files.items():
+            os.truncate(path, ends[modality])
+        self._write_headers(self.num)
+        return len(self.parts)
 
+    def _on_disk(
+        self, line: bytes, wanted: tuple[int, int, str | None], starts: dict[str, int]
+    ) -> tuple[Part, Stored] | None:
+        """Return the part of a ``line`` of the list and its images, which begin at ``starts``; None if it is not whole."""
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            known = parse_json(line.decode())
+            if not line.endswith(b"\n") or (known["first"], known["end"], known.pop("stamp")) != wanted:
+                return None
+            part, stored = Part(**known), {}
+            for modality, path in self.files.items():
+                with path.open("rb") as file:
+                    file.seek(starts[modality])
+                    images = [file.read(length) for length in part.bytes[modality]]
+                if [zlib.crc32(image) for image in images] != part.crc[modality]:
+                    return None
+                stored[modality] = b"".join(images)
+            return part, stored
+        return None
 
-def _finish(
-    folder: Path, job: Work, parts: Sequence[Part], digests: dict[str, str], request: dict[str, Any], max_damaged: float
-) -> None:
-    """Complete the pack in ``folder``; ``digests`` are those of the image files."""
-    contents = _Contents()
-    for part in parts:
-        contents.add(part)
-    damaged = _check_damage(contents, parts, job.source.items(), max_damaged)
-    num = len(contents.columns)
-    if any(num < rows.num for rows in job.files.values()):
-        # If killed here, the next build finds that the checksums of moved rows are wrong, and reads these rows again.
-        for rows in job.files.values():
-            rows.close_holes(contents.runs)
-        digests = {rows.path.name: digest_file(rows.path) for rows in job.files.values()}
-    for path in folder.iterdir():  # left by a build that was killed here
-        if path.name not in digests:
-            path.unlink()
-    table = io.BytesIO()
-    pq.write_table(_table(contents, job), table)
-    write_atomic(folder / "samples.parquet", lambda file: file.write(table.getvalue()))
-    meta = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSIONS[request.get("store", "raw")],
-        "num": num,
-        "digests": {"samples.parquet": hashlib.sha256(table.getvalue()).hexdigest(), **digests},
-        "damaged": damaged,
-        **request,
-    }
-    write_json(folder / "pack.json", {**meta, "digest": digest(json.loads(json.dumps(meta)))})
-    # In a file of its own, because packs of equal content must be byte-identical.
-    write_json(folder / "provenance.json", provenance())
+    def _add(self, part: Part, stored: Stored) -> None:
+        self.parts.append(part)
+        for modality, images in stored.items():
+            self.sums[modality].update(images)
 
+    def append(self, part: Part, stamp: str | None, stored: Stored) -> None:
+        """Write the images of ``part`` to the files, then the part to the list, without fsync: ``resume`` checks them."""
+        for modality, images in stored.items():
+            _append(self.files[modality], images)
+        _append(self.list, json.dumps({**vars(part), "stamp": stamp}).encode() + b"\n")
+        self._add(part, stored)
 
-def _check_damage(
-    contents: _Contents, parts: Sequence[Part], items: Sequence[str], max_damaged: float
-) -> list[list[str]]:
-    """Return name and reason of everything that could not be read; ValueError if it is more than ``max_damaged``."""
-    num_damaged, num_lost, num = len(contents.damaged), len(contents.lost), len(contents.columns)
-    named = [*([items[number], why] for number, why in contents.damaged), *contents.lost]
-    if num_damaged > max_damaged * len(items) or num_lost > max_damaged * (num + num_lost):
-        for part in parts:  # the next build reads the damaged parts again, when they may have been repaired
-            known = part.read()
-            if known["damaged"] or known["lost"]:
-                part.path.unlink()
-        what = f"{num_damaged} of {len(items)} items" if num_damaged else f"{num_lost} of {num + num_lost} samples"
-        raise ValueError(
-            f"{what} cannot be read, first {named[0][0]}: {named[0][1]}"
-            " (repair it, or leave a share of them out: mvitac data pack --max-damaged SHARE)"
-        )
-    if not num:
-        raise ValueError("every item is damaged: nothing to pack")
-    return named
+    def finish(self, num_items: int, max_damaged: float) -> None:
+        """Complete the pack in the folder ``pack``."""
+        folder, num = self.folder / "pack", sum(len(part.columns) for part in self.parts)
+        damaged = self._check_damage(num_items, num, max_damaged)
+        digests = {path.name: self.sums[m].hexdigest() for m, path in self.files.items()}
+        if num != self.num and self.store == "raw":
+            self._write_headers(num)
+            digests = {path.name: digest_file(path) for path in self.files.values()}
+        for path in folder.iterdir():  # left by a build that was killed here
+            if path.name not in digests:
+                path.unlink()
+        table = io.BytesIO()
+        pq.write_table(self._table(), table)
+        write_atomic(folder / "samples.parquet", lambda file: file.write(table.getvalue()))
+        meta = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSIONS[self.store],
+            "num": num,
+            "digests": {"samples.parquet": hashlib.sha256(table.getvalue()).hexdigest(), **digests},
+            "damaged": damaged,
+            **self.request,
+        }
+        write_json(folder / "pack.json", {**meta, "digest": digest(json.loads(json.dumps(meta)))})
+        # In a file of its own, because packs of equal content must be byte-identical.
+        write_json(folder / "provenance.json", provenance())
 
+    def _check_damage(self, num_items: int, num: int, max_damaged: float) -> list[list[str]]:
+        """Return name and reason of everything that could not be read; ValueError if it is more than ``max_damaged``."""
+        damaged = [one for part in self.parts for one in part.damaged]
+        lost = [one for part in self.parts for one in part.lost]
+        if len(damaged) > max_damaged * num_items or len(lost) > max_damaged * (num + len(lost)):
+            # The next build reads from the first damaged part on, when they may have been repaired.
+            good = next(i for i, part in enumerate(self.parts) if part.damaged or part.lost)
+            lines = self.list.read_bytes().splitlines(keepends=True)[:good]
+            write_atomic(self.list, lambda file: file.write(b"".join(lines)))
+            what = f"{len(damaged)} of {num_items} items" if damaged else f"{len(lost)} of {num + len(lost)} samples"
+            first = ": ".join((damaged or lost)[0])
+            raise ValueError(
+                f"{what} cannot be read, first {first}"
+                " (repair it, or leave a share of them out: mvitac data pack --max-damaged SHARE)"
+            )
+        if not num:
+            raise ValueError("every item is damaged: nothing to pack")
+        return [*damaged, *lost]
 
-def _table(contents: _Contents, job: Work) -> pa.Table:
-    """Return the table of the pack, with a checksum (and the length of a JPEG) per image."""
-    arrays = {}
-    for name in dict.fromkeys(name for row in contents.columns for name in row):
-        try:
-            arrays[name] = pa.array([row.get(name) for row in contents.columns])
-        except pa.ArrowException as error:
-            raise ValueError(f"column {name!r} mixes kinds of values: {brief(error)}") from None
-    table = pa.table(arrays)
-    for name in [f"{kind}_{modality}" for kind in ("crc", "bytes") for modality in job.files]:
-        if name in contents.numbers:
-            # A manifest that was made from another pack has these columns already.
-            table = table.drop_columns(name) if name in table.column_names else table
-            table = table.append_column(name, pa.array(contents.numbers[name], pa.uint32()))
-    check_table(table, job.spec)
-    return table
+    def _table(self) -> pa.Table:
+        """Return the table of the pack, with a checksum (and the length of a JPEG) per image."""
+        table = table_of([row for part in self.parts for row in part.columns])
+        for kind in ("crc", "bytes") if self.store == "jpeg" else ("crc",):
+            for modality in self.files:
+                name = f"{kind}_{modality}"
+                # A manifest that was made from another pack has these columns already.
+                table = table.drop_columns(name) if name in table.column_names else table
+                numbers = [number for part in self.parts for number in getattr(part, kind)[modality]]
+                table = table.append_column(name, pa.array(numbers, pa.uint32()))
+        check_table(table, self.spec)
+        return table
