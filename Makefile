@@ -44,8 +44,8 @@ difficulty: .venv/ready  ## check the design rule of the simulator (takes long; 
 docs: .venv/ready  ## build the documentation in site/ (open site/index.html); warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-notebooks: .venv/ready  ## generate the notebooks of the tutorials from their pages
-	$(BIN)/jupytext --quiet --update --to ipynb docs/tutorials/[!i]*.md
+notebooks: .venv/ready  ## the tutorials as notebooks beside their pages (not kept in the repository)
+	$(BIN)/jupytext --quiet --to ipynb docs/tutorials/[!i]*.md
 
 pictures: .venv/ready  ## draw the pictures of the simulators in the documentation
 	$(BIN)/mvitac data sheet materials --side 56 --out docs/materials.png

@@ -1,12 +1,16 @@
-"""The docs: what a page links to is there, and nothing stands twice."""
+"""The docs: what a page names is there, its commands have these options, and nothing stands twice."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
+
+from mvitac.datasets import DatasetConfig
+from mvitac.methods import MethodConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(p.relative_to(ROOT).as_posix() for p in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -32,3 +36,35 @@ def test_no_paragraph_stands_twice(name: str) -> None:
     """As after an edit by script that put a part of a page in twice."""
     long = [part for part in re.split(r"\n\s*\n", (ROOT / name).read_text()) if len(part) > 200]
     assert not [part[:80] for part, times in Counter(long).items() if times > 1]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_lines_of_prose_have_120_characters(name: str) -> None:
+    lines = (ROOT / name).read_text().splitlines()
+    assert not [line for line in lines if len(line) > 120 and not line.lstrip().startswith("|")]
+
+
+def test_every_picture_is_on_a_page() -> None:
+    text = "".join((ROOT / name).read_text() for name in PAGES)
+    assert not [p.name for p in (ROOT / "docs").rglob("*.png") if p.name not in text]
+
+
+def known_options() -> set[str]:
+    """Options in the stored helps, and those of every dataset and method, which stand there for the default only."""
+    helps = (ROOT / "src/mvitac/cli/help").glob("*.txt")
+    options = {option for file in helps for option in re.findall(r"--[a-z][a-z0-9.-]*[a-z0-9]", file.read_text())}
+    options |= {option.replace("--data.", "--") for option in options}  # as `mvitac data ...` spells them
+    options |= {"--items", "--max-damaged"}  # of `data check` and `data pack`, shown when a dataset is named
+    for base, prefixes in ((DatasetConfig, ("--data.", "--")), (MethodConfig, ("--method.", "--method.no-"))):
+        for config in base.choices.values():
+            options |= {p + field.name.replace("_", "-") for field in fields(config) for p in prefixes}
+    return options
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_options_of_commands_exist(name: str) -> None:
+    """In lines of code that run ``mvitac``, and in words of code that begin with ``--``."""
+    text = (ROOT / name).read_text().replace("\\\n", " ")
+    commands = re.findall(r"^(?:    |)mvitac .*$|`(?:mvitac [^`]*|--[^`]*)`", text, flags=re.MULTILINE)
+    options = {o for command in commands for o in re.findall(r"(?<![\w-])--[a-z][a-z0-9.-]*[a-z0-9]", command)}
+    assert not sorted(options - known_options())

@@ -1,4 +1,4 @@
-"""The tutorials run: every cell of every page, in order, in an empty folder; their notebooks hold the same cells.
+"""The tutorials run: every cell of every page, in order, in an empty folder.
 
 So do the how-to pages docs/add_a_dataset.md, and docs/encoders.md and policies.md on the files that a tutorial leaves.
 """
@@ -25,7 +25,7 @@ PAGES = sorted(p for p in (DOCS / "tutorials").glob("*.md") if p.name != "index.
 
 
 def cells(file: Path) -> list[tuple[str, str]]:
-    """Kind and source of every cell of a page or notebook."""
+    """Kind and source of every cell of a page."""
     return [(cell.cell_type, cell.source) for cell in jupytext.read(file).cells]
 
 
@@ -65,13 +65,6 @@ def test_every_cell_runs(page: Path, tmp_path: Path) -> None:
         run(page, folder, {})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
-def test_notebook_is_the_page(page: Path) -> None:
-    notebook = page.with_suffix(".ipynb")
-    assert cells(notebook) == cells(page), "write it anew: make notebooks"
-    assert not any(cell.get("outputs") for cell in jupytext.read(notebook).cells)
-
-
 def test_later_pages_run(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the folder that "Your own sensor" leaves."""
     monkeypatch.chdir(tmp_path)
@@ -89,7 +82,7 @@ def test_later_pages_run(artifact: Path, pack: Pack, tmp_path: Path, monkeypatch
     names: dict[str, Any] = {"__name__": "encoders"}
     pages = DOCS / "encoders.md", DOCS / "policies.md"
     code = [source for page in pages for kind, source in cells(page) if kind == "code"]
-    assert len(code) == 6  # one of each section
+    assert len(code) == 5  # one of each section
     for source in code:
         exec(compile(source, "page", "exec"), names)
     assert names["features"]["touch"].shape == (72, 64) and names["scores"].mean() > 0.75  # chance is .5

@@ -261,7 +261,7 @@ class Model(nn.Module):
         Raises:
             ValueError: If images do not fit the model, or the model is in training mode.
 
-        Example:
+        Examples:
             >>> model.embed(touch=np.zeros((4, 240, 320, 3), np.uint8))["touch"].shape  # doctest: +SKIP
             torch.Size([4, 512])
         """

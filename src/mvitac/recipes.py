@@ -197,7 +197,7 @@ def recipe(name: str, data: DatasetConfig | Pack | None = None, phased: bool | N
     Raises:
         ValueError: If there is no such recipe.
 
-    Example:
+    Examples:
         >>> recipe("demo").data.name
         'materials'
     """

@@ -82,7 +82,7 @@ class Run:
 
     ``data`` is required; the other defaults are the paper's. ``mvitac.recipe`` returns complete runs.
 
-    Example:
+    Examples:
         >>> from dataclasses import replace
         >>> import mvitac
         >>> run = replace(mvitac.recipe("demo"), steps=100, seed=1)

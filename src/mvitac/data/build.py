@@ -73,7 +73,7 @@ def build(
     Raises:
         ValueError: If more items are damaged, the pack exists, or the disk is too small.
 
-    Example:
+    Examples:
         >>> build(MaterialsConfig(num=100).source(), "packs/materials", size=72)
     """
     stop_second_build()

@@ -38,7 +38,7 @@ class MixedPack(Pack):
         ValueError: If a part has no rows to train on, the parts differ in channels or in what touch images show, or are
             the same data, or train of one part and test of another share groups, rows or images.
 
-    Example:
+    Examples:
         >>> pack = MixedPack({"tag": Pack("packs/tag"), "mine": Pack("packs/mine")})  # doctest: +SKIP
         >>> pack.column("part")[pack.rows("train")]  # doctest: +SKIP
     """

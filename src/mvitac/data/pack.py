@@ -44,7 +44,7 @@ class Pack:
         table: One row per sample (pyarrow).
         images: Modality -> uint8 [N, S, S, C], memory-mapped, or decoded when indexed.
 
-    Example:
+    Examples:
         >>> pack = Pack("packs/materials")
         >>> pack.images["touch"][pack.rows("test")]
     """

@@ -92,7 +92,7 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
     Raises:
         ValueError: nothing is there, or it is damaged.
 
-    Example:
+    Examples:
         model = mvitac.load("artifacts/first")
         probabilities = model.predict(vision=photo, touch=press)
     """

@@ -50,7 +50,7 @@ class _Target:
 class Engine:
     """An opened export: call it with uint8 [B, S, S, C] by modality to get float32 [B, ...] by output name.
 
-    Example:
+    Examples:
         engine = Engine("exports/first")
         probabilities = engine(vision=photos, touch=presses)["probability_category"]   # [B, K]
         newtons = engine(vision=photos, touch=presses)["value_force_n"]                # [B, 1]

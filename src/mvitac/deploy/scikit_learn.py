@@ -30,7 +30,7 @@ class ImageFeatures(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstim
     Attributes:
         model_: The loaded model.
 
-    Example:
+    Examples:
         >>> ImageFeatures("artifacts/mine").fit_transform(["a.png", "b.png"]).shape  # doctest: +SKIP
         (2, 512)
     """

@@ -70,7 +70,7 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
     Raises:
         ValueError: As ``probe_runs``.
 
-    Example:
+    Examples:
         >>> scores = mvitac.probe("runs/demo/seed0", probes=("linear", "knn"))  # doctest: +SKIP
         >>> scores["summary"]["category"]["touch"]["mvitac"]["mean"]  # doctest: +SKIP
     """

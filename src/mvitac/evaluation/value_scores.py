@@ -11,7 +11,7 @@ import numpy as np
 from mvitac.data.spec import Target
 
 SUMS = ("n", "error", "squared_error", "value", "squared_value")
-"""What a record keeps of each test group and target: [T][G] sums over its measured rows."""
+"""What a record keeps of each test group and target: ``[T][G]`` sums over its measured rows."""
 NUM_RANGES = 8
 NUM_POINTS = 200
 

@@ -129,7 +129,7 @@ def random_sensors(seed: int, num: int) -> tuple[Sensor, ...]:
     of the three channels lie about 120 degrees apart, as in all known sensors; their order round the gel and the direction
     of the first are random. Half of the sensors have dots. Sensor i depends on (seed, i) only.
 
-    Example:
+    Examples:
         >>> [sensor.name for sensor in random_sensors(0, 2)]
         ['random0000', 'random0001']
     """

@@ -72,7 +72,7 @@ def train(
         Interrupted: After Ctrl-C or SIGTERM; a checkpoint is saved.
         Busy: If another process trains in ``out``.
 
-    Example:
+    Examples:
         >>> out = mvitac.train(mvitac.recipe("demo"), "runs/mine")  # doctest: +SKIP
         >>> model = mvitac.load(out)  # doctest: +SKIP
     """
