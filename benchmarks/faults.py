@@ -301,7 +301,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--points", type=int, default=0, help="kills per command; 0 = before every change of the disk")
     parser.add_argument("--num", type=int, default=100, help="flips per kind of file")
     options = parser.parse_args(argv)
-    sys.modules["mvitac.transforms.numba_views"] = None  # type: ignore[assignment] # compiled in every process: seconds
     if "kills" in options.kinds:
         for name in (*(f"mvitac.cli.{ALL[command].split(':')[0]}" for command in options.commands), *SLOW):
             importlib.import_module(name)

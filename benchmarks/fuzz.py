@@ -210,7 +210,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--limit", type=float, default=20, help="seconds until a call gets SIGINT")
     chosen = parser.parse_args(argv)
     os.environ |= {"HF_HUB_OFFLINE": "1", "COLUMNS": "200", "NO_COLOR": "1"}
-    sys.modules["mvitac.transforms.numba_views"] = None  # type: ignore[assignment] # compiled in every process: seconds
     for name in sorted({f"mvitac.cli.{place.split(':')[0]}" for place in ALL.values()} | set(MODULES)):
         importlib.import_module(name)
     with tempfile.TemporaryDirectory(prefix="mvitac-fuzz-") as folder:

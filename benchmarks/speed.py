@@ -26,7 +26,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -239,7 +238,7 @@ def measure_steps(scale: Scale, spec: DataSpec, device: torch.device, *, compile
 
 
 def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:
-    """Measure augmented images/s of each input without a network. On a CPU, also of views alone and without numba."""
+    """Measure augmented images/s of each input without a network. On a CPU, also of views alone."""
     typical = typical_batches(folder, scale.size, scale.batch, workers)
     variants: dict[str, Callable[[], object]] = {"typical, JPEG files": lambda: next(typical)}
     images = torch.from_numpy(pack.images["vision"][np.resize(pack.rows("train"), scale.batch)]).permute(0, 3, 1, 2)
@@ -249,8 +248,6 @@ def measure_input(scale: Scale, folder: Path, pack: Pack, device: torch.device, 
         ours: dict[str, Callable[[], object]] = {f"ours, pack, {name}": lambda f=parts: next(f)[0]()}
         if device.type == "cpu":
             ours[f"ours, views alone, {name}"] = lambda d=dtype: random_views.apply(images, drawn, scale.size, d)
-        if device.type == "cpu" and random_views.fused():
-            ours |= {f"{name}, without numba": in_torch(call) for name, call in ours.items()}
         variants |= ours
     cuda = device.type == "cuda"
     seconds = steady(variants, workers, scale.rounds, device) if cuda else interleave(variants, scale.rounds, device)
@@ -274,16 +271,6 @@ def with_cudnn(call: Callable[..., object], **flags: bool) -> Callable[..., obje
             put(before)
 
     return wrapped
-
-
-def in_torch(call: Callable[[], object]) -> Callable[[], object]:
-    """Wrap ``call`` so that torch makes the views, as if numba was not installed."""
-
-    def without() -> object:
-        with patch.object(random_views, "fused", lambda: None):
-            return call()
-
-    return without
 
 
 def feed(run: Run, pack: Pack, device: torch.device) -> Any:

@@ -31,10 +31,10 @@ def authors(data: DatasetConfig, phased: bool | None = None) -> Run:
 
     Differences from `paper`: lr 1e-3 with weight decay 1e-6 and StepLR, which first decays at epoch 20; wide heads with
     dropout; a random first convolution for stacked gels; flips with an effective probability of 25 %; grayscale also for
-    grasping; the two gels of a stacked image are augmented independently; whole images are probed at 256 px. Not repeated:
-    key heads that are never updated, key towers that do not start as copies of the query towers, the last short batch of an
-    epoch, and the choice of a checkpoint: here the last epoch is kept; the authors also keep, of every tenth epoch, the one
-    with the best accuracy on its last training batch.
+    grasping; whole images are probed at 256 px. Not repeated: other views of
+    the second gel of a stacked image, key heads that are never updated, key towers that do not start as copies of the query
+    towers, the last short batch of an epoch, and the choice of a checkpoint: here the last epoch is kept; the authors also
+    keep, of every tenth epoch, the one with the best accuracy on its last training batch.
     """
     views = ViewAugment(flip=0.25, grayscale=0.2)
     base = paper(data, phased)
@@ -44,7 +44,7 @@ def authors(data: DatasetConfig, phased: bool | None = None) -> Run:
         method=MViTacConfig(hidden=2048, dropout=0.5),
         optim=Optim(lr=1e-3, eps=1e-8, weight_decay=1e-6, schedule="late-step"),
         encoder=replace(base.encoder, stem="random"),
-        augment=replace(base.augment, whole=256, vision=views, touch=replace(views, independent_sensors=True)),
+        augment=replace(base.augment, whole=256, vision=views, touch=views),
     )
 
 

@@ -205,12 +205,6 @@ class Run:
                 f"whole images of {self.augment.eval_size} px were stored at {stored_size} px:"
                 f" give --augment.whole {stored_size} or less, or pack the data at a larger --data.size"
             )
-        if spec.window.frames > 1 and (
-            self.augment.touch.independent_sensors or self.augment.vision.independent_sensors
-        ):
-            raise ValueError(
-                "independent_sensors would move the frames of a window apart: leave it out, or give frames 1"
-            )
         if self.encoder.temporal != "stack" and spec.window.frames == 1:
             raise ValueError(
                 f"encoder.temporal {self.encoder.temporal} has no effect on single images: give --data.num-frames 2 or"

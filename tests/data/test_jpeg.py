@@ -240,7 +240,6 @@ def test_a_raw_run_is_the_run_it_was() -> None:
     for name in ("workers", "store", "quality", "moments", "makes", "sensors", "sensors_per_press"):
         del record["data"][name]
     del (
-        record["augment"]["gel_flip"],
         record["method"]["pairs"],
         record["method"]["lambda_sensor"],
         record["optim"]["decay_norms"],

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from mvitac.transforms.gel_colours import learn_colours, recolour
+from mvitac.sim.gel import render
+from mvitac.sim.sensors import SENSORS
+from mvitac.transforms.gel_colours import MIN_IMAGES, learn_colours, recolour, slope_colours
+
+SIDE = 48
+PIXEL_MM = 12.8 / SIDE
 
 NEAR = np.array([[40.0, 60.0], [-70.0, 5.0], [20.0, -65.0]])
 FAR = np.array([[-55.0, 10.0], [25.0, 60.0], [35.0, -50.0]])
@@ -67,3 +75,56 @@ def test_what_cannot_be_learned_is_an_error() -> None:
     gray = images(NEAR, slopes(), 1).mean(-1, keepdims=True).repeat(3, -1)
     with pytest.raises(ValueError, match="do not follow slopes"):
         learn_colours(gray)
+
+
+def imprint(seed: int) -> np.ndarray:
+    """Bumps of about a millimetre in a dome that is off the middle, [SIDE, SIDE] mm."""
+    rng = np.random.default_rng(seed)
+    bumps = gaussian_filter(rng.standard_normal((SIDE, SIDE)), 2.5)
+    y, x = (np.mgrid[0:SIDE, 0:SIDE] - SIDE / 2 - rng.normal(0, 6, (2, 1, 1))) * PIXEL_MM
+    return np.maximum(0.25 * bumps / bumps.std() + 0.8 - (x**2 + y**2) / 40, 0).astype(np.float32)
+
+
+def picture(name: str, seed: int, **changes: Any) -> np.ndarray:
+    return render(
+        imprint(seed), replace(SENSORS[name], **changes), np.random.default_rng(seed), pixel_mm=PIXEL_MM, unit=seed
+    )
+
+
+def cosine(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+
+
+def test_colours_of_exact_slopes() -> None:
+    """Both colours, their proportion and that ink is no slope, to a per cent; the sign of the height stays open."""
+    response, ink = np.array([[-100.0, 20], [30, 40], [60, -90]]), np.array([30.0, 50, 20])
+    heights = np.stack([imprint(i) for i in range(32)])
+    gy, gx = np.gradient(heights, PIXEL_MM, axis=(1, 2))
+    dots = gaussian_filter(np.random.default_rng(0).standard_normal(heights.shape), (0, 1, 1))[..., None] * ink
+    colours, mixtures, curl = slope_colours(np.stack([gx, gy], -1) @ response.T + dots)
+    assert curl < 0.01
+    factor = colours[0, 0] / response[0, 0]
+    np.testing.assert_allclose(colours / factor, response, atol=2)
+    np.testing.assert_allclose(mixtures.T @ colours, np.eye(2), atol=1e-6)
+    assert np.abs(mixtures.T @ ink).max() < 0.03 * np.abs(mixtures.T @ response).max()
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_colours_of_simulated_sensors(name: str) -> None:
+    """From a few pictures of different copies, with dots, dirt, saturation and shadow: within 18 degrees of the lamps."""
+    pictures = np.stack([picture(name, i) for i in range(MIN_IMAGES)]).astype(float)
+    colours, _, curl = slope_colours(pictures - pictures.mean(0))
+    true = np.array(SENSORS[name].response, float)
+    sign = np.sign(colours[:, 0] @ true[:, 0])
+    assert cosine(sign * colours[:, 0], true[:, 0]) > 0.95
+    assert cosine(sign * colours[:, 1], true[:, 1]) > 0.95
+    assert curl < 0.15
+
+
+def test_one_signal_is_not_two_slopes() -> None:
+    """Stripes obey any law about how things change along them."""
+    stripes = np.sin(np.arange(SIDE) + np.arange(8)[:, None])[:, None, :, None] * np.full((SIDE, 1, 3), 60.0)
+    with pytest.raises(ValueError, match="do not follow slopes"):
+        slope_colours(stripes)
+    with pytest.raises(ValueError, match="do not follow slopes"):
+        slope_colours(np.zeros((8, SIDE, SIDE, 3)))

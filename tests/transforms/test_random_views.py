@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -13,7 +12,6 @@ from mvitac.transforms import random_views
 from mvitac.transforms.random_views import (
     IMAGENET_MEAN,
     IMAGENET_STD,
-    Augment,
     Drawn,
     ViewAugment,
     draw,
@@ -81,87 +79,12 @@ def test_both_routes_have_the_same_statistics() -> None:
     torch.testing.assert_close(a.std((0, 2, 3)), b.std((0, 2, 3)), atol=0.04, rtol=0)
 
 
-@pytest.mark.parametrize("route", [random_views.apply, random_views._one_by_one, random_views._batched])
+@pytest.mark.parametrize("route", [random_views._one_by_one, random_views._batched])
 def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> None:
     drawn = draw(ViewAugment(), 8, 40, generator())
     exact, rounded = (route(images(), drawn, 24, dtype) for dtype in (torch.float32, torch.bfloat16))
     assert torch.equal(exact.bfloat16(), rounded)
     assert rounded.is_contiguous(memory_format=torch.channels_last)
-
-
-@pytest.mark.parametrize(("side", "size"), [(40, 28), (42, 28), (40, 40), (40, 56), (9, 9)])
-@pytest.mark.parametrize("channels", [3, 6])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_compiled_views_are_torchs_bit_for_bit(side: int, size: int, channels: int, dtype: torch.dtype) -> None:
-    """On noise, with crops from a pixel to the whole; gray alone sums three products, in an order of its own."""
-    pytest.importorskip("numba")
-    raw = torch.randint(0, 256, (24, channels, side, side), dtype=torch.uint8, generator=generator())
-    drawn = draw(ViewAugment(scale=(0.01, 1.0), grayscale=0.3), 24, side, generator())
-    drawn.boxes[0], drawn.boxes[1] = torch.tensor([0, 0, side, side]), torch.tensor([side - 2, side - 1, 2, 1])
-    torchs, compiled = (route(raw, drawn, size, dtype) for route in (random_views._one_by_one, random_views.apply))
-    gray = drawn.grayscale
-    assert torch.equal(torchs[~gray], compiled[~gray])
-    torch.testing.assert_close(torchs[gray], compiled[gray], atol=1e-6, rtol=0.01 if dtype == torch.bfloat16 else 1e-5)
-    assert compiled.is_contiguous(memory_format=torch.channels_last)
-
-
-def test_compiled_rounding_to_bf16_is_torchs() -> None:
-    """Also of halves, which go to the even neighbour, and of what is a bit less or more."""
-    pytest.importorskip("numba")
-    from mvitac.transforms.numba_views import _bfloat16
-
-    bits = [
-        high << 16 | low for high in (0x3F80, 0x3F81, 0xBF80, 0xBF81) for low in (0, 1, 0x7FFF, 0x8000, 0x8001, 0xFFFF)
-    ]
-    values = np.array(bits, np.uint32).view(np.float32)
-    rounded = np.array([_bfloat16(value) for value in values])
-    assert rounded.tolist() == torch.from_numpy(values).bfloat16().view(torch.uint16).tolist()
-
-
-def test_compiled_views_are_shared_among_torchs_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One share for each, and the same views however many there are."""
-    pytest.importorskip("numba")
-    from mvitac.transforms import numba_views
-
-    shares, views = [], numba_views.views
-
-    def counted(*arrays: np.ndarray) -> None:
-        shares.append(len(arrays[0]))
-        views(*arrays)
-
-    monkeypatch.setattr(numba_views, "views", counted)
-    drawn = draw(ViewAugment(), 8, 40, generator())
-    alone = random_views.apply(images(), drawn, 32)
-    assert shares == [8]
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    assert torch.equal(random_views.apply(images(), drawn, 32), alone)
-    assert sorted(shares[1:]) == [2, 3, 3]
-    shares.clear()
-    random_views.apply(images(2), draw(ViewAugment(), 2, 40, generator()), 32)
-    assert shares == [1, 1]
-
-
-def test_torchs_route_where_the_compiled_one_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Jitter, other precisions, images far larger than the view, no numba; and whole images do not wait for numba."""
-
-    class Cannot:
-        MAX_SHRINK = 1.5
-
-        def views(self, *_: object) -> None:
-            raise AssertionError("the compiled route was taken")
-
-    monkeypatch.setattr(random_views, "fused", Cannot)
-    plain, jittered = (draw(ViewAugment(jitter=j), 8, 40, generator()) for j in (0.0, 0.3))
-    for drawn, size, dtype in ((jittered, 32, torch.float32), (plain, 32, torch.float64), (plain, 26, torch.float32)):
-        expected = random_views._one_by_one(images(), drawn, size, dtype)
-        assert torch.equal(random_views.apply(images(), drawn, size, dtype), expected)
-    plain_view(images(), 32)
-    with pytest.raises(AssertionError, match="compiled"):
-        random_views.apply(images(), plain, 32)
-    monkeypatch.setattr(random_views, "fused", lambda: None)
-    assert torch.equal(
-        random_views.apply(images(), plain, 32), random_views._one_by_one(images(), plain, 32, torch.float32)
-    )
 
 
 def test_flip_is_exact() -> None:
@@ -197,49 +120,13 @@ def test_grayscale_makes_channels_equal_before_normalisation() -> None:
     torch.testing.assert_close(view[:, 0], view[:, 2], atol=1e-5, rtol=0)
 
 
-def test_stacked_sensors_move_together_unless_told() -> None:
+def test_stacked_sensors_move_together() -> None:
     raw = images()
     stacked = torch.cat([raw, raw], dim=1)
     together = random_view(stacked, ViewAugment(jitter=0.3), 24, generator())
     assert torch.equal(together[:, :3], together[:, 3:])
-    apart = random_view(stacked, ViewAugment(independent_sensors=True), 24, generator())
-    assert not torch.equal(apart[:, :3], apart[:, 3:])
 
 
 def test_jitter_keeps_the_range() -> None:
     view = denormalise(random_view(images(), ViewAugment(jitter=0.9), 24, generator()))
     assert float(view.min()) >= -1e-5 and float(view.max()) <= 1 + 1e-5
-
-
-@pytest.mark.parametrize(("channels", "apart"), [(3, False), (6, False), (6, True)])
-def test_noise_is_as_strong_as_drawn_and_stays_in_range(channels: int, apart: bool) -> None:
-    gray = torch.full((400, channels, 32, 32), 128, dtype=torch.uint8)
-    config = ViewAugment(scale=(1.0, 1.0), flip=0, grayscale=0, noise=20, independent_sensors=apart)
-    levels = 255 * denormalise(random_view(gray, config, 32, generator())) - 128
-    spread = levels.flatten(1).std(1)  # of each image: uniform on [0, 20]
-    assert float(spread.min()) < 0.5 and 19 < float(spread.max()) < 20.5
-    assert float(spread.mean()) == pytest.approx(10, abs=0.9) and float(spread.std()) == pytest.approx(5.8, abs=0.5)
-    assert abs(float(levels.mean())) < 0.1
-    assert float((levels[:, 0] * levels[:, 1]).mean()) == pytest.approx(0, abs=1)  # each channel has its own
-    black = 255 * denormalise(random_view(torch.zeros_like(gray), config, 32, generator()))
-    assert float(black.min()) >= -1e-3 and float(black.max()) > 20
-    assert torch.equal(random_view(gray, config, 32, generator()), random_view(gray, config, 32, generator()))
-    assert random_view(gray, config, 32, generator()).is_contiguous(memory_format=torch.channels_last)
-    assert random_view(gray, config, 32, generator(), torch.bfloat16).dtype == torch.bfloat16
-
-
-def test_without_noise_a_view_is_what_it_was() -> None:
-    """No draw is taken for noise that is not there, so runs of before can be continued and repeated."""
-    after = []
-    for noise in (0.0, 5.0):
-        drawing = generator()
-        random_view(images(), ViewAugment(noise=noise), 24, drawing)
-        after.append(torch.rand(1, generator=drawing))
-    plain = generator()
-    random_views.apply(images(), draw(ViewAugment(), 8, 40, plain), 24)
-    assert after[0] == torch.rand(1, generator=plain) and after[0] != after[1]
-
-
-def test_coloured_flips_of_nothing_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"has no effect at touch\.flip 0: also give --augment\.touch\.flip 0\.5"):
-        Augment(gel_flip="colour", touch=ViewAugment(flip=0.0))

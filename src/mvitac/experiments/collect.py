@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask
@@ -33,7 +32,6 @@ from mvitac.system.device import describe, describe_precision, pick_device, pick
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.provenance import provenance
 from mvitac.training.setup import check_same
-from mvitac.training.views import gel_mirror
 
 
 def lay_out(plan: Plan, pack: Pack, out: Path, session: ProbeConfig, device: str = "auto") -> Work:
@@ -86,7 +84,6 @@ def _check_row(plan: Plan, row: Row, pack: Pack) -> tuple[Pack, str]:
     run = plan.run(row, plan.data, 0, pack.phased)
     own = pack if run.data == plan.data else _same_samples(run.data.open(), pack)
     run.check(own.spec, len(run.method.training_rows(own)), own.size)
-    gel_mirror(run, own, torch.device("cpu"))
     run.method.on_tiny_trunk(own.spec, run.encoder)
     return own, run.without_idle(own.spec).digest()
 

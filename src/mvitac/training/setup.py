@@ -33,8 +33,7 @@ from mvitac.training.sampler import check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
 from mvitac.training.step import Chunk, Step
-from mvitac.training.views import gel_mirror, load_chunks, values_of
-from mvitac.transforms.gel_flip import GelMirror
+from mvitac.training.views import load_chunks, values_of
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,6 @@ class Setup:
     run: Run  # the same with ``precision`` resolved for this machine
     pack: Pack
     rows: np.ndarray  # pack rows to train on
-    mirror: GelMirror | None
     device: torch.device
     world: World
     method: Method
@@ -57,7 +55,7 @@ class Setup:
 
     def chunks(self, start: int, num_steps: int) -> Iterator[list[Chunk]]:
         """The chunks of each step from ``start`` to ``num_steps`` (``load_chunks``)."""
-        how = self.method.views, self.device, self.world, start, num_steps, self.mirror
+        how = self.method.views, self.device, self.world, start, num_steps
         return load_chunks(self.run, self.pack, self.rows, *how)
 
 
@@ -74,7 +72,6 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     run.method.check_pack(pack)
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
-    mirror = gel_mirror(run, pack, device)
     check_divisible(run, world)
     check_mix(run, pack, rows, world)
     resumed = (out / "run.json").exists()
@@ -92,7 +89,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
     before = start_weights.sensors if start_weights and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
-    setup = Setup(asked, run, pack, rows, mirror, device, world, method, step, start, num_steps, kept, spec)
+    setup = Setup(asked, run, pack, rows, device, world, method, step, start, num_steps, kept, spec)
     if start == 0:
         _before_first_step(setup)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.

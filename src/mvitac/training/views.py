@@ -1,7 +1,6 @@
 """The random views of each step, which are a function of (seed, step)."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +15,6 @@ from mvitac.system.distributed import World
 from mvitac.training.loader import Feed, ahead, prefetch
 from mvitac.training.sampler import batches, mix, partners
 from mvitac.training.step import Chunk
-from mvitac.transforms.gel_flip import GelMirror
 from mvitac.transforms.random_views import random_view
 
 
@@ -29,12 +27,11 @@ def load_chunks(
     world: World,
     start: int,
     num_steps: int,
-    mirror: GelMirror | None = None,
 ) -> Iterator[list[Chunk]]:
     """The chunks of each step's batch that this process embeds.
 
     Views depend on (seed, step, number of the chunk) only. Two processes thus see the same views as one process with chunks
-    of half the batch. ``mirror`` is the result of ``gel_mirror``.
+    of half the batch.
     """
     feed = Feed(pack, device)
     share = run.batch_size // world.size
@@ -44,7 +41,7 @@ def load_chunks(
     def make(step: int, batch: np.ndarray, number: int) -> Views:
         seed = mix(run.seed, step) if num_chunks == 1 else mix(run.seed, step, number)
         own = np.split(batch, num_chunks)[number]
-        return make_views(run, pack, own, num_views, torch.Generator().manual_seed(seed), device, feed, mirror)
+        return make_views(run, pack, own, num_views, torch.Generator().manual_seed(seed), device, feed)
 
     numbers = range(per_process * world.rank, per_process * (world.rank + 1))
     steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
@@ -58,11 +55,6 @@ def load_chunks(
         yield [partial(make, step, batch, number) for number in numbers]
 
 
-def gel_mirror(run: Run, pack: Pack, device: torch.device) -> GelMirror | None:
-    """The object that flips touch images with their colours, or None if the run flips pixels only."""
-    return GelMirror(pack, device) if run.augment.gel_flip == "colour" else None
-
-
 def make_views(
     run: Run,
     pack: Pack,
@@ -71,13 +63,11 @@ def make_views(
     generator: torch.Generator,
     device: torch.device,
     feed: Feed,
-    mirror: GelMirror | None = None,
 ) -> Views:
     """Make random views of pack rows [B] on ``device``, in the precision that the networks read them in.
 
-    All randomness comes from ``generator``. ``mirror`` is the result of ``gel_mirror`` for the run.
+    All randomness comes from ``generator``.
     """
-    assert (mirror is None) == (run.augment.gel_flip == "plain")
     views = [rows] * num_views
     if run.positives != "same-image":
         of = "presses" if run.positives == "same-press" else "touch_groups"
@@ -97,13 +87,9 @@ def make_views(
         sources = {m: _some(sources[m], there) for m, there in has.items()}
     for modality in has:
         config, images[modality] = getattr(run.augment, modality), []
-        if mirror and modality == "touch":
-            config = replace(config, flip=0.0)  # the mirror flips instead
         fed: dict[int, Tensor] = {}  # load an image once for two views
         for source in sources[modality]:
             seen = fed[id(source)] if id(source) in fed else fed.setdefault(id(source), feed(modality, source))
-            if mirror and modality == "touch":
-                seen = mirror.random(seen, source, run.augment.touch, generator)
             view = random_view(seen, config, run.augment.size, generator, dtype)
             images[modality].append(view)
     splits = run.method.label_splits

@@ -1,10 +1,13 @@
 """Touch images of one sensor in the colours of another, learned from unlabelled images of both.
 
-An optical gel shows slope as colour, I(x, y) = I0 + rx gx + ry gy, and ``gel_flip.slope_colours`` finds rx, ry without
-calibration. What it leaves open are a factor and the sign: (r, g) and (-r, -g) give the same images, so peaks may be
-taken for pits. The factor follows from the presses, whose slopes have the same spread on all sensors. The sign follows
-from the gel: it is a membrane that bridges gaps, so an imprint has sharp ridges and smooth valleys, and the curvature of
-its height is skewed, with the same sign on all gels that press the same kind of things (docs/results/sensors.md).
+An optical gel shows slope as colour: I(x, y) = I0 + rx gx + ry gy. I0 [3] is the image without contact, gx and gy are the
+slopes of the imprint, and rx, ry [3] are the colour changes per unit of slope along x and y. They need no calibration:
+slopes are derivatives of one height, so d gx / dy = d gy / dx, and of all pairs of linear colour mixtures only those of gx
+and gy satisfy this (integrability, as in uncalibrated photometric stereo: Yuille and Snow, CVPR 1997). That leaves a
+factor and the sign open: (r, g) and (-r, -g) give the same images, so peaks may be taken for pits. The factor follows
+from the presses, whose slopes have the same spread on all sensors. The sign follows from the gel: it is a membrane that
+bridges gaps, so an imprint has sharp ridges and smooth valleys, and the curvature of its height is skewed, with the
+same sign on all gels that press the same kind of things (docs/results/sensors.md).
 
 Shapes: N images of H x W pixels, levels 0 to 255.
 """
@@ -12,15 +15,19 @@ Shapes: N images of H x W pixels, levels 0 to 255.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
+from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 from scipy.stats import skew
-
-from mvitac.transforms.gel_flip import slope_colours
 
 MIN_IMAGES, NUM_IMAGES = 32, 400  # least number of images of a sensor, and the number that is used
 SMOOTH, SURE = 36, 3.0
 """Curvature is that of slopes blurred by this fraction of the side: of 0, 1, 2 and 3 pixels of 72, 2 told the sign of the
 four known simulated sensors best (t 5.1 to 5.9 with 100 images, 2.1 to 2.9 without blur). Below ``SURE`` it is refused."""
+
+MAX_CURL, MAX_STRETCH = 0.2, 30.0
+"""Above these limits the result is not a pair of slopes. Curl is .03 to .11 for gels, simulated and real, and .25 to .5
+for gray images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +39,26 @@ class GelColours:
     colours: np.ndarray
     """[3, 2], change of level per slope along x and y, in units of the root mean square of the slopes."""
     mixtures: np.ndarray  # [3, 2], where ``d @ mixtures`` are the slopes of a change of level ``d``
+
+
+def slope_colours(images: Float[np.ndarray, "N H W 3"]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Learn the colours of slope from images of one sensor, minus their mean; ValueError if no mixtures are slopes.
+
+    Returns ``colours`` [3, 2], rx and ry as columns, up to a common factor; ``mixtures`` [3, 2], where ``d @ mixtures``
+    are gx and gy of a colour ``d``, up to the inverse factor; and ``curl``, 0 for perfect slopes and .5 for noise.
+    """
+    down = ((images[:, 2:, 1:-1] - images[:, :-2, 1:-1]) / 2).reshape(-1, 3)
+    right = ((images[:, 1:-1, 2:] - images[:, 1:-1, :-2]) / 2).reshape(-1, 3)
+    rounding = np.eye(3) * len(down) / 24  # variance of rounding to whole levels: regularises equal channels
+    yy, xx, yx = down.T @ down + rounding, right.T @ right + rounding, down.T @ right
+    # Find mixtures p, q [3] that minimise |d(p . I)/dy - d(q . I)/dx|^2 relative to their total variation.
+    change = yy + xx
+    shares, pairs = eigh(np.block([[yy, -yx], [-yx.T, xx]]), np.kron(np.eye(2), change))
+    mixtures, curl = pairs[:, 0].reshape(2, 3).T, float(shares[0])
+    slopes = mixtures.T @ change @ mixtures
+    if curl > MAX_CURL or np.linalg.cond(slopes) > MAX_STRETCH:
+        raise ValueError(f"colours do not follow slopes along x and y (curl {curl:.2f})")
+    return change @ mixtures @ np.linalg.inv(slopes), mixtures, curl
 
 
 def learn_colours(images: np.ndarray) -> GelColours:

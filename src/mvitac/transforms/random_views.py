@@ -6,18 +6,13 @@
 Shapes: B images of C channels and H x W pixels, stacked from N = C / 3 sensors; views of S x S pixels.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import cache, lru_cache
-from types import ModuleType
-from typing import Literal
+from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
-
-from mvitac.registry import LATER_IN_DIGEST
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -38,11 +33,6 @@ class ViewAugment:
     """Probability of grayscale (paper: .2 for materials, none for grasping)."""
     jitter: float = 0.0
     """Strength of brightness, contrast and per-channel gain jitter; each factor is 1 +- jitter (paper: none)."""
-    noise: float = field(default=0.0, metadata=LATER_IN_DIGEST)
-    """Gaussian noise on the pixels. Its standard deviation is drawn per image, between 0 and this number of 255 levels
-    (paper: none)."""
-    independent_sensors: bool = False
-    """Draw separate parameters for the two sensors of a stacked touch image, as in the authors' code."""
 
     def __post_init__(self) -> None:
         if not 0 < self.scale[0] <= self.scale[1] <= 1:
@@ -52,8 +42,6 @@ class ViewAugment:
                 raise ValueError(f"augment {name} {getattr(self, name)} is not a probability: give 0 to 1")
         if not 0 <= self.jitter < 1:
             raise ValueError(f"augment jitter {self.jitter}: give a strength in [0, 1)")
-        if not 0 <= self.noise <= 255:
-            raise ValueError(f"augment noise {self.noise}: give a standard deviation of 0 to 255 levels")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +54,6 @@ class Augment:
     """Side in pixels at which frozen encoders see whole images. Default: size. Random crops show objects larger than a whole
     image resized to the same side does, so features of whole images improve with a larger side (arXiv:1906.06423). Heads
     trained with the encoders (shared space, own classifiers) do not, and always use ``size`` (docs/simulator.md)."""
-    gel_flip: Literal["plain", "colour"] = field(default="plain", metadata=LATER_IN_DIGEST)
-    """How touch images are flipped. plain: mirror the pixels (paper). This also mirrors the lamps, which no real press does.
-    colour: show the mirrored touch as the same sensor would see it, from slope colours learned on the training rows."""
     vision: ViewAugment = ViewAugment()
     touch: ViewAugment = ViewAugment()
 
@@ -76,10 +61,6 @@ class Augment:
         for name, side in (("size", self.size), ("whole", self.eval_size)):
             if not 8 <= side <= 1024:
                 raise ValueError(f"augment {name} {side}: give a side of 8 to 1024 pixels")
-        if self.gel_flip == "colour" and not self.touch.flip:
-            raise ValueError(
-                "augment gel_flip 'colour' has no effect at touch.flip 0: also give --augment.touch.flip 0.5"
-            )
 
     @property
     def eval_size(self) -> int:
@@ -128,55 +109,12 @@ def apply(
 
     Computed in fp32 and rounded to ``dtype`` once, as autocast would round it before the first convolution.
     """
-    if images.device.type != "cpu":
-        return _batched(images, drawn, size, dtype)
-    plain = dtype in (torch.float32, torch.bfloat16) and not bool((drawn.gains != 1).any())
-    compiled = fused() if plain else None
-    if compiled is None or max(images.shape[2:]) > compiled.MAX_SHRINK * size:
-        return _one_by_one(images, drawn, size, dtype)
-    return _in_one_pass(images, drawn, size, dtype, compiled)
-
-
-@cache
-def fused() -> ModuleType | None:
-    """``mvitac.transforms.numba_views``, or None without a numba that supports the installed numpy."""
-    try:
-        from mvitac.transforms import numba_views
-    except ImportError:
-        return None
-    return numba_views
-
-
-def _in_one_pass(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, compiled: ModuleType) -> Tensor:
-    """The fast implementation for CPUs, without jitter. The images are divided among torch's threads.
-
-    Bit-identical to ``_one_by_one``, except for the last bits of grayscale views.
-    """
-    num, channels = images.shape[:2]
-    out = torch.empty(num, size, size, channels, dtype=dtype)
-    bits = out.view(torch.uint16) if dtype == torch.bfloat16 else out  # numpy has no bfloat16
-    given = (images.permute(0, 2, 3, 1), drawn.boxes, drawn.flip, drawn.grayscale)
-    each = [*(t.contiguous() for t in given), bits]
-    tones = torch.stack([_luma(images.device).flatten(), *_normalisation(images.device)]).numpy()
-
-    def fill(*share: Tensor) -> None:
-        compiled.views(*(t.numpy() for t in share), tones)
-
-    num_threads = min(num, torch.get_num_threads())
-    if num_threads < 2:
-        fill(*each)
-    else:
-        list(_threads(num_threads).map(fill, *(t.tensor_split(num_threads) for t in each)))
-    return out.permute(0, 3, 1, 2)
-
-
-@cache
-def _threads(num: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(num, "views")
+    implementation = _one_by_one if images.device.type == "cpu" else _batched
+    return implementation(images, drawn, size, dtype)
 
 
 def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
-    """The implementation for CPUs in torch. One image at a time stays in the cache, as uint8 until the last step."""
+    """The implementation for CPUs. One image at a time stays in the cache, as uint8 until the last step."""
     num, channels = images.shape[:2]
     out = torch.empty(num, size, size * channels, dtype=dtype)  # lines of pixels with their channels: long inner loops
     factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device))
@@ -275,27 +213,8 @@ def random_view(
     dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "B C S S"]:
     """One random view of each image. All randomness comes from ``generator``, which is on the CPU."""
-    num, channels, side, _ = images.shape
-    if config.independent_sensors and channels > 3:
-        sensors = [apply(sensor, draw(config, num, side, generator), size, dtype) for sensor in images.split(3, dim=1)]
-        view = torch.cat(sensors, dim=1).contiguous(memory_format=torch.channels_last)
-    else:
-        view = apply(images, draw(config, num, side, generator), size, dtype)
-    return _noisy(view, config.noise, generator) if config.noise else view
-
-
-def _noisy(view: Float[Tensor, "B C S S"], noise: float, generator: torch.Generator) -> Float[Tensor, "B C S S"]:
-    """Add the noise of ``ViewAugment.noise`` and clip to the range from black to white.
-
-    The strengths are drawn from ``generator``, the noise from a generator on the view's device. The noise therefore differs
-    between types of devices.
-    """
-    num, channels, device = len(view), view.shape[1], view.device
-    strength = (noise * torch.rand(num, 1, 1, 1, generator=generator)).to(device, non_blocking=True)
-    here = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
-    scale, shift = (t.repeat(channels // 3).view(-1, 1, 1) for t in _normalisation(device))
-    pixels = torch.randn(view.shape, generator=here, device=device).to(memory_format=torch.channels_last)
-    return torch.addcmul(view.float(), pixels, strength * scale).clamp_(shift, shift + 255 * scale).to(view.dtype)
+    num, _, side, _ = images.shape
+    return apply(images, draw(config, num, side, generator), size, dtype)
 
 
 def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B C S S"]:
@@ -303,9 +222,7 @@ def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B 
     num, _, height, width = images.shape
     whole = torch.tensor([[0, 0, height, width]]).expand(num, 4)
     never = torch.zeros(num, dtype=torch.bool)
-    # On CPUs not the compiled version: there are few images, or the network takes longer, so numba need not be loaded.
-    implementation = _one_by_one if images.device.type == "cpu" else _batched
-    return implementation(images, Drawn(whole, never, never, torch.ones(num, 5)), size, torch.float32)
+    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size)
 
 
 def normalise(images: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
