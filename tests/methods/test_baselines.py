@@ -28,11 +28,10 @@ from mvitac.methods.supervised import SupervisedConfig
 from mvitac.methods.vicreg import VICReg, VICRegConfig, covariance, variance
 from mvitac.model_files import load
 from mvitac.nn.losses import queue_nce
-from mvitac.nn.memory_bank import Bank, Queue, shard_banks
+from mvitac.nn.memory_bank import Bank, Queue
 from mvitac.recipes import with_method
 from mvitac.registry import to_json
 from mvitac.run import Optim, Run
-from mvitac.system.distributed import World
 from mvitac.training.loader import Feed
 from mvitac.training.loop import train
 from mvitac.training.views import make_views
@@ -79,51 +78,6 @@ def test_bank_moves_exactly_the_batchs_rows() -> None:
             assert bank.values[row].tolist() == pytest.approx(expected, rel=1e-5)
         else:
             assert torch.equal(bank.values[row], before[row])
-
-
-@pytest.mark.parametrize(("size", "held"), [(1, [7]), (2, [4, 3]), (3, [3, 2, 2]), (9, [1] * 7 + [0, 0])])
-def test_a_sharded_bank_finds_scores_and_moves_its_own_rows(size: int, held: list[int]) -> None:
-    """Any number of rows over any number of processes: each row on one of them, and only there told, moved and restored."""
-    whole, at, z = Bank(7, 3), torch.tensor([6, 2, 3]), F.normalize(torch.randn(3, 3), dim=1)
-    shards = [copy.deepcopy(whole) for _ in range(size)]
-    drawn = torch.randint(7, (3, 20))
-    dots, all_held = whole.dots(z, whole.find_drawn(drawn))
-    assert all_held.all()
-    counted, state = torch.zeros(3, 20), copy.deepcopy(whole.state_dict())
-    whole.follow(at, z, 0.5)
-    moved = torch.full((7, 3), torch.nan)
-    for rank, shard in enumerate(shards):
-        shard_banks(shard, World(rank, size))
-        shard.values.zero_()
-        shard.load_state_dict(state)
-        assert shard.num_own == held[rank] and len(shard.values) == held[rank] + (size > 1)
-        own, mine = shard.dots(z, shard.find(drawn))
-        torch.testing.assert_close(own[mine], dots[mine])
-        counted += mine
-        shard.follow(at, z, 0.5)
-        moved[rank::size] = shard.values[: held[rank]]
-    assert torch.equal(counted, torch.ones(3, 20)) and torch.equal(moved, whole.values)
-
-
-@pytest.mark.parametrize("size", [1, 2, 5])
-def test_a_process_looks_at_little_more_than_the_drawn_rows_it_holds(size: int) -> None:
-    bank, drawn, found = Bank(53, 3), torch.randint(53, (4, 3000)), []
-    for rank in range(size):
-        shard = copy.deepcopy(bank)
-        shard_banks(shard, World(rank, size))
-        place = shard.find_drawn(drawn)
-        assert place.shape[1] <= 3000 / size * 1.7
-        found += [(q, int(p) * size + rank) for q in range(4) for p in place[q] if p < shard.num_own]
-    assert sorted(found) == sorted((q, int(row)) for q in range(4) for row in drawn[q])
-
-
-def test_a_bank_of_other_rows_is_refused_by_every_process() -> None:
-    state = Bank(8, 3).state_dict()
-    for rank in (0, 1):
-        shard = Bank(7, 3)
-        shard_banks(shard, World(rank, 2))
-        with pytest.raises(RuntimeError, match="size mismatch"):
-            shard.load_state_dict(state)
 
 
 # -- CMC --------------------------------------------------------------------------------------------------------------

@@ -11,8 +11,7 @@ import torch.distributed as dist
 from mvitac.datasets.mix import MixConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
-from mvitac.nn.memory_bank import shard_banks
-from mvitac.system.distributed import join, synchronise_norms
+from mvitac.system.distributed import join
 from mvitac.training import views as batches
 from mvitac.training.loop import train as pretrain
 from mvitac.training.step import Step
@@ -27,8 +26,6 @@ def step(folder: Path) -> None:
 
     def start(name: str) -> tuple[Method, Step]:
         method = build(name)
-        synchronise_norms(method, world)
-        shard_banks(method, world)
         return method, Step(run_of(name), method, torch.device("cpu"), world)
 
     for name in METHODS:

@@ -64,8 +64,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> None:
-    """Synchronised BatchNorm in trunks and heads, gathered negatives, summed gradients: one process's to rounding. So are
-    CMC's banks, of which each process holds its rows and scores queries against them, and Z."""
+    """Gathered negatives, summed gradients, CMC's banks and Z: one process's to rounding, on a trunk without BatchNorm."""
     one, first, second = (torch.load(pair / method / f"{name}.pt") for name in ("alone", "rank0", "rank1"))
     assert_close(one["losses"], first["losses"], 1e-5)
     assert_close(first["losses"], second["losses"], 0)
@@ -75,14 +74,7 @@ def test_two_processes_equal_one_on_the_joint_batch(pair: Path, method: str) -> 
         torch.testing.assert_close(first["memory"][name], value, rtol=1e-4, atol=1e-5)
     assert_close(one["last"], first["last"], 1e-3)
     assert_close(one["weights"], first["weights"], 1e-3)
-    assert first["weights"].keys() - second["weights"].keys() == {f"banks.{m}.values" for m in first["own"]}
-    for name, value in second["weights"].items():
-        assert torch.equal(value, first["weights"][name]), name
-    for rank, own in enumerate((first["own"], second["own"])):
-        for name, rows in own.items():
-            assert len(rows) == (301, 300)[rank] and torch.equal(
-                rows, first["weights"][f"banks.{name}.values"][rank::2]
-            )
+    assert_close(first["weights"], second["weights"], 0)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -133,9 +125,7 @@ def test_a_mix_with_parts_that_lack_a_camera_resumes_bit_for_bit(pack: Pack, tmp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [1, 2])
-def test_the_loop_keeps_whole_banks_when_the_number_of_processes_changes(
-    pack: Pack, tmp_path: Path, first: int
-) -> None:
+def test_the_loop_keeps_banks_when_the_number_of_processes_changes(pack: Pack, tmp_path: Path, first: int) -> None:
     """Cut after step 3 of 4, resumed from step 2 by another number: in the end the rows seen by either have moved, to unit
     length, and the others are where they were at the start."""
     out, run = tmp_path / "run", loop_run(PackConfig(path=pack.path), "cmc")
@@ -173,5 +163,4 @@ def test_a_world_of_one_does_nothing() -> None:
     z = torch.randn(4, 3)
     world = World()
     assert world.gather(z) is z and torch.equal(world.own(z, 4), z)
-    assert world.sum(z) is z and world.spread(z) is z and world.unshard(z, 4) is z and torch.equal(world.shard(z), z)
     assert world.writes and world.anyone(True) and not world.anyone(False)

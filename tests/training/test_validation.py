@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from mvitac.report.report import write_report
 from mvitac.run import Optim
 from mvitac.system.files import read_json
 from mvitac.training import validation
-from mvitac.training.checkpoint import CHECKPOINT, seal
 from mvitac.training.loop import train
 from mvitac.training.validation import Cells, validate, verdict
 from support.training_runs import power_cut, smoke
@@ -94,21 +92,6 @@ def test_killed_and_resumed_keeps_the_same_best_weights_and_sentence(pack: Pack,
         assert mvitac.load(again, which).weights_digest() == mvitac.load(run, which).weights_digest()  # type: ignore
     first, second = ([e for e in log_of(path) if "eval" in e] for path in (run, again))
     assert first == second
-
-
-def test_a_checkpoint_from_before_goes_on_without_a_start(pack: Pack, tmp_path: Path) -> None:
-    run = smoke(pack, checkpoint_every=2)
-    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "r", quiet=True)
-    state = torch.load(tmp_path / "r" / CHECKPOINT, weights_only=True)
-    assert state.pop("kept")["start"].keys() == set(LINEAR)
-    torch.save(state, buffer := io.BytesIO())
-    seal(buffer)
-    (tmp_path / "r" / CHECKPOINT).write_bytes(buffer.getbuffer())
-    lines = [entry for entry in log_of(tmp_path / "r") if entry["step"] != 0]
-    (tmp_path / "r" / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    train(run, tmp_path / "r", resume=True, quiet=True)
-    assert not any("verdict" in entry for entry in log_of(tmp_path / "r"))
 
 
 def cell(wrong: list[int], rows: int = 10) -> torch.Tensor:

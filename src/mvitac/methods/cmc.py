@@ -9,7 +9,7 @@ that bank, drawn at random. Touch queries use the vision bank in the same way. T
 
 The K rows are drawn uniformly with replacement and may include the query's own row. Both directions share one draw. After
 the step, bank rows are updated: bank[i] <- normalised .5 bank[i] + .5 z_i. There is no momentum encoder, and one view per
-image. With several processes, each holds a share of the rows and scores every query against the drawn rows it holds.
+image.
 Sources: arXiv:1906.05849 (eq. 8 - 12); https://github.com/HobbitLong/CMC (NCE/);
 https://github.com/fredfyyang/Touch-and-Go (train_CMC_touch.py: K 16384, tau .07, bank momentum .5, 128-d).
 
@@ -21,7 +21,7 @@ from typing import ClassVar, cast
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
@@ -29,7 +29,6 @@ from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
 from mvitac.nn.encoders import EncoderConfig, build_towers, heads, trunks
 from mvitac.nn.memory_bank import Bank
 from mvitac.registry import formerly
-from mvitac.system.distributed import World
 
 EPS = 1e-7  # added to both denominators, as in the reference code
 
@@ -72,32 +71,12 @@ class CMCConfig(MethodConfig):
         return CMC(self, spec, encoder)
 
 
-def nce(scores: Float[Tensor, "B _"], noise: float, held: Bool[Tensor, "B _"]) -> Float[Tensor, ""]:
-    """This process's contribution to the NCE loss of normalised scores s, whose column 0 is the positive's.
-
-    ``noise`` is K / N, the density of the uniform noise times K. Scores that are not ``held`` are ignored: they come
-    from bank rows of other processes.
-    """
+def nce(scores: Float[Tensor, "B _"], noise: float) -> Float[Tensor, ""]:
+    """NCE loss of normalised scores s, whose column 0 is the positive's. ``noise`` is K / N: K times the uniform density."""
     positive, negatives = scores[:, 0], scores[:, 1:]
     accepted = torch.log(positive / (positive + noise + EPS))
     rejected = torch.log(noise / (negatives + noise + EPS))
-    accepted, rejected = torch.where(held[:, 0], accepted, 0.0), torch.where(held[:, 1:], rejected, 0.0)
     return -(accepted + rejected.sum(1)).mean()
-
-
-def gathered_logits(logits: Float[Tensor, "B _"], held: Bool[Tensor, "B _"], world: World) -> Float[Tensor, "B _"]:
-    """Logits over the rows of all processes, with the same softmax at column 0.
-
-    Column 0 is the positive's logit, then follows the log-sum-exp of the negatives ``held`` by each process. On one process
-    ``logits`` are returned unchanged.
-    """
-    if world.size == 1:
-        return logits
-    none = torch.finfo(logits.dtype).min  # not -inf: its gradient is NaN where a process holds no negative
-    part = logits.new_zeros(len(logits), 1 + world.size)
-    part[:, 0] = torch.where(held[:, 0], logits[:, 0], 0.0)
-    part[:, 1 + world.rank] = torch.where(held[:, 1:], logits[:, 1:], none).logsumexp(1)
-    return world.sum(part)
 
 
 class CMC(Contrastive):
@@ -129,29 +108,27 @@ class CMC(Contrastive):
         assert len(self.rows), "call prepare(rows) first"
         at = torch.searchsorted(self.rows, z["rows"])
         num = self.config.negatives(len(self.rows))
-        drawn = torch.randint(len(self.rows), (len(at), num + 1), device=at.device)[:, 1:]
+        drawn = torch.randint(len(self.rows), (len(at), num + 1), device=at.device)
+        drawn[:, 0] = at  # the positive
         vision, touch = cast(Bank, self.banks["vision"]), cast(Bank, self.banks["touch"])
-        place = torch.cat([touch.find(at)[:, None], touch.find_drawn(drawn)], dim=1)  # the same in both banks
         with torch.autocast(at.device.type, enabled=False):
-            vt, z_vision = self._contrast(z["vision"], touch, place, self.z_norm[0])
-            tv, z_touch = self._contrast(z["touch"], vision, place, self.z_norm[1])
+            vt, z_vision = self._contrast(z["vision"], touch, drawn, self.z_norm[0])
+            tv, z_touch = self._contrast(z["touch"], vision, drawn, self.z_norm[1])
         self.pending = (at, {m: z[m].detach() for m in self.towers}, torch.stack([z_vision, z_touch]))
         return {"loss": vt + tv, "vt": vt, "tv": tv}
 
-    def _contrast(self, query: Tensor, bank: Bank, place: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
+    def _contrast(self, query: Tensor, bank: Bank, at: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
         """The loss of one direction, and its normalisation constant Z, for embeddings ``query`` [B, D].
 
-        ``place`` [B, K + 1] are rows of ``bank``, the other modality's; column 0 is the positive. ``fixed`` is Z of
-        earlier batches, 0 in the first.
+        ``at`` [B, K + 1] are rows of ``bank``, the other modality's; column 0 is the positive. ``fixed`` is Z of earlier
+        batches, 0 in the first.
         """
-        dots, held = bank.dots(query, place)
-        logits, world, num = dots / self.config.temperature, bank.world, self.config.negatives(len(self.rows))
+        logits = bank.dots(query, at) / self.config.temperature
         if self.config.softmax:
-            return F.cross_entropy(gathered_logits(logits, held, world), torch.zeros_like(place[:, 0])), fixed
+            return F.cross_entropy(logits, torch.zeros_like(at[:, 0])), fixed
         scores = logits.exp()
-        mean = torch.where(held, scores.detach(), 0.0).mean() * (place.shape[1] / (num + 1))
-        norm = torch.where(fixed > 0, fixed, world.sum(mean) * len(self.rows))
-        return world.sum(nce(scores / norm, num / len(self.rows), held)), norm
+        norm = torch.where(fixed > 0, fixed, scores.detach().mean() * len(self.rows))
+        return nce(scores / norm, (at.shape[1] - 1) / len(self.rows)), norm
 
     def after_step(self, progress: float) -> None:
         assert self.pending is not None, "call forward first"

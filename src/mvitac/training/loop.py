@@ -134,11 +134,10 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
                 if evaluate and validation:
                     validation(done, last=last)
 
-            # Save a checkpoint. All processes take part, because memory banks are sharded.
-            if save:
-                if world.writes:
-                    check_still_there(out)
-                checkpoint.save(out, run, method, step.optimiser, done, world, kept=setup.kept)
+            # Save a checkpoint.
+            if save and world.writes:
+                check_still_there(out)
+                checkpoint.save(out, run, method, step.optimiser, done, kept=setup.kept)
             if stop and not last:
                 raise Interrupted(f"stopped after step {done} of {num_steps}; continue with --resume --out {out}")
     if world.writes:

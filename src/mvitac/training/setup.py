@@ -19,7 +19,6 @@ from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.nn.memory_bank import replicated, shard_banks
 from mvitac.nn.momentum import Momentum
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
@@ -85,15 +84,14 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     method, taken = _build_method(run, pack, rows, device, world, start_weights)
     step = Step(run, method, device, world)
     num_steps = run.num_steps(len(rows))
-    kept: dict[str, Any] = {}
-    start = checkpoint.restore(out, run, method, step.optimiser, num_steps, world, kept=kept)
+    start, kept = checkpoint.restore(out, run, method, step.optimiser, world)
     before = start_weights.sensors if start_weights and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
     setup = Setup(asked, run, pack, rows, device, world, method, step, start, num_steps, kept, spec)
     if start == 0:
         _before_first_step(setup)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
-    world.same_everywhere(replicated(method))
+    world.same_everywhere([*method.parameters(), *method.buffers()])
     if not resumed and world.writes:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(spec)}
         here = {"device": describe(device), "precision": run.precision}
@@ -203,7 +201,6 @@ def _build_method(
     taken = load_start(start, method) if start else {}
     method.prepare(torch.from_numpy(rows))
     method.learn_scale(values_of(run, pack, rows))
-    shard_banks(method, world)
     method.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     _check_image_size(method, run, pack)
     synchronise_norms(method, world)
