@@ -96,10 +96,7 @@ def slow_nce(scores: list[list[float]], num_rows: int) -> float:
 
 def test_nce_is_the_owners() -> None:
     scores = torch.rand(6, 12) * 0.1
-    held = torch.rand(6, 12) < 0.5
-    whole, *parts = (float(nce(scores, 11 / 50, own)) for own in (held | True, held, ~held))
-    assert whole == pytest.approx(slow_nce(scores.tolist(), 50), rel=1e-5)
-    assert sum(parts) == pytest.approx(whole, rel=1e-5)
+    assert float(nce(scores, 11 / 50)) == pytest.approx(slow_nce(scores.tolist(), 50), rel=1e-5)
 
 
 @pytest.mark.parametrize("softmax", [False, True])
