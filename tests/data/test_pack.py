@@ -390,7 +390,7 @@ def test_disk_is_told_before_it_is_taken(
 ) -> None:
     free(monkeypatch, 3 * 10**9)
     build(Toy(), tmp_path / "p", size=32)
-    assert f"into {tmp_path / 'p'}: needs about 737.5 kB of disk, 3.0 GB are free" in capsys.readouterr().out
+    assert f"into {tmp_path / 'p'}: needs about 0.00 GB of disk, 3.00 GB are free" in capsys.readouterr().out
     build(Toy(), tmp_path / "q", size=32, quiet=True)
     assert "disk" not in capsys.readouterr().out
 

@@ -1,4 +1,4 @@
-"""Images inside something else: LeRobot datasets in and out, tars, parquet of the hub; each pixel beside its own row."""
+"""Images inside something else: LeRobot datasets, tars, parquet of the hub; each pixel beside its own row."""
 
 from __future__ import annotations
 
@@ -15,19 +15,14 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.source import Sample
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.hub import HubConfig
-from mvitac.datasets.lerobot import writer
 from mvitac.datasets.lerobot.reader import LeRobotConfig, _nearest, choose
-from mvitac.datasets.lerobot.writer import write_lerobot
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.datasets.webdataset import WebDatasetConfig
 from support.films import film, shade
-from support.toy import Toy
 
 
 def packed(config: RowsConfig, out: Path) -> Pack:
@@ -179,76 +174,6 @@ def test_lerobot_says_what_is_missing(tmp_path: Path) -> None:
     refused(root, r"file-001\.parquet is not a parquet file")
 
 
-@pytest.fixture(params=[3, 6])
-def toy(request: pytest.FixtureRequest, tmp_path: Path) -> Pack:
-    return build(Toy(touch_channels=request.param), tmp_path / "toy", size=32, quiet=True)
-
-
-def test_a_pack_survives_lerobot(toy: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(writer, "FILE_BYTES", 100_000)  # several files
-    assert main(["data", "export-lerobot", str(toy.path), "--out", str(tmp_path / "set"), "--fps", "25"]) == 0
-    assert len(list((tmp_path / "set/data/chunk-000").iterdir())) > 2
-    names = ("label_pattern", "label_bright")
-    options: dict[str, Any] = {"labels": names, "group": "group", "touch_group": "touch_group", "split": "split"}
-    back = packed(LeRobotConfig(path=tmp_path / "set", size=32, **options), tmp_path / "back")
-    assert back.num == toy.num and back.spec.touch_channels == toy.spec.touch_channels
-    order = np.argsort(toy.touch_groups, kind="stable")
-    at = order[back.column("id").astype(int)]  # lerobot's index counts the rows as written
-    for modality in toy.images:
-        assert (back.images[modality] == toy.images[modality][at]).all()
-    for name in ("group", "split"):
-        assert (back.column(name) == toy.column(name)[at]).all()
-    assert (back.column("id_in_pack") == toy.column("id")[at]).all()
-    assert (back.column("label_label_bright") == toy.column("label_bright")[at]).all()
-    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
-    assert "crc_touch" in toy.table.column_names and not {"crc_vision", "crc_touch"} & set(features)
-    times = back.column("timestamp").astype(float)
-    assert np.allclose(times * 25, back.column("frame").astype(int), atol=1e-4)
-    episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert sum(e["length"] for e in episodes) == toy.num
-    for e in episodes:
-        data = pq.read_table(tmp_path / f"set/data/chunk-000/file-{e['data/file_index']:03d}.parquet").to_pylist()
-        mine = [row for row in data if row["episode_index"] == e["episode_index"]]
-        assert [row["index"] for row in mine] == list(range(e["dataset_from_index"], e["dataset_to_index"]))
-
-
-def test_columns_named_like_the_formats_own_survive_it(tmp_path: Path) -> None:
-    class Named(Toy):
-        def read(self, item: int) -> list[Sample]:
-            (s,) = super().read(item)
-            given = {"frame": 100 + item, "episode": f"e{item}", "timestamp": item / 2, "task": "press", "index": -item}
-            return [Sample(vision=s.vision, touch=s.touch, columns={**s.columns, **given, "task_in_pack": "older"})]
-
-    pack = build(Named(), tmp_path / "pack", size=32, quiet=True)
-    write_lerobot(pack, tmp_path / "set")
-    back = packed(
-        LeRobotConfig(path=tmp_path / "set", size=32, labels=("label_pattern",), group="group"), tmp_path / "b"
-    )
-    at = {name: i for i, name in enumerate(pack.column("id"))}
-    rows = [at[name] for name in back.column("id_in_pack")]
-    for name in ("frame", "episode", "index"):
-        assert back.column(f"{name}_in_pack").tolist() == [str(pack.column(name)[i]) for i in rows]
-    assert back.column("timestamp_in_pack").astype(float).tolist() == [pack.column("timestamp")[i] for i in rows]
-    assert set(back.column("task_in_pack")) == {"older"} and set(back.column("task_in_pack_in_pack")) == {"press"}
-    assert set(back.column("frame").astype(int)) <= set(range(pack.num))  # and these are the format's
-
-
-def test_export_leaves_gaps_out_and_never_overwrites(tmp_path: Path) -> None:
-    class Holes(Toy):
-        def read(self, item: int) -> list[Sample]:
-            (s,) = super().read(item)
-            has = item % 3 != 0
-            columns = {**s.columns, "has_touch": has}
-            return [Sample(vision=s.vision, touch=s.touch if has else None, columns=columns)]
-
-    pack = build(Holes(), tmp_path / "pack", size=32, quiet=True)
-    assert write_lerobot(pack, tmp_path / "set") == 80
-    with pytest.raises(ValueError, match="already exists"):
-        write_lerobot(pack, tmp_path / "set")
-    with pytest.raises(ValueError, match="fps 0"):
-        write_lerobot(pack, tmp_path / "other", fps=0)
-
-
 # -- values -----------------------------------------------------------------------------------------------------------
 
 
@@ -299,23 +224,6 @@ def test_webdataset_hub_and_manifests_read_values(tmp_path: Path) -> None:
         config = FolderConfig(path=tmp_path / f"m.{kind}", size=16, values=("p=pose[0]:mm,pose[2]:mm",))
         values, shown = measured(packed(config, tmp_path / kind))
         assert np.array_equal(values, np.stack([shown / 2, -shown / 4], axis=1)), kind
-
-
-def test_values_and_their_units_leave_as_lerobot_and_come_back(tmp_path: Path) -> None:
-    pack = build(Toy(values=True), tmp_path / "pack", size=32, workers=1, quiet=True)
-    write_lerobot(pack, tmp_path / "set")
-    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
-    assert features["weight"] == {"dtype": "float64", "shape": [1], "names": ["weight (N)"]}
-    assert features["noise"]["names"] is None
-    weight = pack.column("weight")
-    stats = json.loads((tmp_path / "set/meta/stats.json").read_text(), parse_constant=pytest.fail)  # no NaN
-    assert stats["weight"]["mean"] == [pytest.approx(np.nanmean(weight))]
-    assert stats["weight"]["count"] == [np.isfinite(weight).sum()]
-    config = LeRobotConfig(path=tmp_path / "set", size=32, group="group", values=("weight:N", "level:levels"))
-    back = packed(config, tmp_path / "back")
-    at = np.argsort(pack.touch_groups, kind="stable")[back.column("id").astype(int)]
-    for task in back.spec.values:
-        assert np.array_equal(back.values(task)[:, 0], pack.column(task.name)[at], equal_nan=True)
 
 
 # -- WebDataset -------------------------------------------------------------------------------------------------------

@@ -24,9 +24,7 @@ from rich.console import Console
 
 from mvitac.cli.live import _engine, _print_touch, _run, sources, view
 from mvitac.cli.main import main
-from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.datasets.lerobot.reader import LeRobotConfig
 from mvitac.deploy.artifact import seal
 from mvitac.deploy.engine import Engine
 from mvitac.deploy.search import neighbours
@@ -492,51 +490,6 @@ def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:
         Recorder(tmp_path / "pack", {"vision": 3, "touch": 3})
 
 
-def test_a_recording_is_a_lerobot_dataset(engine: Engine, tmp_path: Path) -> None:
-    """Our reader finds every recorded pair again, bit for bit, at the time it was seen; an episode is one touch."""
-    recorder = Recorder(tmp_path / "set", {"vision": 3, "touch": 3}, fps=5.0, form="lerobot")
-    kept: dict[float, dict[str, np.ndarray]] = {}
-
-    def record(images: dict[str, np.ndarray], columns: dict[str, Any]) -> None:
-        kept[columns["time"]] = images
-        recorder(images, columns)
-
-    world = World(engine, record=record)
-    world.run(20)
-    num = recorder.close()
-    assert num == pytest.approx(100, abs=4) and not list(tmp_path.glob("*.spool"))
-    config = LeRobotConfig(path=tmp_path / "set", size=32, group="group")
-    back = build(config.source(), tmp_path / "back", size=32, quiet=True)
-    assert back.num == num and set(back.column("split")) == {"unlabelled"}
-    for row, time in enumerate(back.column("time").astype(float)):
-        for modality, images in back.images.items():
-            assert np.array_equal(images[row], kept[time][modality])
-    touched = back.column("group")[back.column("contact") == "True"]
-    assert set(touched) == {f"touch-{i:06d}" for i in range(1, world.live.num_touches + 1)}
-    episodes = {tuple(pair) for pair in np.stack([back.column("episode"), back.column("group")], 1)}
-    assert len(episodes) == len(set(back.column("episode"))) == len(set(back.column("group")))
-    info = json.loads((tmp_path / "set/meta/info.json").read_text())
-    assert info["fps"] == 5 and info["total_frames"] == num
-
-
-def test_a_recording_of_a_gripper_is_packed_again_as_it_was(tmp_path: Path) -> None:
-    """Two gels: the dataset's own columns must not pass for images."""
-    recorder = Recorder(tmp_path / "set", {"vision": 3, "touch": 6}, fps=1.0, form="lerobot")
-    rng = np.random.default_rng(3)
-    kept = [
-        {m: rng.integers(0, 256, (16, 16, c), dtype=np.uint8) for m, c in (("vision", 3), ("touch", 6))}
-        for _ in range(4)
-    ]
-    for i, images in enumerate(kept):
-        recorder(images, {"time": float(i), "contact": True, "touch_number": 1})
-    assert recorder.close() == 4
-    command = ["data", "pack", "--data", "lerobot", "--path", str(tmp_path / "set"), "--size", "16", "--quiet"]
-    assert main([*command, "--out", str(tmp_path / "back")]) == 0
-    back = Pack(tmp_path / "back")
-    for modality, images in back.images.items():
-        assert np.array_equal(images, np.stack([pair[modality] for pair in kept]))
-
-
 def test_a_gap_is_not_made_up_for(tmp_path: Path) -> None:
     """At most fps pairs a second: also at the start, and after a gap."""
     recorder = Recorder(tmp_path / "pack", {"touch": 3}, fps=1.0)
@@ -548,9 +501,8 @@ def test_a_gap_is_not_made_up_for(tmp_path: Path) -> None:
 
 
 def test_a_rate_that_cannot_be_recorded(tmp_path: Path) -> None:
-    for form, fps, says in (("lerobot", 2.5, "fps 2.5: .* whole number"), ("pack", 0.0, "more than 0")):
-        with pytest.raises(ValueError, match=says):
-            Recorder(tmp_path / "out", {"touch": 3}, fps=fps, form=form)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="more than 0"):
+        Recorder(tmp_path / "out", {"touch": 3}, fps=0.0)
     assert not list(tmp_path.iterdir())
 
 
@@ -572,10 +524,9 @@ def test_a_full_disk_ends_the_recording_only(tmp_path: Path, monkeypatch: pytest
     assert recorder.close() == Pack(tmp_path / "out").num == 128  # as many as were kept until then
 
 
-@pytest.mark.parametrize("form", ["pack", "lerobot"])
-def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
+def test_a_recording_survives_a_crash(tmp_path: Path) -> None:
     out = tmp_path / "recording"
-    recorder = Recorder(out, {"touch": 3}, fps=1.0, form=form)
+    recorder = Recorder(out, {"touch": 3}, fps=1.0)
     image = np.zeros((16, 16, 3), np.uint8)
     for i in range(130):
         recorder({"touch": image + i}, {"time": float(i), "contact": i % 2 == 0, "touch_number": i // 2})
@@ -583,11 +534,7 @@ def test_a_recording_survives_a_crash(form: Any, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not finished: `mvitac live --finish"):
         Recorder(out, {"touch": 3})
     assert main(["live", "--finish", str(out)]) == 0
-    if form == "lerobot":
-        source = LeRobotConfig(path=out, size=16).source()
-        pack = build(source, tmp_path / "pack", size=16, quiet=True)
-    else:
-        pack = Pack(out)
+    pack = Pack(out)
     assert pack.num == 128
     assert np.array_equal(pack.images["touch"][:, 0, 0, 0], pack.column("time").astype(float))
     with pytest.raises(ValueError, match="no unfinished recording"):

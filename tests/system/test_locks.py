@@ -8,19 +8,16 @@ import pytest
 from filelock import FileLock
 
 from mvitac.data.pack import Pack
-from mvitac.datasets.lerobot.writer import write_lerobot
 from mvitac.deploy.artifact import load
 from mvitac.deploy.export import export
 from mvitac.deploy.publish import publish
 from mvitac.deploy.search import build
 from mvitac.system.locks import Busy, new_folder
-from support.processes import begin
 
 COMMANDS = {
     "publish": lambda run, pack, out: publish(run, out, pack),
     "export": lambda run, pack, out: export(load(run), pack, out),
     "index": lambda run, pack, out: build(load(run), pack, out),
-    "lerobot": lambda run, pack, out: write_lerobot(pack, out),
 }
 
 
@@ -45,24 +42,3 @@ def test_a_new_folder_is_complete_or_not_there(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="already exists"), new_folder(tmp_path / "out"):
         pass
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "file"]
-
-
-def lerobot_on_a_full_disk(pack: Path, out: Path) -> int:
-    """No file may grow beyond 50 kB: for a process the same as a full disk, but for the error's text."""
-    import resource
-
-    from mvitac.cli.main import main
-
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
-    return main(["data", "export-lerobot", str(pack), "--out", str(out)])
-
-
-def test_lerobot_on_a_full_disk(pack: Pack, tmp_path: Path) -> None:
-    process = begin(lerobot_on_a_full_disk, pack.path, tmp_path / "out", output=tmp_path / "said")
-    process.join()
-    assert process.exitcode == 2, (tmp_path / "said").read_text()
-    said = (tmp_path / "said").read_text()
-    assert (
-        said.startswith(f"mvitac: error: {tmp_path / 'out'}: ") and "File too large" in said and said.count("\n") == 1
-    )
-    assert [path.name for path in tmp_path.iterdir()] == ["said"]

@@ -18,7 +18,6 @@ from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import Task, Window, listed
 from mvitac.datasets.base import DatasetConfig
-from mvitac.datasets.lerobot.writer import write_lerobot
 from mvitac.datasets.mix import open_packs
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.registry import default, unknown
@@ -260,24 +259,3 @@ def show(argv: list[str]) -> None:
         picture = contact_sheet.to_image(pack, found, num_all, side=options.side)
         write_atomic(out, lambda file: picture.save(file, "PNG"))
     print(f"{out}: {len(found)} of {num_all} strips")
-
-
-@dataclass(frozen=True)
-class _LeRobotOptions:
-    """A pack as a LeRobotDataset v3: images unchanged (PNG), one episode per touch group."""
-
-    pack: Positional[Path]
-    """Folder of the pack."""
-    out: Path
-    """Folder of the new dataset."""
-    fps: int = 10
-    """Nominal rate of the rows of an episode: a pack holds no times."""
-
-
-def export_lerobot(argv: list[str]) -> None:
-    """mvitac data export-lerobot PACK --out DIR [--fps 10]"""
-    options = parse(_LeRobotOptions, argv, "data export-lerobot")
-    pack = Pack(options.pack)
-    num = write_lerobot(pack, options.out, fps=options.fps)
-    left = f"; {pack.num - num} rows that lack a modality left out" * (num < pack.num)
-    print(f"{options.out}: {num} frames{left}")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console, Group
@@ -53,10 +53,8 @@ class _Options:
     """Show the nearest known touches from this index."""
     record: Path | None = None
     """Record the frames in this new folder."""
-    record_as: Literal["pack", "lerobot"] = "pack"
-    """Format of the recording: a pack, or a LeRobotDataset v3 (one episode per touch)."""
     record_fps: float = 10.0
-    """Pairs per second to record; a whole number for lerobot."""
+    """Pairs per second to record."""
     window: bool = False
     """Also show the frames and answers in a window; q or Esc in it ends. Needs a display and opencv-python."""
     seconds: float | None = None
@@ -102,7 +100,7 @@ def live(argv: list[str]) -> None:
     recorder = None
     if options.record:
         channels = {m: s[2] for m, s in frame_shapes(engine).items()}
-        how: Any = {"fps": options.record_fps, "form": options.record_as, "sensor": sensor}
+        how: Any = {"fps": options.record_fps, "sensor": sensor}
         recorder = Recorder(options.record, channels, **how, tell=lambda text: _say(console, text, "yellow"))
     # Faults are printed above the picture, so that they stay in the scrollback and in a log file.
     tell = lambda event: _say(console, event.text, "yellow")  # noqa: E731

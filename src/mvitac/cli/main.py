@@ -20,7 +20,6 @@ COMMANDS = {
     "data check": "data_check:check",
     "data sheet": "data:sheet",
     "data show": "data:show",
-    "data export-lerobot": "data:export_lerobot",
     "pretrain": "pretrain:pretrain",
     "finetune": "finetune:finetune",
     "adapt": "finetune:adapt",

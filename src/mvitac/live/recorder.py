@@ -1,18 +1,17 @@
-"""Record live input: pairs are written to a temporary folder, the spool, and become a pack or a LeRobotDataset at the end
+"""Record live input: pairs are written to a temporary folder, the spool, and become a pack at the end
 (after a crash: later, by ``mvitac live --finish``)."""
 
 import io
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from mvitac.data.build import build
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec
-from mvitac.datasets.lerobot.writer import check_fps, write_lerobot
 from mvitac.registry import from_json, to_json
 from mvitac.system.files import check_place, digest_file, read_json, write_atomic, write_json
 
@@ -20,7 +19,7 @@ SPOOL = 64  # pairs per file of the spool: the number that a crash can lose
 
 
 class Recorder:
-    """Call it with every pair; ``close`` makes the pack or dataset. At most ``fps`` pairs per second are kept.
+    """Call it with every pair; ``close`` makes the pack. At most ``fps`` pairs per second are kept.
 
     Recording ends when pairs cannot be written (a full disk); ``tell`` gets a sentence, and prediction goes on.
     """
@@ -31,19 +30,16 @@ class Recorder:
         channels: dict[str, int],
         *,
         fps: float = 10.0,
-        form: Literal["pack", "lerobot"] = "pack",
         sensor: str = "",
         tell: Callable[[str], object] = print,
     ) -> None:
         """Record into the new folder ``out``; ``channels``: modality -> C of its images, uint8 [S, S, C].
 
-        ``fps`` is the maximum number of pairs per second, a whole number for lerobot. ``sensor`` is the name of the touch
-        sensor, if it is known (column sensor).
+        ``fps`` is the maximum number of pairs per second. ``sensor`` is the name of the touch sensor, if it is known
+        (column sensor).
         """
         if not fps > 0:
             raise ValueError(f"fps {fps:g}: give pairs a second, more than 0")
-        if form == "lerobot":
-            check_fps(fps)
         if out.exists():
             raise ValueError(f"{out} already exists: choose another --record, or delete it first")
         check_place(out)
@@ -63,7 +59,7 @@ class Recorder:
             source="mvitac live",
         )
         self.spool.mkdir(parents=True)
-        write_json(self.spool / "recording.json", {"spec": to_json(spec), "form": form, "fps": fps, "sensor": sensor})
+        write_json(self.spool / "recording.json", {"spec": to_json(spec), "sensor": sensor})
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num = 0
         self._next = float("-inf")
@@ -98,7 +94,7 @@ class Recorder:
         self.waiting = []
 
     def close(self) -> int:
-        """Write the last pairs and make the pack or dataset; returns its number of pairs (0: nothing is made)."""
+        """Write the last pairs and make the pack; returns its number of pairs (0: nothing is made)."""
         self._flush()
         return finish(self.out)
 
@@ -109,12 +105,7 @@ def finish(out: Path) -> int:
     if not spool.files:  # a crash before the first file
         shutil.rmtree(spool.path)
         return 0
-    if spool.form == "lerobot":
-        packed = spool.path / "pack"
-        shutil.rmtree(packed, ignore_errors=True)
-        num = write_lerobot(build(spool, packed, size=spool.size(), quiet=True), out, fps=int(spool.fps))
-    else:
-        num = build(spool, out, size=spool.size(), quiet=True).num
+    num = build(spool, out, size=spool.size(), quiet=True).num
     shutil.rmtree(spool.path)
     return num
 
@@ -128,7 +119,7 @@ class Recorded(Source):
             raise ValueError(f"{path} does not exist: there is no unfinished recording to finish")
         self.files = sorted(path.glob("*.npz"))
         meta = read_json(path / "recording.json", "an unfinished recording")
-        self.form, self.fps, self._spec = meta["form"], meta["fps"], meta["spec"]
+        self._spec = meta["spec"]
         self.named = {"sensor": sensor} if (sensor := meta.get("sensor")) else {}  # older recordings have none
 
     def spec(self) -> DataSpec:

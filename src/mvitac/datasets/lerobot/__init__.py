@@ -1,3 +1,3 @@
-"""Reads and writes LeRobot datasets."""
+"""Reads LeRobot datasets."""
 
 from mvitac.datasets.lerobot import reader as reader
