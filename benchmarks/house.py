@@ -1,4 +1,4 @@
-"""Figures of the code's structure: modules, imports, cycles, long functions, words of documentation.
+"""Figures of the code's structure: lines, files, options, words, imports, cycles, long functions, paths through the code.
 
     python -m benchmarks.house [ROOT] [--json FILE]
 
@@ -10,8 +10,19 @@ import ast
 import json
 import re
 from collections import Counter
+from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+NAMED = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+PATHS = {
+    "pretrain": "mvitac.training.loop.train",
+    "probe": "mvitac.evaluation.evaluate.probe_runs",
+    "bench": "mvitac.bench.score.score_suite",
+    "export": "mvitac.deploy.export.export",
+}
+"""Command -> the function that does its work."""
 
 
 def modules(root: Path) -> dict[str, Path]:
@@ -20,29 +31,31 @@ def modules(root: Path) -> dict[str, Path]:
     return {".".join(f.relative_to(root / "src").with_suffix("").parts).removesuffix(".__init__"): f for f in files}
 
 
-def imports(name: str, file: Path, known: dict[str, Path]) -> set[str]:
-    """Modules of the package that ``file`` imports when it is imported itself: not in functions, not for types only."""
+def statements(body: list[ast.stmt], inside: bool) -> Iterator[ast.stmt]:
+    """Statements that run when a file is imported; with ``inside`` also those in functions and for types only."""
+    for node in body:
+        for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if not inside and (for_types or isinstance(node, Function)):
+            continue
+        yield node
+        for part in ("body", "orelse", "finalbody"):
+            yield from statements(getattr(node, part, []), inside)
 
-    def statements(body: list[ast.stmt]) -> list[ast.stmt]:
-        found = []
-        for node in body:
-            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-                continue
-            if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-                continue
-            found.append(node)
-            for part in ("body", "orelse", "finalbody"):
-                found += statements(getattr(node, part, []))
-        return found
 
-    asked = set()
-    for node in statements(ast.parse(file.read_text()).body):
+def names(tree: ast.Module, known: dict[str, Path], inside: bool = False) -> dict[str, str]:
+    """Name in a file -> dotted name of what it imports from the package: a module, or something in one."""
+    found = {}
+    for node in statements(tree.body, inside):
         if isinstance(node, ast.Import):
-            asked |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            inside = {f"{node.module}.{alias.name}" for alias in node.names}
-            asked |= {one if one in known else node.module for one in inside}
-    return {one for one in asked if one in known} - {name}
+            found |= {alias.asname or alias.name: alias.name for alias in node.names if alias.name in known}
+        elif isinstance(node, ast.ImportFrom) and node.module in known:
+            found |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def module_of(name: str, known: dict[str, Path]) -> str:
+    """The module that ``name`` is, or is in."""
+    return name if name in known else name.rpartition(".")[0]
 
 
 def room(name: str) -> str:
@@ -50,26 +63,9 @@ def room(name: str) -> str:
     return name.split(".")[1] if "." in name else name
 
 
-def reached(start: str, arrows: dict[str, set[str]]) -> set[str]:
-    """Modules imported by ``start``, directly or not, itself included; packages above them are imported, too."""
-    seen: set[str] = set()
-    waiting = {start}
-    while waiting:
-        name = waiting.pop()
-        seen.add(name)
-        above = {name.rpartition(".")[0]} & arrows.keys()
-        waiting |= (arrows[name] | above) - seen
-    return seen
-
-
-def one_choice(arrows: dict[str, set[str]]) -> dict[str, set[str]]:
-    """The graph where methods and datasets do not import every file of their folder to register it."""
-    return {name: set() if name in ("mvitac.methods", "mvitac.datasets") else to for name, to in arrows.items()}
-
-
-def functions(file: Path) -> list[tuple[int, str]]:
+def functions(tree: ast.Module) -> list[tuple[int, str]]:
     """Length in lines and name of every function."""
-    nodes = (n for n in ast.walk(ast.parse(file.read_text())) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef)))
+    nodes = (n for n in ast.walk(tree) if isinstance(n, Function))
     return [((n.end_lineno or n.lineno) - n.lineno + 1, n.name) for n in nodes]
 
 
@@ -82,36 +78,103 @@ def cycle(arrows: dict[str, set[str]]) -> list[str]:
     return []
 
 
+def floors(rooms: dict[str, set[str]]) -> dict[str, int]:
+    """How many packages lie below each, on its longest way down; {} if there is a cycle."""
+    found: dict[str, int] = {}
+    for name in TopologicalSorter(rooms).static_order() if not cycle(rooms) else ():
+        found[name] = max((found[below] + 1 for below in rooms.get(name, ())), default=0)
+    return found
+
+
+def calls(start: str, trees: dict[str, ast.Module], known: dict[str, Path]) -> list[str]:
+    """Functions and classes of the package that ``start`` calls by name, directly or not, each once, in reading order.
+
+    A method is reached with its class: what an object is, its name does not tell.
+    """
+    things = ((f"{name}.{node.name}", node) for name in trees for node in trees[name].body if isinstance(node, NAMED))
+    defined = dict(things)
+    seen: list[str] = []
+
+    def visit(name: str) -> None:
+        if name in seen or name not in defined:
+            return
+        seen.append(name)
+        home = module_of(name, known)
+        imported = names(trees[home], known, inside=True)
+        found = [n for n in ast.walk(defined[name]) if isinstance(n, ast.Call)]
+        for node in sorted(found, key=lambda n: (n.lineno, n.col_offset)):
+            parts = ast.unparse(node.func).split(".")
+            target = imported.get(parts[0], f"{home}.{parts[0]}")
+            visit(".".join([target, *parts[1:]]) if target in known else target)
+
+    visit(start)
+    return seen
+
+
+def walk(start: str, trees: dict[str, ast.Module], known: dict[str, Path], floor: dict[str, int]) -> dict[str, int]:
+    """Files entered by the calls of ``start``, stays in them, moves between packages, and climbs to a higher one."""
+    files = [module_of(name, known) for name in calls(start, trees, known)]
+    stays = [name for at, name in enumerate(files) if at == 0 or files[at - 1] != name]
+    moves = [(a, b) for a, b in zip(map(room, stays), map(room, stays[1:]), strict=False) if a != b]
+    climbs = sum(floor.get(b, 0) > floor.get(a, 0) for a, b in moves)
+    return {"files": len(set(files)), "stays": len(stays), "moves": len(moves), "climbs": climbs}
+
+
+def count(files: list[Path]) -> int:
+    """Return the number of lines."""
+    return sum(len(file.read_text().splitlines()) for file in files)
+
+
+def options(root: Path) -> dict[str, set[str]]:
+    """Command -> its options, as its stored help lists them."""
+    helps = sorted((root / "src").rglob("cli/help/*.txt"))
+    return {file.stem: set(re.findall(r"^ *(--[\w.-]*\w)", file.read_text(), re.MULTILINE)) for file in helps}
+
+
 def measure(root: Path) -> dict[str, object]:
     """All figures of the checkout in ``root``."""
     known = modules(root)
-    arrows = {name: imports(name, file, known) for name, file in known.items()}
+    trees = {name: ast.parse(file.read_text()) for name, file in known.items()}
+
+    def to(name: str, tree: ast.Module, inside: bool) -> set[str]:
+        return {module_of(one, known) for one in names(tree, known, inside).values()} - {name}
+
+    arrows, late = ({n: to(n, tree, inside) for n, tree in trees.items()} for inside in (False, True))
     pairs = Counter(
         (room(a), room(b)) for a in arrows for b in arrows[a] if room(a) != room(b) and "mvitac" not in (a, b)
     )
     rooms: dict[str, set[str]] = {}
     for a, b in pairs:
         rooms.setdefault(a, set()).add(b)
-    loop = "mvitac.training.loop" if "mvitac.training.loop" in known else "mvitac.train"
-    needed = reached(loop, one_choice(arrows))
-    lengths = [(*found, name) for name, file in known.items() for found in functions(file)]
-    docs = sorted([*root.glob("*.md"), *root.glob("docs/**/*.md")])
-    lines = [line for file in docs for line in file.read_text().splitlines()]
+    lengths = [(*found, name) for name, tree in trees.items() for found in functions(tree)]
+    pages = sorted([*root.glob("*.md"), *root.glob("docs/**/*.md")])
+    lines = [line for file in pages for line in file.read_text().splitlines()]
+    words = Counter[str]()
+    for page in pages:
+        words[str(page.parent.relative_to(root))] += len(page.read_text().split())
+    given = options(root)
+    folders = {name: [f for n, f in known.items() if room(n) == name and n != "mvitac"] for name in map(room, known)}
     return {
-        "modules per folder": dict(Counter(str(f.parent.relative_to(root / "src")) for f in known.values())),
+        "lines per package": {name: count(files) for name, files in folders.items() if files},
+        "lines of src": count(list(known.values())),
+        "lines of tests": count(sorted(root.glob("tests/**/*.py"))),
+        "files of src": len(known),
+        "files per package": {name: len(files) for name, files in folders.items() if files},
+        "options by command": {command: len(found) for command, found in given.items()},
+        "options": len(set[str]().union(*given.values())),
+        "words by folder": dict(words),
+        "words of docs": words.total(),
+        "lines of prose over 120": sum(len(line) > 120 and not line.lstrip().startswith("|") for line in lines),
         "arrows between modules": sum(map(len, arrows.values())),
         "arrows between packages": len(pairs),
         "imports across packages": sum(pairs.values()),
+        "floors": 1 + max(floors(rooms).values(), default=0),
         "cycle of packages": cycle(rooms),
         "cycle of modules": cycle({k: v for k, v in arrows.items() if k != "mvitac"}),
-        f"files reached from {loop}": len(needed),
-        f"lines reached from {loop}": sum(len(known[name].read_text().splitlines()) for name in needed),
-        "lines of src": sum(len(f.read_text().splitlines()) for f in known.values()),
+        "cycle of modules, late and types too": cycle({k: v for k, v in late.items() if k != "mvitac"}),
         "functions over 40 lines": sum(length > 40 for length, _, _ in lengths),
         "functions over 60 lines": sorted((f for f in lengths if f[0] > 60), reverse=True),
-        "words of docs": sum(len(re.findall(r"\S+", line)) for line in lines),
-        "lines of docs over 120": sum(len(line) > 120 for line in lines),
-        "lines of prose over 120": sum(len(line) > 120 and not line.lstrip().startswith("|") for line in lines),
+        **{f"path of {command}": walk(start, trees, known, floors(rooms)) for command, start in PATHS.items()},
     }
 
 
