@@ -88,7 +88,9 @@ def test_digest_is_of_the_outcome() -> None:
     assert replace(run, seed=5).digest() != run.digest()
     jittered = replace(run.augment.touch, jitter=0.1)
     assert replace(run, augment=replace(run.augment, touch=jittered)).digest() != run.digest()
-    crossed, paired = (replace(run, method=MViTacConfig(symmetric=True, pairs=pairs)) for pairs in ("crossed", "all"))
+    crossed, paired = (
+        replace(run, method=MViTacConfig(keys="end-to-end", pairs=pairs)) for pairs in ("crossed", "all")
+    )
     assert crossed.digest() != paired.digest()
 
 

@@ -62,8 +62,6 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
       from scratch, 8 points of category (one seed). Biases and BatchNorm are not decayed.
     - BatchNorm in the heads (SimCLR v2, MoCo v3): prevents an early collapse of the embeddings with small batches. No
       difference (three seeds: without it +.9).
-    - Momentum .99 rising to 1 (BYOL, MoCo v3), for methods that have one: the keys converge with the queries. No
-      difference from 0 to .999 (one seed).
     - Rows of a touch are spread over the epoch: consecutive frames of one touch are near-duplicates and wrong as negatives.
       No difference on simulated touches, which have no consecutive frames (one seed).
     - same-touch positives: two views of one image share lamp, background and sensor, which is enough to minimise L_vv and
@@ -83,7 +81,7 @@ def modern(data: DatasetConfig, phased: bool | None = None) -> Run:
     return replace(
         base,
         recipe="modern",
-        method=MViTacConfig(head_norm=True, keys="end-to-end", pairs="all", momentum_end=1.0),
+        method=MViTacConfig(head_norm=True, keys="end-to-end", pairs="all"),
         optim=Optim(
             name="adamw", lr=1e-3, eps=1e-8, weight_decay=1e-4, decay_norms=False, schedule="cosine", warmup=0.05
         ),

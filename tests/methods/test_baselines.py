@@ -416,20 +416,6 @@ def test_losses_that_need_another_modality_are_refused() -> None:
         MViTacConfig(losses=("vv", "vt")).build(Toy(vision_channels=0).spec(), TINY)
 
 
-def test_shared_heads_are_one_module() -> None:
-    method = build("mvitac", config=MViTacConfig(hidden=24, out=12, shared_heads=True))
-    tower = method.query["touch"]  # type: ignore[union-attr]
-    assert tower.inter is tower.intra
-    key = method.key["touch"].module  # type: ignore[union-attr]
-    assert key.inter is key.intra
-    with torch.no_grad():
-        for p in method.query.parameters():  # type: ignore[union-attr]
-            p.add_(1)
-    before = key.inter[0].weight.clone()
-    method.after_step(0.0)
-    torch.testing.assert_close(key.inter[0].weight, before + 0.01)  # moved once, not twice
-
-
 def test_momentum_zero_copies_the_queries() -> None:
     method = build("mvitac", config=MViTacConfig(hidden=24, out=12, momentum=0.0))
     with torch.no_grad():

@@ -69,7 +69,7 @@ class MCT(Contrastive):
     def __init__(self, config: MCTConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        same = ("temperature", "lambda_inter", "momentum", "momentum_end", "out", "hidden", "head_norm")
+        same = ("temperature", "lambda_inter", "momentum", "out", "hidden", "head_norm")
         self.towers = MViTac(MViTacConfig(**{name: getattr(config, name) for name in same}), spec, encoder)
         self.queues = nn.ModuleDict()
         self.pending: dict[tuple[str, str], Tensor] = {}

@@ -29,7 +29,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, row_pairs
 from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers, num_features, trunks
 from mvitac.nn.losses import info_nce
-from mvitac.nn.momentum import Momentum, momentum_at
+from mvitac.nn.momentum import Momentum
 from mvitac.registry import LATER_IN_DIGEST
 from mvitac.system.threads import in_branches
 
@@ -53,24 +53,15 @@ class MViTacConfig(MethodConfig):
     (rows with the same value in column press and another in column sensor). 0: none (paper)."""
     momentum: float = 0.99
     """Momentum m of eq. 1-3. Not given in the paper; .99 in the authors' code."""
-    momentum_end: float | None = None
-    """If given, m rises to this value along a half cosine (as in BYOL and MoCo v3). The paper has no schedule."""
     keys: Literal["momentum", "end-to-end"] = "momentum"
     """Network that computes the keys. momentum: a momentum copy of the query tower (paper). end-to-end: the query tower
-    itself, with gradients (as in SimCLR; the name is from MoCo, figure 2). end-to-end is always symmetric and ignores the
-    momentum."""
-    key_norm: Literal["batch", "running"] = "batch"
-    """BatchNorm statistics of momentum towers. batch: of their own batch (authors' code). running: moving averages that
-    follow the query tower (EMAN, arXiv:2101.08482)."""
-    symmetric: bool = False
-    """Use each view as query and as key, and average both losses (BYOL, MoCo v3). The paper does not."""
+    itself, with gradients (as in SimCLR; the name is from MoCo, figure 2). Each view is then query and key
+    in turn, and momentum has no effect."""
     pairs: Literal["crossed", "all"] = field(default="crossed", metadata=LATER_IN_DIGEST)
     """Views paired by the inter-modal losses. crossed: a view of one modality with the other view of the other modality
-    (paper). all: with both views of the other modality, at no extra forward pass; needs end-to-end or symmetric."""
+    (paper). all: with both views of the other modality, at no extra forward pass; needs end-to-end keys."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")
     """Losses of eq. 14 to minimise. The paper minimises all four."""
-    shared_heads: bool = False
-    """Use one head per encoder for intra- and inter-modal losses. The paper uses two."""
     out: int = 128
     """Width of the embeddings z (paper: 128)."""
     hidden: int = 512
@@ -84,14 +75,14 @@ class MViTacConfig(MethodConfig):
         self.check_fields(
             positive=("temperature",),
             weight=("lambda_inter", "lambda_sensor"),
-            share=("momentum", "momentum_end"),
+            share=("momentum",),
             width=("out", "hidden"),
         )
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise ValueError(f"losses {self.losses}: give one or more of vv, tt, vt, tv, each once")
         if self.pairs == "all" and not self.both_ways:
             raise ValueError(
-                "pairs 'all' needs each view as query and as key: give keys 'end-to-end', symmetric, or pairs 'crossed'"
+                "pairs 'all' needs each view as query and as key: give keys 'end-to-end', or pairs 'crossed'"
             )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout {self.dropout}: give a probability in [0, 1)")
@@ -103,7 +94,7 @@ class MViTacConfig(MethodConfig):
     @property
     def both_ways(self) -> bool:
         """Whether each view is used as query and as key."""
-        return self.symmetric or self.keys == "end-to-end"
+        return self.keys == "end-to-end"
 
     def training_rows(self, pack: Pack) -> np.ndarray:
         rows = super().training_rows(pack)
@@ -147,7 +138,7 @@ class Tower(nn.Module):
             )
 
         self.intra = head()
-        self.inter = self.intra if config.shared_heads else head()
+        self.inter = head()
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         features = self.trunk(images)
@@ -169,8 +160,7 @@ class MViTac(Contrastive):
         towers = {m: Tower(config, encoder, spec.channels(m), spec.frames(m)) for m in spec.modalities}
         self.query = nn.ModuleDict(towers)
         momentum = self.query if config.keys == "momentum" else {}
-        running = config.key_norm == "running"
-        self.key = nn.ModuleDict({m: Momentum(tower, running_norm=running) for m, tower in momentum.items()})
+        self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in momentum.items()})
 
     def queries(self, batch: Views) -> Embeddings:
         """Eq. 4, 6, 9, 12."""
@@ -194,9 +184,8 @@ class MViTac(Contrastive):
                 losses[part] = torch.stack(terms).mean()  # eq. 8, 11
         weight = {"vt": self.config.lambda_inter, "tv": self.config.lambda_inter}
         minimised = [weight.get(part, 1.0) * loss for part, loss in losses.items() if part in self.config.losses]
-        if (
-            self.config.sensor_view and ("q", "touch", 0, "intra") in z
-        ):  # its key is the same press through another sensor
+        # Its key is the same press through another sensor.
+        if self.config.sensor_view and ("q", "touch", 0, "intra") in z:
             losses["sensor"] = info_nce(z["q", "touch", 0, "intra"], z[k, "touch", 2, "intra"], self.config.temperature)
             minimised.append(self.config.lambda_sensor * losses["sensor"])
         return {"loss": torch.stack(minimised).sum(), **losses}  # eq. 14; losses that are not minimised are logged too
@@ -214,9 +203,8 @@ class MViTac(Contrastive):
         return {m: tower.inter for m, tower in self.query.items()}  # type: ignore[misc]
 
     def after_step(self, progress: float) -> None:
-        m = momentum_at(progress, self.config.momentum, self.config.momentum_end)
         for key in self.key.values():
-            key.follow(m)  # type: ignore[operator]  # eq. 1-3
+            key.follow(self.config.momentum)  # type: ignore[operator]  # eq. 1-3
 
 
 def embed(name: str, towers: nn.ModuleDict, batch: Views, views: tuple[int, ...], *, more: bool) -> Embeddings:

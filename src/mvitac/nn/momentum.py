@@ -14,20 +14,12 @@ def momentum_at(progress: float, start: float, end: float | None) -> float:
 
 
 class Momentum(nn.Module):
-    """A frozen copy of the module ``query`` that follows it: theta_k <- m theta_k + (1 - m) theta.
+    """A frozen copy of the module ``query`` that follows it: theta_k <- m theta_k + (1 - m) theta."""
 
-    With ``running_norm``, BatchNorm of the copy uses moving averages that follow the query's, instead of the statistics
-    of the batch. A key then depends on no other image of its batch (EMAN, Cai et al., CVPR 2021).
-    """
-
-    def __init__(self, query: nn.Module, *, running_norm: bool = False) -> None:
+    def __init__(self, query: nn.Module) -> None:
         super().__init__()
         self.module = copy.deepcopy(query).requires_grad_(False)
-        self.running_norm = running_norm
         self._query = (query,)  # in a tuple, or its parameters would be listed here, too
-
-    def train(self, mode: bool = True) -> "Momentum":
-        return super().train(mode and not self.running_norm)
 
     @torch.no_grad()
     def forward(self, *inputs: Any) -> Any:
