@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
+from mvitac.data.checks.examine import examine_source
 from mvitac.data.images import decode, fit, shrink
 from mvitac.data.pack import Pack
 from mvitac.datasets.folder import FolderConfig
@@ -754,13 +756,13 @@ def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytes
     words = ["data", "pack", "--data", "folder", "--path", str(file), "--size", "16", "--quiet", "--labels", "material"]
     assert main([*words, "--out", str(tmp_path / "grouped"), "--group", "object"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "groups: 8, one per object, of 3 rows each." in shown and "No --group" not in shown
+    assert "groups: 8, one per object, of 3 rows each." in shown and "no --group" not in shown
     assert main([*words, "--out", str(tmp_path / "forgotten")]) == 0
     for packed_now in (True, False):
         shown = " ".join(capsys.readouterr().out.split())
         assert "groups: 24, one per row, of 1 row each. A split takes whole groups, and intervals resample" in shown
-        assert "intervals too narrow. In that case pack again with --group COLUMN (this table has stiffness," in shown
-        assert "object, seq" in shown and "(this table has material" not in shown
+        assert "note: no --group was given, so every row is its own group" in shown
+        assert shown.endswith("intervals too narrow (of those in test, also in train: object 4 of 4)")
         if packed_now:
             assert main(["data", "info", str(tmp_path / "forgotten")]) == 0
     assert main(["data", "info", str(tmp_path / "grouped"), "--json", "-"]) == 0
@@ -771,6 +773,23 @@ def test_commands_say_what_a_group_is(tmp_path: Path, rows: Table, capsys: pytes
         words = [*command.split(), "--data", "folder", f"{prefix}path", str(named)]
         assert main([*words, *(["--out", str(tmp_path / "no")] if command != "data check" else [])]) == 2
         assert f"name the image columns, {prefix}vision COLUMN {prefix}touch COLUMN" in capsys.readouterr().err
+
+
+def test_rows_that_share_something_are_told_where_no_group_is_given(tmp_path: Path, rows: Table) -> None:
+    """File names up to their last number, and columns of text, but not numbers, labels by another name and splits."""
+    given = []
+    for i, row in enumerate(rows):
+        names = {m: f"{m}/rec-{i // 6}_{i:03d}b.png" for m in ("vision", "left", "right")}
+        for m, name in names.items():
+            (tmp_path / str(row[m])).rename(tmp_path / name)
+        more = {"press": f"press {i // 2}", "kind": f"a {row['material']}" * bool(row["material"])}
+        given.append({**names, "material": row["material"], "seq": row["seq"], "side": row["side"], **more})
+    file = write(given, tmp_path / "m.csv")
+    (note,) = FolderConfig(path=file, labels=("material",), split_seed=1).source().spec().notes
+    assert re.search(r"also in train: press \d of \d, vision files 4 of 4\)$", note)
+    assert not FolderConfig(path=file, labels=("material",), group="press").source().spec().notes
+    findings, _ = examine_source(FolderConfig(path=file, labels=("material",), size=16).source(), quiet=True)
+    assert [(f.verdict, f.item) for f in findings if "vision files" in f.evidence] == [("look", "groups")]
 
 
 def test_a_home_folder_in_an_option(

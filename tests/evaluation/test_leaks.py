@@ -8,7 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
 import mvitac
 from mvitac.cli.main import main
@@ -93,6 +96,33 @@ def test_leak_stands_beside_every_score(
     assert (tmp_path / "art" / FILE).read_bytes() == (run / FILE).read_bytes()
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_forgotten_group_is_told_below_every_score(
+    pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By ``data check``, ``probe``, in the report and on the card."""
+    rows = []
+    for i, split in enumerate(pack.column("split")):
+        names = {m: f"{m}{i:03d}.png" for m in ("vision", "touch")}
+        for m, name in names.items():
+            Image.fromarray(pack.images[m][i]).save(tmp_path / name)
+        rows.append({**names, "split": split, "cup": f"cup {i % 9}", "kind": f"{pack.column('label_pattern')[i]}"})
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "m.parquet")
+    made = ["--path", str(tmp_path / "m.parquet"), "--labels", "kind", "--size", "32", "--workers", "1", "--quiet"]
+    assert main(["data", "pack", "--data", "folder", *made, "--out", str(tmp_path / "forgotten")]) == 0
+    warning = "no --group was given, so every row is its own group"
+    assert main(["data", "check", str(tmp_path / "forgotten"), "--json", str(tmp_path / "c.json")]) == 1
+    found = [f for f in read_json(tmp_path / "c.json", "findings")["findings"] if f["item"] == "groups"]
+    assert found[0]["verdict"] == "look" and warning in found[0]["evidence"] and "cup 9 of 9" in found[0]["evidence"]
+    forgotten = Pack(tmp_path / "forgotten")
+    mvitac.train(smoke(forgotten, steps=1, eval_every=0), tmp_path / "run", quiet=True)
+    capsys.readouterr()
+    assert main(["probe", str(tmp_path / "run"), "--modalities", "touch"]) == 0
+    assert f"note: {warning}" in " ".join(capsys.readouterr().out.split())
+    assert warning in write_report([tmp_path / "run"], tmp_path / "report", quiet=True).read_text()
+    assert warning in (publish(tmp_path / "run", tmp_path / "art") / "README.md").read_text()
+
+
 def test_unseen_test_rows_have_no_leak(run: Path, pack: Pack, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["probe", str(run), "--on", str(pack.path), "--no-controls"]) == 0
     shown = capsys.readouterr().out
@@ -165,8 +195,9 @@ def test_the_same_images_under_other_names_leak(pack: Pack, tmp_path: Path, kept
 
     class Kept(Renamed):
         def read(self, item: int) -> list[Sample]:
-            (sample,) = super().read(item)
-            return [replace(sample, vision=np.rot90(sample.vision)) if "photo" in kept else sample]  # type: ignore
+            (sample,) = Renamed().read(item)
+            photo = {"touch": None, "both": sample.vision}.get(kept, sample.vision[::-1])  # type: ignore[index]
+            return [replace(sample, vision=photo)]
 
     renamed = build(Kept(vision_channels=3 * (kept != "touch")), tmp_path / "renamed", size=32, quiet=True)
     write_sources(tmp_path, [source_of(pack, pack.rows("train"))])

@@ -12,7 +12,6 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, check_json, parse, printed_to, save_json, selectors, short
 from mvitac.data.build import build
-from mvitac.data.checks.finding import some
 from mvitac.data.notebook import measured
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
@@ -22,8 +21,6 @@ from mvitac.datasets.mix import open_packs
 from mvitac.datasets.simulated import SimulatedConfig
 from mvitac.registry import default, unknown
 from mvitac.system.files import check_place, write_atomic
-
-OWN_COLUMNS = ("id", "group", "touch_group", "split", "sensor")  # columns that packing adds to a table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,17 +90,7 @@ def _groups(pack: Pack) -> str:
     text = (
         f"groups: {len(sizes)}, one per {by}, of {rows} each. A split takes whole groups, and intervals resample them"
     )
-    if by != "row" or many > 1:
-        return f"{text}."
-    own = [*OWN_COLUMNS, *(task.name for task in pack.spec.tasks)]
-    table = pack.table.drop_columns([name for name in own if name in pack.table.column_names])
-    repeated = [name for name in table.column_names if 1 < len(table.column(name).unique()) <= pack.num / 2]
-    repeated = [name for name in repeated if not name.startswith(("label_", "has_", "crc_", "bytes_"))]
-    return (
-        f"{text}.\nNo --group was given, so every row is a group of its own. If rows show the same object or recording,"
-        " train and test then share it: scores are too high and intervals too narrow. In that case pack again with"
-        f" --group COLUMN{f' (this table has {some(repeated, 6)})' if repeated else ''}."
-    )
+    return f"{text}."
 
 
 @dataclass(frozen=True)

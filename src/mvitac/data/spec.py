@@ -8,6 +8,7 @@ from typing import Literal
 from mvitac.registry import LATER
 
 MODALITIES = ("vision", "touch")
+UNGROUPED = "no --group was given"  # begins the note of a table whose rows are their own groups
 PHASES = ("before", "during", "after")  # values of column phase: the moments of a grasp
 
 

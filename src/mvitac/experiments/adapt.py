@@ -90,7 +90,12 @@ def adapt(
                 found = _scores(scored, one, known, retrieval=name in (NEW, OLD))
                 records += [{"data": name, "source": source, "seed": asked.seed, **record} for record in found]
                 advance()
-    result = {"ancestor": str(ancestor), "group_by": pack.spec.group_by, "records": records}
+    result = {
+        "ancestor": str(ancestor),
+        "group_by": pack.spec.group_by,
+        "notes": list(pack.spec.notes),
+        "records": records,
+    }
     write_json(out / "adapted.json", result, sealed=True)
     return result
 

@@ -193,7 +193,7 @@ def print_adaptation(result: dict[str, Any], file: TextIO | None = None) -> None
     if not found:
         print("nothing to score: the data has no labels and no shared space of two modalities", file=file)
     about = f"95 % intervals: over test {result['group_by']}s only, for this one run; R2 of values, else accuracy."
-    print(about, file=file)
+    print("\n".join([about, *(f"note: {note}" for note in result["notes"])]), file=file)
 
 
 def text_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:

@@ -534,6 +534,30 @@ def test_other_keys_and_other_splits_are_looked_at_too(tmp_path: Path) -> None:
     assert fold.verdict == "broken" and "group (object): 20 of 20 in more than one split" in fold.evidence
 
 
+@pytest.mark.parametrize("objects", ["the same", "others"])
+def test_resized_copies_in_another_pack_are_found(tmp_path: Path, objects: str) -> None:
+    """What training on one pack and scoring on the other would not call a leak."""
+
+    class Renamed(Presses):
+        def spec(self) -> DataSpec:
+            return replace(super().spec(), name="renamed")
+
+        def read(self, item: int) -> list[Sample]:
+            obj, k = divmod(item, NUM_FRAMES)
+            (sample,) = super().read(item)
+            shown = (obj + 1) % NUM_OBJECTS if objects == "the same" else obj + 100
+            names = {"id": f"new {item}", "group": f"new {obj}", "touch_group": f"new {obj}"}
+            return [replace(sample, vision=camera(shown, k), touch=gel(shown, k), columns={**sample.columns, **names})]
+
+    one, other = (tmp_path / name for name in ("one", "other"))
+    build(Presses(), one, size=SIDE, quiet=True)
+    build(Renamed(), other, size=24, quiet=True)
+    file = tmp_path / "found.json"
+    assert main(["data", "check", str(one), str(other), "--json", str(file)]) in (0, 1)
+    found = {f["item"]: f for f in json.loads(file.read_text())["findings"]}["near-copies across splits"]
+    assert found["verdict"] == ("look" if objects == "the same" else "ok"), found["evidence"]
+
+
 def test_half_a_dataset_in_the_other_order_is_seen_too(tmp_path: Path) -> None:
     class Half(Presses):
         def read(self, item: int) -> list[Sample]:

@@ -85,6 +85,7 @@ def examine(
         image_checks.time_offset(pack, looks),
         table_checks.mixture(pack),
         *labels,
+        *table_checks.ungrouped(pack),
         *table_checks.leaks(pack),
         name_checks.similar_names(pack),
         duplicates.exact_copies(pack, looks),

@@ -8,6 +8,7 @@ from mvitac.data.checks.finding import Finding, Verdict, share, some
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.source import Count
+from mvitac.data.spec import UNGROUPED
 
 KEYS = ("object", "instance", "recording", "video", "grasp", "experiment", "session", "sequence")
 """Columns whose values should not be in more than one split either, if the dataset has them."""
@@ -151,6 +152,12 @@ def leaks(pack: Pack) -> list[Finding]:
         evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
         findings.append(Finding("groups across split columns", "ok", evidence))
     return findings
+
+
+def ungrouped(pack: Pack) -> list[Finding]:
+    """Repeat the note of a table that was packed without groups; [] with groups."""
+    notes = [note for note in pack.spec.notes if UNGROUPED in note]
+    return [Finding("groups", "look", "; ".join(notes), "pack again with --group COLUMN")] if notes else []
 
 
 def mixture(pack: Pack) -> Finding:

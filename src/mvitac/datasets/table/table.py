@@ -4,6 +4,7 @@ The table is checked completely before the first image is decoded.
 """
 
 import os
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
@@ -205,7 +206,7 @@ class Rows(Source):
             controls=controls,
             licence=config.licence,
             source=config.source_url or "not given",
-            notes=("no column says the groups, so frames of one video are one group",) * (grouping.group_by == "video"),
+            notes=self._notes(selected, grouping, assigned, {task.name: label for task, label in read}),
             difference=config.difference,
         )
 
@@ -267,6 +268,22 @@ class Rows(Source):
                 splits.check_leak(where, column, f"{name} images", images, [found[i] for i in there])
         splits.check_sides(where, column, found, tasks, labels, len(set(grouping.groups)))
         return found
+
+    def _notes(
+        self, selected: Selection, grouping: Grouping, assigned: Sequence[str], labels: dict[str, list[int]]
+    ) -> tuple[str, ...]:
+        """What results say about groups that no column names."""
+        if grouping.group_by == "video":
+            return ("no column says the groups, so frames of one video are one group",)
+        if grouping.group_by != "row":
+            return ()
+        names = [name for name in selected.manifest.columns if name not in (*labels, self._split, self._sensor)]
+        texts = {name: [row[name] for row in selected.rows] for name in names if name not in selected.refs}
+        for column, refs in selected.refs.items():  # file names up to their last number
+            files = (os.path.splitext(os.path.basename(ref.path))[0] if ref else "" for ref in refs)
+            if (stems := [re.sub(r"\d+\D*$", "", file) for file in files]) not in texts.values():
+                texts[f"{column} files"] = stems
+        return (columns.ungrouped(texts, assigned, [*labels.values()]),)
 
     def _make_rows(
         self, selected: Selection, own: dict[str, Sequence[Any]], extra: dict[str, list[float]]
