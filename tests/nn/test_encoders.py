@@ -80,15 +80,6 @@ def test_a_hub_that_does_not_answer_is_asked_once(monkeypatch: pytest.MonkeyPatc
         assert len(calls) == 1
 
 
-def test_foreign_file_is_refused(tmp_path: Path, weights: Path) -> None:
-    bad = tmp_path / "bad.safetensors"
-    bad.write_bytes(b"not weights")
-    with pytest.raises(ValueError, match="does not hold weights for resnet10t"):
-        build_trunk(EncoderConfig(trunk="resnet10t", weights=str(bad)), 3)
-    with pytest.raises(ValueError, match="does not hold weights for resnet18"):
-        build_trunk(EncoderConfig(trunk="resnet18", weights=str(weights)), 3)
-
-
 def test_unknown_names() -> None:
     with pytest.raises(ValueError, match="unknown trunk 'resnet81'"):
         EncoderConfig(trunk="resnet81", weights=SCRATCH)

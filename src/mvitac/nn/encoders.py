@@ -4,7 +4,7 @@ import copy
 import difflib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from mvitac.data.spec import DataSpec
 from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.small_conv import use_convolutions, use_products
+from mvitac.nn.weights import load_weights, read_tensors, stem_names
 from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.system.files import brief
 
@@ -176,14 +177,6 @@ def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:
     return trunk
 
 
-def stem_names(trunk: nn.Module) -> list[str]:
-    """Names of the convolutions of a timm model that see the image."""
-    known = (getattr(trunk, "pretrained_cfg", None) or {}).get("first_conv")
-    if known:
-        return [known] if isinstance(known, str) else list(known)
-    return [name for name, module in trunk.named_modules() if isinstance(module, nn.Conv2d)][:1]
-
-
 def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
     arguments: dict[str, Any] = {"num_classes": 0, "in_chans": channels}
     if timm.models.model_entrypoint(config.trunk.split(".")[0]).__module__ in _VITS:
@@ -200,11 +193,9 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
         # Checked here, not in the config: a finished run must load after the file of its initial weights is gone.
         if not Path(config.weights).is_file():
             raise ValueError(f"weights {config.weights!r}: give imagenet, scratch, or a file that exists")
-        try:
-            overlay = {"file": config.weights}
-            return timm.create_model(config.trunk, pretrained=True, pretrained_cfg_overlay=overlay, **arguments)
-        except Exception as error:  # torch, safetensors and timm raise different types for an unsuitable file
-            raise ValueError(f"{config.weights} does not hold weights for {config.trunk}: {brief(error)}") from None
+        trunk = _from_timm(replace(config, weights=SCRATCH), channels)
+        load_weights(trunk, read_tensors(Path(config.weights)), config.weights)
+        return trunk
     return _with_imagenet(config.trunk, arguments)
 
 

@@ -1,7 +1,4 @@
-"""Start weights from another model: what to take (``Init``), and loading a trunk or a head from a state dict.
-
-Shapes: O filters, C channels, h x w pixels of a kernel.
-"""
+"""Start weights from another model: what to take (``Init``), and loading a trunk or a head from a state dict."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -9,13 +6,11 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from jaxtyping import Float
-from timm.models import adapt_input_conv
 from torch import Tensor, nn
 
-from mvitac.nn.encoders import PerFrame, stem_names
+from mvitac.nn.encoders import PerFrame
 from mvitac.nn.finetuning import AttentivePool
-from mvitac.nn.weights import misfit, read_safetensors, safetensors_digest
+from mvitac.nn.weights import load_weights, misfit, read_safetensors, safetensors_digest
 
 MODEL = "model.safetensors"  # the file with the weights in the folder of a run or an artifact
 
@@ -70,46 +65,20 @@ def _digest(file: Path, changed: int) -> str:
     return safetensors_digest(read_safetensors(file)[1])
 
 
-def load_trunk(trunk: nn.Module, state: dict[str, Tensor]) -> None:
-    """Load ``state``, the state dict of a trunk from ``build_trunk`` or timm, into another trunk.
+def load_trunk(trunk: nn.Module, state: dict[str, Tensor], file: Path | str = "it") -> None:
+    """Load ``state``, the state dict of a trunk from ``build_trunk`` or timm, into another trunk (``load_weights``).
 
-    The first convolution is adapted to the number of channels. A trunk that sees a window's frames one by one, and one that
+    ``file`` is where it is from, for messages. A trunk that sees a window's frames one by one, and one that
     sees a single image, take each other's weights. ValueError if they are different networks; ``trunk`` is then unchanged.
     """
     inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
     if isinstance(trunk, AttentivePool) or "query" in state:  # a learned pooling starts anew
         single = trunk.trunk if isinstance(trunk, AttentivePool) else trunk
-        return load_trunk(single, inner if "query" in state else state)
+        return load_trunk(single, inner if "query" in state else state, file)
     single = trunk.trunk if isinstance(trunk, PerFrame) else trunk
-    _load_single(single, inner or state)
+    load_weights(single, inner or state, file)
     if isinstance(trunk, PerFrame) and inner and fits(trunk, state):
         trunk.load_state_dict(state)  # the weights of the frames, too
-
-
-def _load_single(trunk: nn.Module, state: dict[str, Tensor]) -> None:
-    expected = trunk.state_dict()
-    classifier = (getattr(trunk, "pretrained_cfg", None) or {}).get("classifier") or ()
-    ends = tuple(f"{name}." for name in ([classifier] if isinstance(classifier, str) else classifier))
-    state = {name: value for name, value in state.items() if name in expected or not name.startswith(ends or "\0")}
-    state |= {n: v for n, v in expected.items() if n.endswith("num_batches_tracked") and n not in state}
-    for name in stem_names(trunk):
-        own, other = expected.get(f"{name}.weight"), state.get(f"{name}.weight")
-        if own is not None and other is not None and own.ndim == other.ndim == 4 and not other.shape[1] % 3:
-            state[f"{name}.weight"] = adapt_stem(other, own.shape[1])
-    if why := misfit(expected, state):
-        raise ValueError(why)
-    trunk.load_state_dict(state)
-
-
-def adapt_stem(weight: Float[Tensor, "O C h w"], channels: int) -> Float[Tensor, "O channels h w"]:
-    """Filters of a first convolution for another number of channels, both multiples of three.
-
-    Three to more: repeated and rescaled, as timm does. More to three: summed over the images on the channels. Either way the
-    response to the same picture in all places stays the same. An equal number is left as it is.
-    """
-    if weight.shape[1] == channels:
-        return weight
-    return adapt_input_conv(channels, weight.unflatten(1, (-1, 3)).sum(1))
 
 
 def fits(module: nn.Module, state: dict[str, Tensor]) -> bool:

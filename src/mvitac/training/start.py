@@ -102,7 +102,7 @@ def _load_encoder(start: Start, trunks: dict[str, Any], modality: str) -> None:
     if state is None:
         raise ValueError(f"it has {' and '.join(start.trunks)} only")
     try:
-        load_trunk(trunks[modality], state)
+        load_trunk(trunks[modality], state, start.init.path or "")
     except ValueError as error:
         raise ValueError(f"its trunk is {start.trunk}, {error}" if start.trunk else str(error)) from None
 

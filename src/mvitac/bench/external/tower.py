@@ -3,7 +3,6 @@
 Widths and depths are taken from the file. A head has 64 channels in every transformer here, as in ViT-Ti, S, B and L.
 """
 
-import argparse
 import math
 import re
 from collections.abc import Mapping
@@ -18,27 +17,19 @@ from timm.models.vision_transformer import Block
 from torch import Tensor, nn
 
 from mvitac.bench.external.base import Adapter
-from mvitac.nn.weights import misfit, read_safetensors
-from mvitac.system.files import brief
+from mvitac.nn import weights
+from mvitac.nn.weights import misfit
 
 Tensors = dict[str, Tensor]
 HEAD = 64  # channels of an attention head
 
 
 def read_tensors(file: Path) -> Tensors:
-    """The tensors of a checkpoint, those under "model" or "state_dict" if it has such an entry. Never unpickles objects."""
-    if file.suffix == ".safetensors":
-        return read_safetensors(file)[1]
-    try:
-        with torch.serialization.safe_globals([argparse.Namespace]):  # TVL and AnyTouch keep their options in the file
-            found: Any = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises several types
-        raise ValueError(f"{file} cannot be read as weights without running code from it ({brief(error)})") from None
-    for key in ("model", "state_dict"):
-        found = found[key] if isinstance(found, dict) and isinstance(found.get(key), dict) else found
-    if not isinstance(found, dict):
-        raise ValueError(f"{file} holds a {type(found).__name__}, not named weights")
-    return {str(name): value for name, value in found.items() if isinstance(value, Tensor)}
+    """The tensors of a checkpoint, those below "state_dict" or "model" if it has such an entry (``nn.weights``)."""
+    tensors = weights.read_tensors(file)
+    for entry in ("state_dict.", "model."):
+        tensors = under(tensors, entry) or tensors
+    return tensors
 
 
 def under(tensors: Tensors, start: str, names: Mapping[str, str] = {}) -> Tensors:

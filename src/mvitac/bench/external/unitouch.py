@@ -16,7 +16,6 @@ from mvitac.bench.external.base import Adapter, Loaded
 from mvitac.bench.external.preprocessing import CLIP, Preprocessing
 from mvitac.bench.external.tower import HEAD, projection, read_tensors, shape, tower, under
 
-PREFIX = 6  # leading characters of every name in the file that the owner drops
 NAMES = {"cls_token": "front", "rgbt_stem.proj.1": "embed", "pos_embedding_helper.pos_embed": "positions"}
 LENGTH = 5.0  # length of the features
 
@@ -29,9 +28,9 @@ class UniTouch(Adapter):
     expects: ClassVar[str] = "last_new.ckpt of huggingface.co/chfeng/Touch-LLM"
 
     def load(self) -> Loaded:
-        whole = {name[PREFIX:]: value for name, value in read_tensors(self.path()).items()}
+        whole = read_tensors(self.path())
         tensors = under(whole, "modality_preprocessors.touch.", NAMES)
-        tensors |= under(whole, "modality_trunks.touch.", {})
+        tensors |= under(whole, "modality_trunks.touch.")
         tensors |= under(whole, "modality_heads.touch.", {"0": "head.0", "2": "head.1"})
         width = shape(self, tensors, "embed.weight", 5)[0]
         head = projection(tensors, 1e-6)
