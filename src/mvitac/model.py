@@ -8,14 +8,12 @@ Shapes: N or B images, C channels, H x W pixels, D features, E dimensions of the
 """
 
 import json
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Target, listed
 from mvitac.methods.base import Method
@@ -86,13 +84,6 @@ class Model(nn.Module):
         named = self.spec.sensors not in ((), (self.spec.name,))
         sensors = f" (touch sensors {listed(self.spec.sensors)})" if named else ""
         return f"Model({method} of {trunk}, trained on {self.spec.name}{sensors}: features {widths})"
-
-    def _repr_html_(self) -> str:
-        rows = [(modality, num_features(trunk)) for modality, trunk in self.encoders.items()]
-        probes = [(task, ", ".join(classes)) for task, classes in self.classes.items()]
-        probes += [(task, ", ".join(f"{t.name} ({t.unit})" for t in found)) for task, found in self.targets.items()]
-        text = f"<p>{escape(repr(self))}</p>{table(rows, ('input', 'features'))}"
-        return text + (table(probes, ("probe", "answers")) if probes else "")
 
     def forward(
         self, *unnamed: Tensor, vision: Tensor | None = None, touch: Tensor | None = None, shared: bool = False

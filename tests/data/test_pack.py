@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import errno
 import fcntl
 import io
@@ -23,7 +22,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from filelock import FileLock
-from PIL import Image
 
 from mvitac.data import build as packing
 from mvitac.data.build import build
@@ -426,17 +424,6 @@ def test_scoring_on_val_hides_test(pack: Pack) -> None:
     task = whole.spec.tasks[0].name
     unseen = whole.rows("test")
     assert (choosing.labels(task, "train", "val", "test")[unseen] == -1).all()
-
-
-def test_shows_itself_in_a_notebook(pack: Pack) -> None:
-    page = pack._repr_html_()
-    train = pack.rows("train")
-    groups = len(set(pack.column("group")[train]))
-    assert f"120 rows of {pack.spec.name} at 32 px" in repr(pack)
-    assert f"<td>train</td><td>{len(train)}</td><td>{groups}</td>" in page
-    strips = [Image.open(io.BytesIO(base64.b64decode(part.split('"')[0]))) for part in page.split("base64,")[1:]]
-    assert [strip.size for strip in strips] == [(6 * 32, 32)] * 2  # vision and touch of six rows
-    assert np.array_equal(np.asarray(strips[0])[:, :32], pack.images["vision"][0])
 
 
 def test_rows_of_one_task_alone_are_hidden_from_all_else(pack: Pack) -> None:

@@ -12,7 +12,6 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import asks_help, check_json, parse, printed_to, save_json, selectors, short
 from mvitac.data.build import build
-from mvitac.data.notebook import measured
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.spec import Task, Window, listed
@@ -189,6 +188,17 @@ def _describe(pack: Pack) -> dict[str, Any]:
         "notes": list(pack.spec.notes),
         "digest": pack.digest,
     }
+
+
+def measured(pack: Pack, rows: np.ndarray) -> list[dict[str, Any]]:
+    """Each target with its task, its unit, the number of ``rows`` with a value, and the lowest and highest one."""
+    found = []
+    for task in pack.spec.values:
+        for target, values in zip(task.targets, pack.values(task)[rows].T, strict=True):
+            have = values[np.isfinite(values)]
+            ends = {"low": float(have.min()), "high": float(have.max())} if len(have) else {"low": None, "high": None}
+            found.append({"task": task.name, "target": target.name, "unit": target.unit, "rows": len(have), **ends})
+    return found
 
 
 def _majority(pack: Pack, task: Task, split: str) -> dict[str, Any] | None:

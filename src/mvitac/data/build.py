@@ -25,14 +25,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mvitac.data.pack import FORMAT, Pack
+from mvitac.data.pack import FORMAT, FORMAT_VERSION, Pack
 from mvitac.data.pack_table import check_table
 from mvitac.data.read_samples import Part, Reader, Stored, read_parts, stop_second_build, table_of
 from mvitac.data.source import Source
-from mvitac.data.spec import DataSpec
-from mvitac.data.storage import FORMAT_VERSIONS, QUALITY, SUFFIXES, Store, check_request, stored_as
+from mvitac.data.spec import QUALITY, SUFFIXES, DataSpec, Store, check_request, stored_as
 from mvitac.registry import to_json
-from mvitac.system.files import digest, digest_file, naming, parse_json, read_json, write_atomic, write_json
+from mvitac.system.files import digest, digest_file, naming, read_json, write_atomic, write_json
 from mvitac.system.locks import hold_lock
 from mvitac.system.progress import shown
 from mvitac.system.progress import work as progress
@@ -162,7 +161,7 @@ class _Partial:
     def __init__(self, folder: Path, spec: DataSpec, num: int, request: dict[str, Any]) -> None:
         """``num`` is the number of rows if nothing is damaged."""
         self.folder, self.spec, self.num, self.request = folder, spec, num, request
-        self.store, size = request.get("store", "raw"), request["size"]
+        self.store, size = request["store"], request["size"]
         self.list = folder / "parts.jsonl"
         self.shapes = {m: (size, size, spec.channels(m)) for m in spec.modalities}
         self.files = {m: folder / "pack" / f"{m}{SUFFIXES[self.store]}" for m in spec.modalities}
@@ -224,7 +223,7 @@ class _Partial:
     ) -> tuple[Part, Stored] | None:
         """Return the part of a ``line`` of the list and its images, which begin at ``starts``; None if it is not whole."""
         with contextlib.suppress(ValueError, KeyError, TypeError):
-            known = parse_json(line.decode())
+            known = json.loads(line)
             if not line.endswith(b"\n") or (known["first"], known["end"], known.pop("stamp")) != wanted:
                 return None
             part, stored = Part(**known), {}
@@ -266,7 +265,7 @@ class _Partial:
         write_atomic(folder / "samples.parquet", lambda file: file.write(table.getvalue()))
         meta = {
             "format": FORMAT,
-            "format_version": FORMAT_VERSIONS[self.store],
+            "format_version": FORMAT_VERSION,
             "num": num,
             "digests": {"samples.parquet": hashlib.sha256(table.getvalue()).hexdigest(), **digests},
             "damaged": damaged,

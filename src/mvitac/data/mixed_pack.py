@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from mvitac.data.lazy import Pieces
 from mvitac.data.mixed_table import MixedTasks, mixed_spec, mixed_table, renamed_columns
-from mvitac.data.pack import Images, Pack, has_difference
+from mvitac.data.pack import Images, Pack
 from mvitac.data.row_hashes import image_sums, known_images, number_hint, row_hashes
 from mvitac.data.spec import MODALITIES
 from mvitac.system.files import digest
@@ -141,7 +141,7 @@ def _check(parts: Mapping[str, Pack]) -> dict[str, int]:
             counts = ", ".join(f"{num} in {name}" for name, num in given.items())
             raise ValueError(f"{modality} channels differ: {counts}; pack them with the same number of sensors")
         channels[modality] = next(iter(given.values()), 0)
-    minus = {name: has_difference(pack) for name, pack in parts.items() if pack.spec.touch_channels}
+    minus = {name: pack.spec.difference for name, pack in parts.items() if pack.spec.touch_channels}
     if len(set(minus.values())) > 1:
         with_, without = (next(name for name, given in minus.items() if given == wanted) for wanted in (True, False))
         raise ValueError(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pyarrow as pa
 
-from mvitac.data.pack import Pack, has_difference
+from mvitac.data.pack import Pack
 from mvitac.data.spec import MODALITIES, AnyTask, DataSpec, Task, ValueTask
 
 OWN = re.compile(r"(id|group|touch_group|press|part|sensor|(has|crc|bytes|label)_.*)")
@@ -154,5 +154,5 @@ def mixed_spec(parts: Mapping[str, Pack], tasks: MixedTasks, channels: Mapping[s
         licence="; ".join(f"{name}: {spec.licence}" for name, spec in specs.items()),
         source="; ".join(f"{name}: {spec.source}" for name, spec in specs.items()),
         notes=(*notes, *(f"{name}: {note}" for name, spec in specs.items() for note in spec.notes)),
-        difference=any(map(has_difference, parts.values())),
+        difference=any(spec.difference for spec in specs.values()),
     )

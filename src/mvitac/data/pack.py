@@ -22,16 +22,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mvitac.data import notebook
 from mvitac.data.jpeg import Jpegs
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack_table import check_table
-from mvitac.data.spec import PHASES, AnyTask, DataSpec, ValueTask
-from mvitac.data.storage import FORMAT_VERSIONS, SUFFIXES, Store
+from mvitac.data.spec import PHASES, SUFFIXES, AnyTask, DataSpec, Store, ValueTask
 from mvitac.registry import from_json, unknown
 from mvitac.system.files import brief, digest, digest_file, read_json
 
-FORMAT = "mvitac-pack"
+FORMAT, FORMAT_VERSION = "mvitac-pack", 2
 
 Images = np.ndarray | Lazy
 
@@ -59,9 +57,7 @@ class Pack:
         try:
             self.spec: DataSpec = from_json(DataSpec, self.meta.get("spec"), "spec")
             self.num, self.size = (int(from_json(int, self.meta.get(name), name)) for name in ("num", "size"))
-            self.store: Store = from_json(Store, self.meta.get("store", "raw"), "store")
-            if FORMAT_VERSIONS[self.store] != (version := self.meta["format_version"]):
-                raise ValueError(f"store: {self.store} is not of format {version}")
+            self.store: Store = from_json(Store, self.meta.get("store"), "store")
             self.digests: dict[str, str] = from_json(dict[str, str], self.meta.get("digests"), "digests")
             files = {f"{m}{SUFFIXES[self.store]}": m for m in self.spec.modalities}
             if sorted(self.digests) != sorted(names := ("samples.parquet", *files)):
@@ -81,9 +77,8 @@ class Pack:
         meta = read_json(path := self.path / "pack.json", "a pack's description")
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             raise ValueError(f"{path} does not describe a pack: choose a folder `mvitac data` wrote")
-        if (version := meta.get("format_version")) not in FORMAT_VERSIONS.values():
-            known = " and ".join(map(str, FORMAT_VERSIONS.values()))
-            raise ValueError(f"{self.path} has pack format {version}, this version reads {known}: re-pack it")
+        if (version := meta.get("format_version")) != FORMAT_VERSION:
+            raise ValueError(f"{self.path} has pack format {version}, this version reads {FORMAT_VERSION}: re-pack it")
         rest = {key: value for key, value in meta.items() if key != "digest"}
         if meta.get("digest", given := digest(rest)) != given:
             raise ValueError(f"{path} does not match its digest: it was changed or damaged, re-pack it")
@@ -107,9 +102,6 @@ class Pack:
 
     def __repr__(self) -> str:
         return f"Pack({str(self.path)!r}: {self.num} rows of {self.spec.name} at {self.size} px)"
-
-    def _repr_html_(self) -> str:
-        return notebook.pack_html(self)
 
     @property
     def digest(self) -> str:
@@ -309,12 +301,3 @@ class Pack:
             held = f"{images.dtype} {images.shape}" if isinstance(images, np.ndarray) else "no array"
             raise ValueError(f"{path} holds {held}, pack.json promises uint8 {expected}")
         return images
-
-
-def has_difference(pack: Pack) -> bool:
-    """Return whether touch is stored minus its background.
-
-    Older packs have no such field in their spec, only the option in their fingerprint.
-    """
-    options = pack.meta.get("fingerprint") or {}
-    return pack.spec.difference or bool((options.get("options") or options).get("difference"))

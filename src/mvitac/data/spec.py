@@ -3,12 +3,15 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
-from mvitac.registry import LATER
+from mvitac.registry import LATER, unknown
 
 MODALITIES = ("vision", "touch")
 UNGROUPED = "no --group was given"  # begins the note of a table whose rows are their own groups
+SUFFIXES = {"raw": ".npy", "jpeg": ".jpegs"}  # of image files, by how images are stored
+Store = Literal["raw", "jpeg"]
+QUALITY = 95
 PHASES = ("before", "during", "after")  # values of column phase: the moments of a grasp
 
 
@@ -180,3 +183,24 @@ class DataSpec:
     def modalities(self) -> tuple[str, ...]:
         """The modalities this dataset has, in the order of ``MODALITIES``."""
         return tuple(m for m in MODALITIES if self.channels(m))
+
+
+def check_request(
+    size: int, workers: int, max_damaged: float = 0.0, *, store: str = "raw", quality: int = QUALITY
+) -> None:
+    """Raise ValueError for invalid packing options."""
+    if not 8 <= size <= 1024:
+        raise ValueError(f"size {size} is not possible: give the stored side in pixels, 8 to 1024")
+    if not 0 <= workers <= 1024:
+        raise ValueError(f"workers {workers} is not possible: give 1 to 1024 processes, or 0 for one per core")
+    if not 0 <= max_damaged <= 1:
+        raise ValueError(f"max_damaged {max_damaged} is not possible: give a fraction of the items, 0 to 1")
+    if store not in SUFFIXES:
+        raise unknown("store", str(store), SUFFIXES)
+    if not 1 <= quality <= 100:
+        raise ValueError(f"quality {quality} is not possible: give a JPEG quality from 1 to 100")
+
+
+def stored_as(store: Store, quality: int) -> dict[str, Any]:
+    """Return the storage options that identify a pack."""
+    return {"store": store} if store == "raw" else {"store": store, "quality": quality}

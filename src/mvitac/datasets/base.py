@@ -1,12 +1,11 @@
 """The base class of dataset configs. A config gives a source of samples; all other code reads the pack made from it."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Window
-from mvitac.data.storage import QUALITY, Store, check_request, stored_as
+from mvitac.data.spec import QUALITY, Store, Window, check_request, stored_as
 from mvitac.data.windows import windowed
 from mvitac.registry import LATER, Registered
 from mvitac.system.files import cache_dir, check_place, digest
@@ -102,10 +101,7 @@ class DatasetConfig(Registered):
         path = self.place(source)
         unfinished = path.with_name(f"{path.name}.partial")  # beside a pack: its build was killed in the last clean-up
         if path.exists() and not unfinished.exists():
-            pack = Pack(path)
-            # A pack from before its reader named values has their columns already.
-            pack.spec = replace(pack.spec, values=source.spec().values)
-            return pack
+            return Pack(path)
         try:
             check_place(path)
         except ValueError as error:

@@ -106,7 +106,7 @@ def _mark_gaps(opened: pq.ParquetFile, group: int, column: str, places: list[Ima
 def _classes(schema: pa.Schema) -> dict[str, list[str]]:
     """Return column -> class names, from the metadata of Hugging Face's datasets library."""
     try:
-        features: dict[str, Any] = parse_json((schema.metadata or {})[b"huggingface"])["info"]["features"]
+        features: dict[str, Any] = parse_json((schema.metadata or {})[b"huggingface"].decode())["info"]["features"]
     except (KeyError, ValueError):
         return {}
     return {k: f["names"] for k, f in features.items() if isinstance(f, dict) and f.get("_type") == "ClassLabel"}

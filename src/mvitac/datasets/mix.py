@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 from mvitac.data.mixed_pack import MixedPack
 from mvitac.data.pack import Pack
-from mvitac.data.storage import check_request
+from mvitac.data.spec import check_request
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.table.manifest import number_of

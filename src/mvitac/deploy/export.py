@@ -19,7 +19,7 @@ import numpy as np
 import safetensors.numpy
 import torch
 
-from mvitac.data.pack import Pack, has_difference
+from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import preprocessing
 from mvitac.deploy.engine import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST, open_engine
 from mvitac.deploy.export_module import ExportModule
@@ -140,7 +140,7 @@ def _check_fits(model: Model, pack: Pack, modality: str) -> None:
     model.check_modality(modality)
     channels, difference = model.spec.channels(modality), modality == "touch" and model.spec.difference
     fits = (modality in pack.spec.modalities, pack.spec.channels(modality) == channels, pack.size == model.stored)
-    if not all(fits) or (difference and not has_difference(pack)):
+    if not all(fits) or (difference and not pack.spec.difference):
         raise ValueError(
             f"{pack.path} cannot check this model: it needs {modality} images of {channels} channels"
             f" at {model.stored} px{' minus their background' * difference}, as the training data has"

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
-from mvitac.data.pack import Pack, has_difference
+from mvitac.data.pack import Pack
 from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.registry import from_json, unknown
@@ -102,7 +102,7 @@ def check_pack(model: Model, pack: Pack) -> tuple[str, ...]:
                 f"{pack.path} has {pack.spec.channels(modality)} channels of {modality}, the model was trained with"
                 f" {model.spec.channels(modality)}: pack the data alike"
             )
-    if "touch" in names and model.spec.difference and not has_difference(pack):
+    if "touch" in names and model.spec.difference and not pack.spec.difference:
         raise ValueError(
             f"{pack.path} has touch as the sensor gives it, the model was trained on difference images: pack the data"
             " with --subtract-background"

@@ -7,8 +7,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from tabulate import tabulate
+
 from mvitac.data.joined_pack import JoinedPack
-from mvitac.data.notebook import table
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import number_hint
 from mvitac.data.spec import AnyTask, Task, ValueTask
@@ -48,7 +49,7 @@ class Scores(dict[str, Any]):
             columns = columns_of(task)
             rows = [(source, *(cell_text(task, source, m) for m in columns)) for source in sources_of(task)]
             caption = f"<b>{escape(name)}</b>, {score_name(task)} %, {escape(tested_on(task, self['group_by']))}"
-            parts.append(f"<p>{caption}</p>{table(rows, ['', *columns])}")
+            parts.append(f"<p>{caption}</p>{tabulate(rows, ['', *columns], tablefmt='html', disable_numparse=True)}")
         lines = [f"95 % intervals: {covered(self['group_by'], self['records'])}."]
         lines += [*self["notes"], *(f"LEAK: {leak}" for leak in self["leaks"])]
         return "".join(parts) + "".join(f"<p>{escape(line)}</p>" for line in lines)
