@@ -64,7 +64,7 @@ COMMANDS = {
     "probe": "probe {base}/run --probes knn --no-controls --json {out}/scores.json",
     "compare": "compare --plan {base}/plan.json --out {out}/c",
     "publish": "publish {base}/run {out}/a",
-    "export": "export {base}/run --format torch --rows 4 --out {out}/x",
+    "export": "export {base}/run --rows 4 --out {out}/x",
     "index": "index {base}/pack --model {base}/run --out {out}/i",
     "embed": "embed {base}/pack --model {base}/run --out {out}/e.npz",
     "report": "report {base}/run --out {out}/report --quiet",

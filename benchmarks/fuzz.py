@@ -220,7 +220,7 @@ def main(argv: list[str] | None = None) -> int:
         if child(lambda: prepare(base), said := Path(folder) / "said"):
             raise RuntimeError(said.read_text())
         for words in (
-            f"export {base}/run --format onnx --rows 4 --out {base}/export",
+            f"export {base}/run --rows 4 --out {base}/export",
             f"index {base}/pack --model {base}/run --out {base}/index",
             f"bench {base}/run --suite {base}/suite.toml --data-root {base} --out {base}/results",
         ):

@@ -25,22 +25,22 @@ import torch
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.deploy.engine import Call, Engine, cosines
-from mvitac.deploy.export import ExportConfig, export
+from mvitac.deploy.engine import Call, Engine, Runtime, cosines
+from mvitac.deploy.export import ExportConfig, Precision, export
 from mvitac.deploy.export_module import ExportModule
 from mvitac.model_files import fresh
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe
 from mvitac.system.provenance import provenance
 
-VARIANTS: dict[str, dict[str, Any]] = {
-    "ONNX Runtime fp32": {"kind": "onnx"},
-    "ONNX Runtime int8": {"kind": "onnx", "int8": True},
-    "OpenVINO fp32": {"kind": "openvino"},
-    "OpenVINO bf16": {"kind": "openvino", "precision": "bf16"},
-    "OpenVINO int8": {"kind": "openvino", "int8": True},
+VARIANTS: dict[str, tuple[Precision, Runtime]] = {
+    "ONNX Runtime fp32": ("fp32", "onnxruntime"),
+    "ONNX Runtime int8": ("int8", "onnxruntime"),
+    "OpenVINO fp32": ("fp32", "openvino"),
+    "OpenVINO bf16": ("bf16", "openvino"),
+    "OpenVINO int8": ("int8", "openvino"),
 }
-ANY = ExportConfig(min_cosine=0.5, accuracy_loss=100.0, num_rows=64)
+ANY = ExportConfig(min_cosine=0.5, accuracy_loss=100.0, value_loss=100.0, num_rows=64)
 """The benchmark reports the loss of precision, so every export is accepted."""
 
 
@@ -84,12 +84,12 @@ def main() -> None:
     if not options.no_compile:
         calls["torch.compile"] = in_torch(torch.compile(graph, dynamic=False))
     sizes = {"eager": sum(p.numel() * 4 for p in graph.parameters()) / 1e6}
-    for name, how in VARIANTS.items():
-        out = folder / name.replace(" ", "-")
+    for name, (precision, runtime) in VARIANTS.items():
+        out = folder / precision
         if not out.exists():
-            report = export(model, pack, out, replace(ANY, threads=options.threads, **how))
-            print(name, "exported:", json.dumps(report["cosine"]), file=sys.stderr)
-        engine = Engine(out, threads=options.threads)
+            report = export(model, pack, out, replace(ANY, threads=options.threads, precision=precision))
+            print(precision, "exported:", json.dumps(report["cosine"]), file=sys.stderr)
+        engine = Engine(out, engine=runtime, threads=options.threads)
         sizes[name] = engine.meta["report"]["size_mb"]
         calls[name] = engine._call
 

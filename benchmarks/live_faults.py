@@ -195,7 +195,7 @@ def main() -> int:
         parser.error(f"--disk {options.disk}: more than 64 MB, filling it would take long")
     with tempfile.TemporaryDirectory(prefix="mvitac-live-") as folder:
         base = Path(folder)
-        words = f"export {base}/run --format onnx --rows 4 --out {base}/export".split()
+        words = f"export {base}/run --rows 4 --out {base}/export".split()
         for work in (lambda: prepare(base), lambda: mvitac(words)):
             if child(work, base / "said"):
                 raise RuntimeError((base / "said").read_text())

@@ -111,12 +111,11 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 @pytest.fixture(scope="session")
 def onnx(artifact: Path, pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """That artifact, exported for ONNX Runtime."""
+    """That artifact, exported."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.export import ExportConfig, export
+    from mvitac.deploy.export import export
 
-    config = ExportConfig(kind="onnx")
-    return made_once(tmp_path_factory, "onnx", lambda out: export(load(artifact), pack, out, config))
+    return made_once(tmp_path_factory, "onnx", lambda out: export(load(artifact), pack, out))
 
 
 @pytest.fixture(scope="session")
@@ -146,9 +145,8 @@ def value_artifact(measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="session")
 def value_onnx(value_artifact: Path, measured: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """That artifact, exported for ONNX Runtime."""
+    """That artifact, exported."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.export import ExportConfig, export
+    from mvitac.deploy.export import export
 
-    config = ExportConfig(kind="onnx")
-    return made_once(tmp_path_factory, "value-onnx", lambda out: export(load(value_artifact), measured, out, config))
+    return made_once(tmp_path_factory, "value-onnx", lambda out: export(load(value_artifact), measured, out))

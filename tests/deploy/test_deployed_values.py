@@ -19,7 +19,6 @@ from mvitac.deploy import engine as runtime
 from mvitac.deploy import publish
 from mvitac.deploy.artifact import read_manifest
 from mvitac.deploy.engine import Engine, spread_at
-from mvitac.deploy.export import ExportConfig
 from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.parity import parity, reference
 from mvitac.evaluation.probe import score_rows, split_rows
@@ -123,10 +122,10 @@ def test_an_export_that_changes_a_value_is_refused_in_the_unit(value_artifact: P
         return found
 
     with pytest.raises(
-        ValueError, match=f"changes weight by {0.2 * std:.3g} N .* at most {0.1 * std:.3g} N .*--value-loss"
+        ValueError, match=f"changes weight by {0.2 * std:.3g} N .* at most {0.1 * std:.3g} is allowed .--value-loss"
     ):
-        parity(graph, call, model, measured, rows, wanted, ExportConfig())
-    report = parity(graph, call, model, measured, rows, wanted, ExportConfig(value_loss=0.3))
+        parity(graph, call, measured, rows, wanted, min_cosine=0.99)
+    report = parity(graph, call, measured, rows, wanted, min_cosine=0.99, value_loss=0.3)
     assert report["values"]["both"][1]["change"] == pytest.approx(0.2 * std, rel=1e-3)
     assert report["values"]["both"][1]["num"] == 16 and report["values"]["light"][0]["change"] < 1e-3
 
@@ -135,7 +134,7 @@ def test_values_that_a_pack_lacks_are_still_compared(value_artifact: Path, pack:
     model = mvitac.load(value_artifact)
     graph, rows = ExportModule(model), pack.rows("test")
     wanted = reference(model, graph, pack, rows)
-    report = parity(graph, lambda arrays: _run(graph, arrays), model, pack, rows, wanted, ExportConfig())
+    report = parity(graph, lambda arrays: _run(graph, arrays), pack, rows, wanted, min_cosine=0.99)
     light = report["values"]["light"][0]
     assert light["num"] == 0 and light["original"] is None and light["allowed"] > 0
     assert light["allowed"] == pytest.approx(0.1 * wanted["value_light"].std(), rel=1e-4)
@@ -148,7 +147,7 @@ def _run(graph: ExportModule, arrays: list[np.ndarray]) -> list[np.ndarray]:
 
 def test_a_value_that_differs_on_the_robot_is_refused(value_onnx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice as long features have the same cosine, but not the same values."""
-    real = runtime.open_engine
+    real = runtime.open_model
     names = json.loads((value_onnx / "export.json").read_text())["outputs"]
 
     def longer(*given: object) -> runtime.Call:
@@ -157,8 +156,8 @@ def test_a_value_that_differs_on_the_robot_is_refused(value_onnx: Path, monkeypa
             x * 2 if name.startswith(("embedding", "value")) else x for name, x in zip(names, call(arrays), strict=True)
         ]
 
-    monkeypatch.setattr(runtime, "open_engine", longer)
-    with pytest.raises(ValueError, match=r"level differs by .* levels from the trained model"):
+    monkeypatch.setattr(runtime, "open_model", longer)
+    with pytest.raises(ValueError, match=r"on this machine level differs by .* levels, at most"):
         Engine(value_onnx, threads=1)
 
 
@@ -170,12 +169,12 @@ def test_export_command_prints_errors_in_the_unit(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    wrote = lambda graph, two, out, *_: Path(shutil.copy(value_onnx / "model.onnx", out))  # noqa: E731
+    wrote = lambda graph, path: shutil.copy(value_onnx / "model.onnx", path)  # noqa: E731
     monkeypatch.setattr("mvitac.deploy.export.write_onnx", wrote)  # it takes seconds, and gives the same
-    command = ["export", str(value_artifact), "--int8", "--target", "avx2", "--on", str(measured.path)]
+    command = ["export", str(value_artifact), "--precision", "int8", "--on", str(measured.path)]
     assert main([*command, "--out", str(tmp_path / "e"), "--value-loss", "9", "--accuracy-loss", "100"]) == 0
     assert "weight, mean absolute error, N" in " ".join(capsys.readouterr().out.split())
     report = json.loads((tmp_path / "e" / "export.json").read_text())["report"]
     assert 0 < report["values"]["both"][1]["change"] < report["values"]["both"][1]["allowed"]
-    assert main([*command, "--out", str(tmp_path / "f"), "--value-loss", "-1"]) == 2
-    assert "--value-loss -1.0: give" in capsys.readouterr().err and not (tmp_path / "f").exists()
+    assert main([*command, "--out", str(tmp_path / "f"), "--value-loss", "nan", "--accuracy-loss", "100"]) == 2
+    assert "(--value-loss)" in capsys.readouterr().err and not (tmp_path / "f").exists()

@@ -31,7 +31,7 @@ from mvitac.deploy.publish import publish
 from mvitac.deploy.search import Index, build
 from mvitac.evaluation.run_names import names_of
 from mvitac.nn.encoders import EncoderConfig, build_trunk
-from mvitac.system.files import digest, digest_file, read_json
+from mvitac.system.files import digest, digest_file, read_json, write_json
 from support.training_runs import smoke
 
 RESULT = Path(__file__).parents[2] / "benchmarks" / "board" / "sim-v2" / "sim-v2-resnet18-random.json"
@@ -266,8 +266,8 @@ FOLDERS: list[tuple[str, str, Change, str]] = [
     ("index", "classes of no task", setting("classes", value={"x": ["a"]}), "is damaged"),
     ("index", "a class less", setting("classes", value={"pattern": ["a", "b"]}), "labels that are no classes"),
     ("index", "a list for its pack", setting("pack", value=["/"]), "pack: expected str"),
-    ("onnx", "file above", above, "names other files"),
-    ("onnx", "files are a number", setting("files", value=7), "is damaged"),
+    ("onnx", "file above", above, "names others than"),
+    ("onnx", "files are a number", setting("files", value=7), "lacks files"),
     ("onnx", "no tolerance", lambda trap, m: m.pop("tolerance"), "is damaged"),
     ("onnx", "a number for a class", setting("classes", value={"pattern": [1]}), "expected str, got 1"),
     ("onnx", "a value without unit", setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
@@ -293,7 +293,10 @@ def test_indexes_and_exports(
     manifest = folder / ("index.json" if kind == "index" else "export.json")
     described = json.loads(manifest.read_text())
     change(trap, described)
-    manifest.write_text(json.dumps({**described, "digest": seal(described)}))
+    if kind == "index":
+        manifest.write_text(json.dumps({**described, "digest": seal(described)}))
+    else:
+        write_json(manifest, described, sealed=True)
     touched.clear()
     with pytest.raises(ValueError, match=says):
         Index(folder) if kind == "index" else Engine(folder)

@@ -1,8 +1,8 @@
 """``mvitac publish`` and ``export``: a trained model for other people and other engines."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional
@@ -51,15 +51,13 @@ def publish(argv: list[str]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _ExportOptions(exports.ExportConfig):
-    """Write a model for another engine: uint8 in, embeddings, probabilities and values out. The result is compared with the
-    model on real inputs; nothing is written if it differs."""
+    """Write a model as ONNX, for OpenVINO and ONNX Runtime: uint8 in, embeddings, probabilities and values out. The result
+    is compared with the model on real inputs; nothing is written if it differs."""
 
     model: Positional[str]
     """Folder of a run or an artifact, or owner/name on the Hub."""
     out: Path
     """The new folder."""
-    kind: Annotated[exports.Kind, tyro.conf.arg(name="format")] = "onnx"
-    """Engine: torch (torch.export), onnx (ONNX Runtime) or openvino."""
     on: Path | None = None
     """Pack whose test rows check the export, and on which the probes of a run are fitted; an artifact keeps its own
     (default: the data the model was trained on)."""
@@ -68,26 +66,20 @@ class _ExportOptions(exports.ExportConfig):
     new_sensor: Path | None = None
     """Pack with 64 to 400 unlabelled images of a touch sensor that the model never met, such as a recording of mvitac
     live: the export is for that sensor, and shows its images in the colours of the known ones."""
-    modalities: tyro.conf.Suppress[tuple[str, ...] | None] = None
-    modality: Literal["both", "vision", "touch"] = "both"
-    """Inputs of the export; both = all the model has."""
     num_rows: Annotated[int, tyro.conf.arg(name="rows")] = 512
     """Maximum number of test rows to check on."""
 
 
 def export(argv: list[str]) -> None:
-    """mvitac export RUN|ARTIFACT --out DIR [--format torch|onnx|openvino] [--int8]"""
+    """mvitac export RUN|ARTIFACT --out DIR [--precision fp32|bf16|int8]"""
     options = parse(_ExportOptions, argv, "export")
-    names = [field.name for field in fields(exports.ExportConfig) if field.name != "modalities"]
-    given = {name: getattr(options, name) for name in names}
-    config = exports.ExportConfig(**given, modalities=None if options.modality == "both" else (options.modality,))
     model = load(options.model)
     pack = Pack(options.on) if options.on else own_data(model, "check the export on a pack, --on PACK")
     pack = as_trained(model, pack)
     with shown():
         calibrate = as_trained(model, Pack(options.calibrate)) if options.calibrate else None
         new = Pack(options.new_sensor) if options.new_sensor else None
-        report = exports.export(with_probes(model, pack), pack, options.out, config, calibrate=calibrate, new=new)
+        report = exports.export(with_probes(model, pack), pack, options.out, options, calibrate=calibrate, new=new)
     print(_table(options.out, report, new.path if new else None))
 
 
@@ -96,16 +88,13 @@ def _table(out: Path, report: dict[str, Any], new: Path | None) -> str:
     rows = []
     for task, values in report["accuracy"].items():
         rows.append([f"{task}, accuracy %", f"{values['original']:.1f}", f"{values['export']:.1f}"])
-    for target in (target for targets in report.get("values", {}).values() for target in targets):
+    for target in (target for targets in report["values"].values() for target in targets):
         if target["num"]:
             cells = (f"{target[key]:.3g}" for key in ("original", "export"))
             rows.append([f"{target['name']}, mean absolute error, {target['unit']}", *cells])
         rows.append([f"{target['name']}, change, {target['unit']}", "", f"{target['change']:.2g}"])
     for name, values in report["cosine"].items():
         rows.append([f"{name}, lowest cosine", "", f"{values['min']:.5f}"])
-    if target := report.get("target"):
-        bits = {"avx2": "any CPU, 7-bit weights", "vnni": "with VNNI, 8-bit weights"}[target]
-        rows.append(["target CPU", "", f"{target}: {bits}"])
     rows.append(["size, MB", "", f"{report['size_mb']}"])
     rows.append(["latency of one pair, ms: p50 / p99", "", "{p50} / {p99}".format(**report["latency_ms"])])
     return text_table(title, ["", "original", "export"], rows)

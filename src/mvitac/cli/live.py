@@ -18,7 +18,7 @@ from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse
 from mvitac.data.spec import task_title
-from mvitac.deploy.engine import FORMAT_VERSION, MANIFEST, Engine, about_sensor, frame_shapes, frames_of
+from mvitac.deploy.engine import EXPORT, Engine, about_sensor, frame_shapes, frames_of
 from mvitac.live.cameras import source
 from mvitac.live.contact import LiveConfig
 from mvitac.live.display import Window, draw
@@ -239,23 +239,19 @@ def sources(
 def _engine(model: str, threads: int, console: Any) -> Engine:
     """The engine of an export; a run or an artifact is exported first, once, into the cache."""
     from mvitac.deploy.artifact import load
-    from mvitac.deploy.engine import import_openvino, lists_bf16
     from mvitac.deploy.export import export
     from mvitac.deploy.publish import own_data, with_probes
     from mvitac.nn.weights import safetensors_digest
 
-    if (Path(model) / MANIFEST).is_file():
-        engine = Engine(model, threads=threads)
-        if engine.meta["precision"] == "bf16" and not lists_bf16(import_openvino().Core()):
-            console.print(f"{model} is in bf16, which this CPU lacks: it runs in fp32, slower", soft_wrap=True)
-        return engine
+    if (Path(model) / EXPORT.name).is_file():
+        return Engine(model, threads=threads)
     loaded = load(model)
     # Artifacts of one run differ in their probes only. A run has none: its data decides those that are fitted below.
     probes = [[to_json(r.info), safetensors_digest(dict(r.state_dict()))] for r in loaded.probes.values()]
-    key = digest([FORMAT_VERSION, loaded.weights_digest(), probes])
+    key = digest([EXPORT.version, loaded.weights_digest(), probes])
     folder = cache_dir() / "exports" / key[:32]
     if not folder.exists():
-        console.print(f"exporting {model} for ONNX Runtime, once", soft_wrap=True, highlight=False)
+        console.print(f"exporting {model}, once", soft_wrap=True, highlight=False)
         pack = own_data(loaded, "`mvitac export MODEL --on PACK --out DIR` first, and give DIR")
         export(with_probes(loaded, pack), pack, folder)
     return Engine(folder, threads=threads)

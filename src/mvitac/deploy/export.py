@@ -1,16 +1,15 @@
-"""Write a model for another engine, and refuse to if the result is another model than the trained one.
+"""Write a model as ONNX, and refuse to if the result is another model than the trained one.
 
 The reference is ``Model.features`` and its probes, the code that computed the published scores. The candidate is the
-written file, opened again by the engine that will run it.
+written file, opened again as on a robot.
 """
 
 import contextlib
 import io
 import logging
-import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -21,20 +20,20 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import preprocessing
-from mvitac.deploy.engine import CHECK, FILES, FORMAT, FORMAT_VERSION, MANIFEST, open_engine
-from mvitac.deploy.export_module import ExportModule
+from mvitac.deploy.engine import CHECK, EXPORT, MODEL, open_model
+from mvitac.deploy.export_module import ExportModule, write_onnx
 from mvitac.deploy.parity import latency, parity, reference
-from mvitac.deploy.quantise import Target, quantise, this_machine, to_openvino, write_onnx
+from mvitac.deploy.quantise import quantise
 from mvitac.evaluation.features import sample
 from mvitac.evaluation.sensors import learn_looks
 from mvitac.model import Model
 from mvitac.system.device import has_bf16
-from mvitac.system.files import digest, digest_file, write_atomic, write_json
+from mvitac.system.files import write_atomic
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 from mvitac.system.provenance import provenance
 
-Kind = Literal["torch", "onnx", "openvino"]
+Precision = Literal["fp32", "bf16", "int8"]
 MIN_COSINE = {"fp32": 0.9999, "bf16": 0.99, "int8": 0.95}
 """Lowest cosine of any single embedding with the original, by the arithmetic of an export."""
 NEW_SENSOR = "--new-sensor"  # the option that errors name
@@ -47,17 +46,11 @@ for some images only)."""
 class ExportConfig:
     """What to export, and how far it may differ from the trained model."""
 
-    kind: Kind = "onnx"
-    """Engine: torch (torch.export), onnx (ONNX Runtime) or openvino."""
-    precision: Literal["fp32", "bf16"] = "fp32"
-    """Arithmetic of openvino; bf16 only on a CPU that computes it, where it can be checked."""
-    int8: bool = False
-    """8-bit weights and activations; their ranges come from train rows of the pack (onnx, openvino)."""
-    target: Target = "auto"
-    """CPU that int8 is for. avx2: any CPU (7-bit weights). vnni: x86 with VNNI or AMX, or ARM (8-bit weights). auto: this
-    machine's, as measured."""
-    modalities: tuple[str, ...] | None = None
-    """Inputs of the export; None = all the model has."""
+    precision: Precision = "fp32"
+    """Arithmetic. bf16: by OpenVINO, on a CPU that computes it. int8: 8-bit activations, with ranges from train rows of the
+    pack, and 7-bit weights, for any CPU."""
+    modality: Literal["both", "vision", "touch"] = "both"
+    """Inputs of the export; both = all the model has."""
     min_cosine: float | None = None
     """Lowest cosine of any single embedding with the original (default: .9999 for fp32, .99 for bf16, .95 for int8)."""
     accuracy_loss: float = 0.5
@@ -70,22 +63,14 @@ class ExportConfig:
     """CPU threads while measuring latency; 0 = all cores."""
 
     def __post_init__(self) -> None:
-        if self.min_cosine is None:
-            object.__setattr__(self, "min_cosine", MIN_COSINE["int8" if self.int8 else self.precision])
-        if self.int8 and self.kind == "torch":
-            raise ValueError("--int8 is for onnx and openvino: give --format onnx or --format openvino")
-        if self.target != "auto" and not self.int8:
-            raise ValueError(f"--target {self.target} chooses the weights of --int8: add --int8, or leave --target out")
-        if not (0 <= self.accuracy_loss <= 100):
-            raise ValueError(f"--accuracy-loss {self.accuracy_loss}: give points of accuracy, 0 to 100")
-        if not 0 <= self.value_loss < math.inf:
-            raise ValueError(f"--value-loss {self.value_loss}: give standard deviations of the value, 0 or more")
-        if not (self.min_cosine is None or -1 <= self.min_cosine <= 1):
-            raise ValueError(f"--min-cosine {self.min_cosine}: give a cosine, -1 to 1")
         if self.num_rows < 1:
             raise ValueError(f"--rows {self.num_rows}: give at least 1")
-        if self.precision == "bf16" and (self.kind != "openvino" or self.int8):
-            raise ValueError("--precision bf16 is a mode of openvino without --int8: give --format openvino")
+
+    @property
+    def tolerance(self) -> dict[str, float]:
+        """The limits of ``parity``."""
+        cosine = MIN_COSINE[self.precision] if self.min_cosine is None else self.min_cosine
+        return {"min_cosine": cosine, "accuracy_loss": self.accuracy_loss, "value_loss": self.value_loss}
 
 
 def export(
@@ -97,7 +82,7 @@ def export(
     calibrate: Pack | None = None,
     new: Pack | None = None,
 ) -> dict[str, Any]:
-    """Write ``model`` with its probes for another engine into the new folder ``out``, checked on test rows of ``pack``.
+    """Write ``model`` with its probes as ONNX into the new folder ``out``, checked on test rows of ``pack``.
 
     ``calibrate``: data whose train rows set the ranges of int8 (default: ``pack``). ``new``: unlabelled images of a touch
     sensor that ``pack`` lacks. The export is then for that sensor, whose images it shows in the colours of those of
@@ -106,11 +91,9 @@ def export(
     if the export is not possible, or differs by more than ``config`` allows.
     """
     if config.precision == "bf16" and not has_bf16(torch.device("cpu")):
-        raise ValueError(
-            "--precision bf16: this CPU does not compute bf16 itself, so OpenVINO would use fp32 or emulate it, and the"
-            " export could not be checked: export it on a CPU with AVX512-BF16 or AMX, or leave --precision out"
-        )
-    asked, known, pack = config.modalities or tuple(model.encoders), pack, new or pack
+        raise ValueError("--precision bf16: this CPU does not compute bf16 itself, so the export could not be checked")
+    asked = tuple(model.encoders) if config.modality == "both" else (config.modality,)
+    known, pack = pack, new or pack
     if new and "touch" not in asked:
         raise ValueError(f"{NEW_SENSOR} is about touch, which this export lacks: leave it out")
     for given, modality in product((known, pack, calibrate or pack), asked):
@@ -125,13 +108,13 @@ def export(
         )
     rows = sample(rows, config.num_rows)
     with new_folder(out) as partial:
-        with work(f"writing {config.kind}"), silent():
-            if config.int8 and config.target == "auto":
-                config = replace(config, target=this_machine(config.kind))
-            _write_model(graph, partial, config, _examples(graph, calibrate or pack) if config.int8 else None)
-        report, wanted = _measure(model, graph, partial, pack, rows, config)
+        with work("writing ONNX"), silent():
+            write_onnx(graph, partial / MODEL)
+            if config.precision == "int8":
+                quantise(partial / MODEL, list(graph.inputs), _examples(graph, calibrate or pack))
+        report, wanted = _measure(model, graph, partial / MODEL, pack, rows, config)
         _write_check(graph, partial, pack, rows, wanted)
-        _write_manifest(model, graph, partial, config, report)
+        EXPORT.write(partial, _about(model, graph, config, report))
     return report
 
 
@@ -155,25 +138,6 @@ def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:
     return [[pack.images[m][r : r + 1] for m in graph.modalities] for r in sample(rows, NUM_CALIBRATION)]
 
 
-def _write_model(
-    graph: ExportModule, folder: Path, config: ExportConfig, examples: list[list[np.ndarray]] | None
-) -> None:
-    """The model files of the engine; in int8 where there are ``examples``."""
-    two = tuple(torch.zeros(2, *shape, dtype=torch.uint8) for shape in graph.inputs.values())
-    batch = torch.export.Dim("batch", min=1, max=1024)
-    shapes = (tuple({0: batch} for _ in two),)
-    if config.kind == "torch":
-        buffer = io.BytesIO()  # to a file, torch ends the process on a full disk
-        torch.export.save(torch.export.export(graph, two, dynamic_shapes=shapes), buffer)
-        write_atomic(folder / FILES["torch"][0], lambda file: file.write(buffer.getbuffer()))
-        return
-    path = write_onnx(graph, two, folder, list(graph.inputs), list(graph.outputs), shapes)
-    if examples is not None:
-        quantise(path, list(graph.inputs), examples, seven_bits=config.target == "avx2")
-    if config.kind == "openvino":
-        to_openvino(path)
-
-
 def _write_check(
     graph: ExportModule, folder: Path, pack: Pack, rows: np.ndarray, wanted: dict[str, np.ndarray]
 ) -> None:
@@ -185,31 +149,20 @@ def _write_check(
     write_atomic(folder / CHECK, lambda file: file.write(data))
 
 
-def _write_manifest(
-    model: Model, graph: ExportModule, folder: Path, config: ExportConfig, report: dict[str, Any]
-) -> None:
-    """export.json; every other file that it does not name is deleted."""
-    values = {"value_loss": config.value_loss} if graph.values else {}
-    meta = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "kind": config.kind,
+def _about(model: Model, graph: ExportModule, config: ExportConfig, report: dict[str, Any]) -> dict[str, Any]:
+    """What export.json says, besides the files."""
+    return {
         "precision": config.precision,
-        "int8": config.int8,
         "inputs": {m: list(shape) for m, shape in graph.inputs.items()},
         "outputs": list(graph.outputs),
         "classes": graph.classes,
-        **({"values": graph.values} if graph.values else {}),
+        "values": graph.values,
         "preprocessing": preprocessing(model) | ({"new_sensor": graph.looks.about()} if graph.looks else {}),
         "weights": model.weights_digest(),
-        "tolerance": {"min_cosine": config.min_cosine, "accuracy_loss": config.accuracy_loss} | values,
+        "tolerance": config.tolerance,
         "report": report,
         "provenance": provenance(),
-        "files": {name: digest_file(folder / name) for name in (CHECK, *FILES[config.kind])},
     }
-    write_json(folder / MANIFEST, {**meta, "digest": digest(meta)})
-    for stray in {p.name for p in folder.iterdir()} - {MANIFEST, *meta["files"]}:
-        (folder / stray).unlink()
 
 
 @contextlib.contextmanager
@@ -226,17 +179,16 @@ def silent() -> Iterator[None]:
 
 
 def _measure(
-    model: Model, graph: ExportModule, folder: Path, pack: Pack, rows: np.ndarray, config: ExportConfig
+    model: Model, graph: ExportModule, path: Path, pack: Pack, rows: np.ndarray, config: ExportConfig
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The report on the written files, and the outputs of the trained model for ``rows``."""
-    call = open_engine(folder, config.kind, config.precision, config.threads)
+    """The report on the written file, and the outputs of the trained model for ``rows``."""
+    engine = "openvino" if config.precision == "bf16" else "auto"
+    call = open_model(path, engine, config.precision, config.threads)
     with work("computing the outputs of the model", len(rows), "rows") as advance:
         wanted = reference(model, graph, pack, rows, advance)
     with work("checking the outputs of the export", len(rows), "rows") as advance:
-        report = parity(graph, call, model, pack, rows, wanted, config, advance)
-    if config.int8:
-        report["target"] = config.target
-    report["size_mb"] = round(sum((folder / name).stat().st_size for name in FILES[config.kind]) / 1e6, 2)
+        report = parity(graph, call, pack, rows, wanted, **config.tolerance, advance=advance)
+    report["size_mb"] = round(path.stat().st_size / 1e6, 2)
     with work("measuring latency"):
         report["latency_ms"] = latency(call, [pack.images[m][rows[:1]] for m in graph.modalities])
     return report, wanted

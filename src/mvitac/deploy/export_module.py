@@ -7,6 +7,7 @@ probability_<task> [B, K], value_<task> [B, T] in the units of its T targets. Wi
 features are the mean over its images in the colours of each known one.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,24 @@ class ExportModule(nn.Module):
         shared = [F.normalize(head(wanted[m]), dim=1) for m, head in self.projectors.items()]
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         return (*features.values(), *shared, *(probe(joined) for probe in self.probes))
+
+
+def write_onnx(graph: ExportModule, path: Path) -> None:
+    """Write ``graph`` as the ONNX file ``path``, for batches of 1 to 1024."""
+    two = tuple(torch.zeros(2, *shape, dtype=torch.uint8) for shape in graph.inputs.values())
+    batch = torch.export.Dim("batch", min=1, max=1024)
+    torch.onnx.export(
+        graph,
+        two,
+        path,
+        dynamo=True,
+        dynamic_shapes=(tuple({0: batch} for _ in two),),
+        input_names=list(graph.inputs),
+        output_names=list(graph.outputs),
+        opset_version=18,
+        external_data=False,
+        verbose=False,
+    )
 
 
 def output_of(probe: LinearProbe) -> str:
