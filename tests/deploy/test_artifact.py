@@ -23,14 +23,14 @@ from mvitac.data.images import difference
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.deploy.artifact import preprocessing, read_manifest, seal
+from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
 from mvitac.deploy.publish import fit_probes, push
 from mvitac.deploy.search import check_pack
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.probe import split_rows
-from mvitac.system.files import digest_file
+from mvitac.system.files import digest_file, read_json, write_json
 
 
 @pytest.fixture
@@ -40,13 +40,12 @@ def copy(artifact: Path, tmp_path: Path) -> Path:
 
 def reseal(folder: Path, change: Callable[[dict[str, Any]], object] = lambda m: None) -> None:
     """Make every digest fit again, as an attacker would."""
-    manifest = json.loads((folder / "artifact.json").read_text())
+    manifest = read_json(folder / "artifact.json", "a description")
     for name in manifest["files"]:
         if (folder / name).is_file():
             manifest["files"][name] = digest_file(folder / name)
     change(manifest)
-    manifest["digest"] = seal(manifest)
-    (folder / "artifact.json").write_text(json.dumps(manifest))
+    write_json(folder / "artifact.json", manifest, sealed=True)
 
 
 class Payload:
@@ -107,7 +106,7 @@ def test_publish_command_and_card(smoke_run: Path, tmp_path: Path, capsys: pytes
 
 
 def test_the_card_names_what_encoders_and_what_probes_learned_from(artifact: Path) -> None:
-    model, manifest = mvitac.load(artifact), read_manifest(artifact)
+    model, manifest = mvitac.load(artifact), ARTIFACT.read(artifact)
     assert "Encoders and probes: toy; source: tests/support/toy.py; licence: none." in card(model, manifest)
     assert "pre-trained without labels" in card(model, manifest)
     manifest["data"] = {"name": "other", "licence": "CC-BY", "source": "others"}
@@ -155,15 +154,8 @@ def test_a_pickle_is_never_opened(copy: Path, tmp_path: Path) -> None:
     for name in ("model.safetensors", "probes.safetensors"):
         (copy / name).write_bytes(pickle.dumps(Payload(tmp_path / "owned")))
         reseal(copy)
-        with pytest.raises(ValueError, match=r"no safetensors file|announces a header"):
+        with pytest.raises(ValueError, match="cannot be read as safetensors"):
             mvitac.load(copy)
-    assert not (tmp_path / "owned").exists()
-
-
-def test_a_pickle_beside_the_weights_is_refused(copy: Path, tmp_path: Path) -> None:
-    (copy / "pytorch_model.bin").write_bytes(pickle.dumps(Payload(tmp_path / "owned")))
-    with pytest.raises(ValueError, match="unpickle"):
-        mvitac.load(copy)
     assert not (tmp_path / "owned").exists()
 
 
@@ -171,7 +163,7 @@ def test_a_pickle_beside_the_weights_is_refused(copy: Path, tmp_path: Path) -> N
 def test_names_outside_an_artifacts_own_are_refused(copy: Path, name: str) -> None:
     (copy.parent / "secret").write_text("secret")
     reseal(copy, lambda m: m["files"].update({name: "0" * 64}))
-    with pytest.raises(ValueError, match=r"names a file .* refused"):
+    with pytest.raises(ValueError, match=r"names others than .* refused"):
         mvitac.load(copy)
 
 
@@ -179,7 +171,7 @@ def test_a_huge_header_is_refused_before_it_is_read(copy: Path) -> None:
     with (copy / "model.safetensors").open("wb") as file:
         file.write((1 << 40).to_bytes(8, "little") + b"{")
     reseal(copy)
-    with pytest.raises(ValueError, match="announces a header of 1099511627776 bytes"):
+    with pytest.raises(ValueError, match="cannot be read as safetensors"):
         mvitac.load(copy)
 
 
@@ -207,12 +199,6 @@ def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
     assert set(made) == {"meta"}
 
 
-def test_a_huge_description_is_refused(copy: Path) -> None:
-    (copy / "artifact.json").write_text("[" * (2 << 20))
-    with pytest.raises(ValueError, match="no artifact needs more"):
-        mvitac.load(copy)
-
-
 @pytest.mark.parametrize("name", ["model.safetensors", "probes.safetensors", "run.json", "README.md"])
 def test_a_changed_byte_is_found(copy: Path, name: str) -> None:
     data = bytearray((copy / name).read_bytes())
@@ -234,7 +220,7 @@ def test_another_normalisation_or_colour_order_is_refused(copy: Path) -> None:
     for name, value in (("mean", [0.5, 0.5, 0.5]), ("colour_order", "BGR"), ("size", 31)):
         before = json.loads((copy / "artifact.json").read_text())["preprocessing"][name]
         reseal(copy, lambda m, n=name, v=value: m["preprocessing"].update({n: v}))
-        with pytest.raises(ValueError, match=f"says {name} .* predictions would be wrong"):
+        with pytest.raises(ValueError, match=f"{name} is .*, its model was trained with"):
             mvitac.load(copy)
         reseal(copy, lambda m, n=name, v=before: m["preprocessing"].update({n: v}))
     mvitac.load(copy)
@@ -254,7 +240,7 @@ def test_probes_of_another_shape_are_refused(copy: Path) -> None:
 
 
 def test_the_hub_offline_is_one_clear_line(artifact: Path) -> None:
-    with pytest.raises(ValueError, match=r"no folder someone/touch here.*Hugging Face Hub"):
+    with pytest.raises(ValueError, match=r"no folder someone/touch here, and no download from the Hugging Face Hub"):
         mvitac.load("someone/touch")
     with pytest.raises(ValueError, match="could not be written on the Hugging Face Hub"):
         push(artifact, "someone/touch")
@@ -324,7 +310,7 @@ def test_what_the_hub_gives_is_checked_too(copy: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     assert mvitac.load("someone/touch@v2").classes["pattern"] == ("columns", "rows", "checks")
     assert asked["repo"] == "someone/touch" and asked["revision"] == "v2"
-    assert set(asked["allow_patterns"]) == {"artifact.json", *read_manifest(copy)["files"]}
+    assert set(asked["allow_patterns"]) == {"artifact.json", *ARTIFACT.read(copy)["files"]}
     (copy / "run.json").write_text("{}")
     with pytest.raises(ValueError, match="does not match its digest"):
         mvitac.load("someone/touch")

@@ -17,7 +17,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import Target
 from mvitac.deploy import engine as runtime
 from mvitac.deploy import publish
-from mvitac.deploy.artifact import read_manifest
+from mvitac.deploy.artifact import ARTIFACT
 from mvitac.deploy.engine import Engine, spread_at
 from mvitac.deploy.export_module import ExportModule
 from mvitac.deploy.parity import parity, reference
@@ -28,7 +28,7 @@ LEVEL = Target(name="level", unit="levels")
 
 
 def test_predicted_values_score_as_the_artifact_says(value_artifact: Path, measured: Pack) -> None:
-    model, summary = mvitac.load(value_artifact), read_manifest(value_artifact)["scores"]["summary"]
+    model, summary = mvitac.load(value_artifact), ARTIFACT.read(value_artifact)["scores"]["summary"]
     for task in measured.spec.values:
         rows = split_rows(measured, task).test
         for modality, names in (("touch", ["touch"]), ("both", ["vision", "touch"])):
@@ -81,9 +81,9 @@ def test_values_of_a_damaged_description_are_refused() -> None:
 
 
 def test_an_artifact_of_classes_says_nothing_of_values(artifact: Path) -> None:
-    assert "values" not in read_manifest(artifact) and "## Values" not in (artifact / "README.md").read_text()
+    assert ARTIFACT.read(artifact)["values"] == [] and "## Values" not in (artifact / "README.md").read_text()
     assert "## Classes" in (artifact / "README.md").read_text()
-    json.dumps(read_manifest(artifact), allow_nan=False)
+    json.dumps(ARTIFACT.read(artifact), allow_nan=False)
     assert torch.is_tensor(mvitac.load(artifact).predict(touch=np.zeros((2, 32, 32, 3), np.uint8))["pattern"])
 
 

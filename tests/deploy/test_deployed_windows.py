@@ -18,7 +18,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import Window
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
-from mvitac.deploy.artifact import read_manifest
+from mvitac.deploy.artifact import ARTIFACT
 from mvitac.deploy.engine import Engine, frame_shapes
 from mvitac.deploy.publish import publish
 from mvitac.live.contact import LiveConfig
@@ -88,10 +88,10 @@ def test_each_frame_is_minus_the_first_one_of_its_touch(model: Model, measured: 
 
 
 def test_the_artifact_says_what_a_window_is(published: Path, artifact: Path) -> None:
-    window = read_manifest(published)["preprocessing"]["window"]
+    window = ARTIFACT.read(published)["preprocessing"]["window"]
     assert (window["frames"], window["stride"], window["order"], window["of"]) == (2, 1.0, "frame", ["touch"])
     assert "newest frame first" in window["layout"]
-    assert "window" not in read_manifest(artifact)["preprocessing"]
+    assert "window" not in ARTIFACT.read(artifact)["preprocessing"]
 
 
 # -- live -------------------------------------------------------------------------------------------------------------

@@ -25,7 +25,6 @@ from rich.console import Console
 from mvitac.cli.live import _engine, _print_touch, _run, sources, view
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
-from mvitac.deploy.artifact import seal
 from mvitac.deploy.engine import Engine
 from mvitac.deploy.search import neighbours
 from mvitac.live.cameras import Camera, Ended, Folder, Simulated, source
@@ -36,6 +35,7 @@ from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import CaptureThread, Stream
 from mvitac.model import Model
 from mvitac.report.value_figures import over_time
+from mvitac.system.files import read_json, write_json
 from support.faults import Clock, Rig, World, faulty
 from support.films import film, shade
 
@@ -610,10 +610,10 @@ def test_each_artifact_of_a_run_is_exported_for_itself(
 ) -> None:
     """Once: their weights are the same, their probes are not."""
     other = shutil.copytree(artifact, tmp_path / "other")
-    manifest = json.loads((other / "artifact.json").read_text())
+    manifest = read_json(other / "artifact.json", "a description")
     for question in manifest["probes"]:
         question["classes"].reverse()
-    (other / "artifact.json").write_text(json.dumps({**manifest, "digest": seal(manifest)}))
+    write_json(other / "artifact.json", manifest, sealed=True)
     made: list[tuple[str, ...]] = []
 
     def exported(model: Model, pack: Pack, out: Path, **options: Any) -> None:

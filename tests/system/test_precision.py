@@ -276,7 +276,7 @@ def test_a_bf16_export_runs_in_fp32_where_openvino_lists_no_bf16(onnx: Path, mon
 
         def compile_model(self, path: Path, device: str, config: dict[str, str]) -> SimpleNamespace:
             hints.append(config["INFERENCE_PRECISION_HINT"])
-            return SimpleNamespace(create_infer_request=lambda: None)
+            return SimpleNamespace(inputs=[], create_infer_request=lambda: None)
 
     monkeypatch.setattr(openvino, "Core", Core)
     for capabilities in (["FP32"], ["BF16", "FP32"]):

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from mvitac.cli.options import parse
 from mvitac.data.pack import Pack
 from mvitac.deploy import export as exports
-from mvitac.deploy.artifact import load, read_manifest
+from mvitac.deploy.artifact import ARTIFACT, load
 from mvitac.deploy.publish import own_data, with_probes
 from mvitac.deploy.publish import publish as write_artifact
 from mvitac.deploy.publish import push as push_artifact
@@ -43,7 +43,7 @@ def publish(argv: list[str]) -> None:
     with shown():
         pack = Pack(options.on) if options.on else None
         out = write_artifact(options.run, options.out, pack, allow_leak=options.allow_leak)
-    print_summary(read_manifest(out)["scores"])
+    print_summary(ARTIFACT.read(out)["scores"])
     print(f"written: {out}")
     if options.push:
         print(f"pushed: {push_artifact(out, options.push, private=options.private)}")

@@ -12,30 +12,30 @@ against its digest before it is parsed, and no file with another name is opened.
 
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
 from huggingface_hub import ModelHubMixin
 from torch import nn
 
 from mvitac import model_files
+from mvitac.deploy.sealed_folder import SealedFolder
 from mvitac.evaluation.encoders import is_encoder, open_encoder
 from mvitac.model import Model
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
+from mvitac.nn.weights import read_safetensors
 from mvitac.registry import from_json, to_json
-from mvitac.system.files import brief, digest, digest_file, read_json
+from mvitac.system.files import brief, fields_of
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
-FORMAT, FORMAT_VERSION = "mvitac-artifact", 1
-MANIFEST = "artifact.json"
-FILES = ("model.safetensors", "probes.safetensors", "run.json", "trained_on.safetensors", "README.md")
-"""The only names an artifact may use."""
-PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".npy", ".npz", ".joblib")
-"""Suffixes of files that some program may unpickle. An artifact has none: one that does was changed."""
-MAX_HEADER, MAX_MANIFEST = 4 << 20, 1 << 20
-"""Maximum bytes: the safetensors header of a ResNet takes some 20 kB; one of gigabytes would fill the memory."""
+ARTIFACT = SealedFolder(
+    "artifact.json",
+    "mvitac-artifact",
+    2,
+    "mvitac publish",
+    required=frozenset(("model.safetensors", "run.json")),
+    optional=frozenset(("probes.safetensors", "trained_on.safetensors", "README.md")),
+)
 AS_GIVEN = "none is subtracted: tactile images are used as the sensor gives them"
 SUBTRACTED = (
     "subtracted: touch is (touch - background) / 2 + 128, the background being what the sensor shows without contact;"
@@ -77,7 +77,7 @@ class PublishedModel(Model, ModelHubMixin):
         return read(local if local.is_dir() else pull(str(pretrained_model_name_or_path), revision, **options))
 
     def _save_pretrained(self, save_directory: Path) -> None:
-        for name in (MANIFEST, *read_manifest(self.folder)["files"]):
+        for name in (ARTIFACT.name, *ARTIFACT.read(self.folder)["files"]):
             shutil.copyfile(self.folder / name, save_directory / name)
 
 
@@ -103,20 +103,18 @@ def load(path: str | Path, which: model_files.Which = "last") -> Model:
     # "runs/frist" beside a folder runs/ is a typing mistake, not a repository.
     if found and not local.exists() and not local.parent.is_dir():
         return read(pull(found["repo"], found["revision"]))
-    return read(local) if (local / MANIFEST).is_file() else model_files.load(local, which)
+    return read(local) if (local / ARTIFACT.name).is_file() else model_files.load(local, which)
 
 
 def pull(repo: str, revision: str | None = None, **options: Any) -> Path:
     """Download the artifact ``repo`` into the local cache of the Hub; only files that an artifact may have are fetched."""
     from huggingface_hub import snapshot_download
 
+    allowed = sorted({ARTIFACT.name, *ARTIFACT.required, *ARTIFACT.optional})
     try:
-        return Path(snapshot_download(repo, revision=revision, allow_patterns=[MANIFEST, *FILES], **options))
+        return Path(snapshot_download(repo, revision=revision, allow_patterns=allowed, **options))
     except Exception as error:  # offline, not found, no access: the client has an exception for each
-        raise ValueError(
-            f"there is no folder {repo} here, and it could not be downloaded from the Hugging Face Hub ({brief(error)}):"
-            " give the folder of a run or an artifact, or check the id, the network and the login (`hf auth login`)"
-        ) from None
+        raise ValueError(f"no folder {repo} here, and no download from the Hugging Face Hub: {brief(error)}") from None
 
 
 def preprocessing(model: Model) -> dict[str, Any]:
@@ -139,94 +137,26 @@ def preprocessing(model: Model) -> dict[str, Any]:
 
 def read(folder: Path) -> PublishedModel:
     """The model in the artifact ``folder``, with its probes; ValueError if anything was changed since it was published."""
-    manifest = read_manifest(folder)
+    about = ARTIFACT.read(folder)
     model = model_files.load(folder / "model.safetensors")
-    asked, given = preprocessing(model), manifest["preprocessing"]
-    for name in ("colour_order", "mean", "std", "stored", "size", "channels", "window"):
-        if given.get(name) != asked.get(name):
-            raise ValueError(
-                f"{folder}: artifact.json says {name} {given.get(name)}, its model was trained with {asked.get(name)}:"
-                " predictions would be wrong, publish it again"
-            )
-    # Those of the probes, too; older artifacts name the sensors only here.
-    model.spec = replace(model.spec, sensors=from_json(tuple[str, ...], given.get("sensors", []), "sensors"))
-    model.probes = read_probes(folder, manifest, model)
+    with fields_of(folder / ARTIFACT.name):
+        asked, given = preprocessing(model), about["preprocessing"]
+        for name in ("colour_order", "mean", "std", "stored", "size", "channels", "window"):
+            if given.get(name) != asked.get(name):
+                raise ValueError(f"{folder}: {name} is {given.get(name)}, its model was trained with {asked.get(name)}")
+        model.probes = read_probes(folder, about, model)
     return PublishedModel(model, folder).eval()
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """artifact.json of ``folder``, after checking every file that it names; ValueError otherwise."""
-    path = folder / MANIFEST
-    if path.is_file() and path.stat().st_size > MAX_MANIFEST:
-        raise ValueError(f"{path} has {path.stat().st_size} bytes: no artifact needs more than {MAX_MANIFEST}, refused")
-    manifest = read_json(path, "an artifact's description")
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise ValueError(f"{path} does not describe an artifact: give a folder `mvitac publish` wrote")
-    if manifest.get("format_version") != FORMAT_VERSION:
-        raise ValueError(
-            f"{path} has format {manifest.get('format_version')}, this version reads {FORMAT_VERSION}: publish it again"
-        )
-    if manifest.get("digest") != seal(manifest):
-        raise ValueError(f"{path} does not match its digest: it was changed or damaged, copy it again")
-    files = manifest.get("files")
-    if not isinstance(files, dict) or not isinstance(manifest.get("preprocessing"), dict):
-        raise ValueError(f"{path} names no files or no preprocessing: it was not written by `mvitac publish`")
-    for name in files:
-        if name not in FILES:
-            raise ValueError(f"{path} names a file {name!r}: an artifact holds only {', '.join(FILES)}, refused")
-    if not {"model.safetensors", "run.json"} <= files.keys():
-        raise ValueError(f"{path} lacks model.safetensors or run.json: it was not written by `mvitac publish`")
-    for there in sorted(folder.iterdir()):
-        if there.suffix.lower() in PICKLES:
-            raise ValueError(f"{there} is a file that programs unpickle: an artifact has none, refused")
-    for name, expected in files.items():
-        if not (folder / name).is_file():
-            raise ValueError(f"{folder / name} is missing: copy the artifact again")
-        if name.endswith(".safetensors"):
-            check_header(folder / name)
-        if digest_file(folder / name) != expected:
-            raise ValueError(f"{folder / name} does not match its digest: it was changed or damaged, copy it again")
-    return manifest
-
-
-def seal(manifest: dict[str, Any]) -> str:
-    """The digest of a manifest without its own ``digest`` field."""
-    return digest({key: value for key, value in manifest.items() if key != "digest"})
-
-
-def check_header(path: Path) -> None:
-    """ValueError if ``path`` does not begin as a safetensors file of sane size."""
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-        first = file.read(1)
-    if length > MAX_HEADER:
-        raise ValueError(f"{path} announces a header of {length} bytes: no model needs more than {MAX_HEADER}, refused")
-    if first != b"{" or 8 + length > path.stat().st_size:
-        raise ValueError(f"{path} is no safetensors file: an artifact holds no other kind of weights, refused")
-
-
-def read_probes(folder: Path, manifest: dict[str, Any], model: Model) -> dict[str, LinearProbe]:
+def read_probes(folder: Path, about: dict[str, Any], model: Model) -> dict[str, LinearProbe]:
     """The probes of ``folder`` by name; ValueError if names, shapes or classes do not fit the model."""
-    try:
-        classes: tuple[ProbeInfo, ...] = from_json(tuple[ProbeInfo, ...], manifest.get("probes"), "probes")
-        values: tuple[ValueInfo, ...] = from_json(tuple[ValueInfo, ...], manifest.get("values", []), "values")
-    except ValueError as error:
-        raise ValueError(f"{folder / MANIFEST} is damaged ({error}): publish it again") from None
-    infos = (*classes, *values)
-    if not infos:
+    classes: tuple[ProbeInfo, ...] = from_json(tuple[ProbeInfo, ...], about["probes"], "probes")
+    values: tuple[ValueInfo, ...] = from_json(tuple[ValueInfo, ...], about["values"], "values")
+    if not (classes or values):
         return {}
-    path = folder / "probes.safetensors"
-    if path.name not in manifest["files"]:
-        raise ValueError(f"{folder / MANIFEST} describes probes but names no {path.name}: publish it again")
-    tensors = safetensors.torch.load_file(path)
-    expected = {f"{q.name}.{part}" for q in infos for part in ("weight", "bias")}
-    for name in sorted(expected ^ tensors.keys()):
-        where = "is missing" if name in expected else "does not belong"
-        raise ValueError(f"{path}: tensor {name!r} {where}: publish the artifact again")
-    probes = {}
-    for info in infos:
-        if unknown := set(info.modalities) - set(model.encoders):
-            raise ValueError(f"{path}: probe {info.name} needs {unknown}, which this model has no encoder for")
+    path, probes = folder / "probes.safetensors", {}
+    _, tensors = read_safetensors(path)
+    for info in (*classes, *values):
         dim = sum(int(model.encoders[m].num_features) for m in info.modalities)  # type: ignore[arg-type]
         probe = LinearProbe(info, tensors[f"{info.name}.weight"], tensors[f"{info.name}.bias"])
         if probe.weight.shape[1] != dim:

@@ -3,134 +3,65 @@
 import json
 from typing import Any
 
-from mvitac.data.spec import listed
+import jinja2
+
 from mvitac.evaluation.score_text import cell_text, columns_of, covered, pipes, score_name, sources_of, tested_on
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ValueInfo
 from mvitac.system.files import fields_of
 
 
-def card(model: Model, manifest: dict[str, Any]) -> str:
-    """The model card: Markdown with the Hub's front matter."""
-    data, learned = manifest["data"], manifest["trained_on"]
+def card(model: Model, about: dict[str, Any]) -> str:
+    """The model card: Markdown with the Hub's front matter. ``about`` is what artifact.json says."""
+    data, learned, scores = about["data"], about["trained_on"], about["scores"]
     sets = {"Encoders and probes": learned}
     if learned != {key: data[key] for key in learned}:
         sets = {"Encoders": learned, "Probes": data}
     licences = ", and ".join(dict.fromkeys(one["licence"] for one in sets.values()))
-    header = [
-        "---",
-        "library_name: mvitac",
-        "tags: [tactile, robotics, self-supervised, visual-tactile]",
-        "license: other",
-        f"license_name: {json.dumps('weights: as their owner says; trained on data under: ' + licences)}",
-        "---",
-        "",
-    ]
-    end = [
-        "## Data",
-        "",
-        *(f"{what}: {one['name']}; source: {one['source']}; licence: {one['licence']}." for what, one in sets.items()),
-        *_start(manifest.get("start")),
-        "The configuration, library versions and commit are in run.json.",
-        "",
-    ]
-    about = _about(model, learned["name"], data["name"], manifest["scores"])
-    return "\n".join(map(_harmless, [*header, *about, *_usage(manifest["preprocessing"]), *end]))
+    pages = jinja2.Environment(
+        loader=jinja2.PackageLoader("mvitac", "deploy"),
+        finalize=_harmless,
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+    )
+    with fields_of("run.json"):
+        return pages.get_template("card.md.j2").render(
+            model=model,
+            run=model.run,
+            learned=learned,
+            data=data,
+            sets=sets,
+            licence=json.dumps(f"weights: as their owner says; trained on data under: {licences}"),
+            scores=scores,
+            tables=_tables(model, scores),
+            names=dict.fromkeys(score_name(task) for task in scores["summary"].values()),
+            leaks=list(dict.fromkeys(probe.info.leak for probe in model.probes.values() if probe.info.leak)),
+            covered=covered(scores["group_by"], [{"source": "run", "seed": 0}]),
+            given=about["preprocessing"],
+            start=about.get("start"),
+        )
 
 
-def _harmless(line: str) -> str:
-    """One line of Markdown in which labels and notes of the data make no HTML, image, link or terminal escape."""
-    text = "".join(c if c.isprintable() else " " for c in line)
+def _harmless(value: object) -> str:
+    """Text in which labels and notes of the data make no line, HTML, image, link or terminal escape in Markdown."""
+    text = "".join(c if c.isprintable() else " " for c in str(value))
     return text.replace("<", "&lt;").replace("](", r"]\(")
 
 
-def _start(start: dict[str, Any] | None) -> list[str]:
-    """A line on the weights that training started from, as its record says; nothing without them."""
-    if not start:
-        return []
-    with fields_of("run.json"):
-        parts = [f"{modality} {' and '.join(names)}" for modality, names in start["taken"].items()]
-        return [
-            f"Started from the weights of {start['name']} (sha256 {start['digest']}): {', '.join(parts)}. They were trained"
-            f" on: {', '.join(start['trained_on'])}. The data's licences above are not theirs."
-        ]
-
-
-def _about(model: Model, learned: str, data: str, scores: dict[str, Any]) -> list[str]:
-    """The part of the model card on the model: what it is, an example, scores, classes."""
-    run = model.run
-    said = "probabilities" if not model.targets else "probabilities_and_values" if model.classes else "values"
-    return [
-        f"# {run.method.name} on {learned}",
-        "",
-        f"Encoders of {' and '.join(model.encoders)} images ({run.encoder.trunk}),"
-        f" {'trained with labels' if model.tasks else 'pre-trained without labels'} by"
-        f" `{run.method.name}` (recipe `{run.recipe}`, seed {run.seed}), with linear probes on {data}.",
-        "",
-        "```python",
-        "import mvitac",
-        'model = mvitac.load("this folder, or owner/name on the Hub")   # never unpickles, checks every digest',
-        f"{said} = model.predict({', '.join(f'{m}={m}_image' for m in model.encoders)})   # uint8 RGB, any size",
-        "```",
-        "",
-        "## Scores",
-        "",
-        *_score_tables(model, scores),
-        *_listed("Classes", {task: ", ".join(c) for task, c in model.classes.items()}),
-        *_listed(
-            "Values", {task: ", ".join(f"{t.name} in {t.unit}" for t in ts) for task, ts in model.targets.items()}
-        ),
-    ]
-
-
-def _listed(title: str, rows: dict[str, str]) -> list[str]:
-    """A section of the model card with one line per task; nothing without tasks."""
-    return [f"## {title}", "", *(f"- {task}: {text}" for task, text in rows.items()), ""] if rows else []
-
-
-def _score_tables(model: Model, scores: dict[str, Any]) -> list[str]:
-    """A Markdown table per task: accuracy or R2 with its interval, next to the controls; of values their errors too."""
-    if not scores["summary"]:
-        return ["No task has labelled rows in train and test.", ""]
-    by = scores["group_by"]
-    leaks = dict.fromkeys(r.info.leak for r in model.probes.values() if r.info.leak)
-    unseen = f"{by}s that neither encoders nor probes saw"
-    if leaks:
-        unseen = f"test rows. LEAK, what the encoders saw of them: {'; '.join(leaks)}"
-    names = dict.fromkeys(score_name(task).capitalize() for task in scores["summary"].values())
-    lines = [
-        f"{' or '.join(names)} in percent of linear probes, on {unseen}. The rows below the first are controls."
-        f" 95 % intervals: {covered(by, [{'source': 'run', 'seed': 0}])}.",
-        "",
-    ]
+def _tables(model: Model, scores: dict[str, Any]) -> list[str]:
+    """Lines of a table per task: accuracy or R2 with its interval, next to the controls; of values their errors too."""
+    lines = []
     for name, task in scores["summary"].items():
         columns = columns_of(task)
-        rows = [[s, *(cell_text(task, s, m) for m in columns)] for s in sources_of(task)]
-        lines += pipes([f"{name} ({tested_on(task, by)})", *columns], rows, words=1)
-        lines += _errors([r.info for r in model.probes.values() if r.info.task == name])
-    return [*lines, *(line for note in scores["notes"] for line in (f"Note: {note}.", ""))]
-
-
-def _errors(infos: list[Any]) -> list[str]:
-    """A Markdown table of the errors of one task's probes, in the unit of each target; nothing for classes."""
-    infos = [q for q in infos if isinstance(q, ValueInfo)]
-    if not infos:
-        return []
-    rows = []
-    for t, target in enumerate(infos[0].targets):
-        found = [f"{q.errors[t].mae:.3g} ({q.errors[t].rmse:.3g}) {target.unit}" for q in infos]
-        rows.append([target.name, *found])
-    return pipes(["mean absolute error (root mean square)", *(q.modality for q in infos)], rows, words=1)
-
-
-def _usage(given: dict[str, Any]) -> list[str]:
-    """The part of the model card on preprocessing."""
-    return [
-        "## Preprocessing",
-        "",
-        f"{given['input']}. {given['resize']}: stored {given['stored']} px, size {given['size']} px."
-        f" Then (x / 255 - {given['mean']}) / {given['std']}. Background: {given['background']}.",
-        f"Sensors seen: {listed(given['sensors']) or 'not recorded'}."
-        " For another sensor, lamp or gel, check the accuracy before you rely on these predictions.",
-        "",
-    ]
+        rows = [[source, *(cell_text(task, source, m) for m in columns)] for source in sources_of(task)]
+        lines += pipes([f"{name} ({tested_on(task, scores['group_by'])})", *columns], rows, words=1)
+        probes = [probe.info for probe in model.probes.values() if probe.info.task == name]
+        if infos := [info for info in probes if isinstance(info, ValueInfo)]:
+            errors = [[f"{e.mae:.3g} ({e.rmse:.3g})" for e in info.errors] for info in infos]
+            rows = [
+                [target.name, *(f"{each[t]} {target.unit}" for each in errors)]
+                for t, target in enumerate(infos[0].targets)
+            ]
+            heads = ["mean absolute error (root mean square)", *(info.modality for info in infos)]
+            lines += pipes(heads, rows, words=1)
+    return lines

@@ -20,12 +20,12 @@ import numpy as np
 import safetensors.numpy
 
 from mvitac.data.spec import listed
-from mvitac.deploy.manifest import Manifest
+from mvitac.deploy.sealed_folder import SealedFolder
 from mvitac.registry import from_json
 from mvitac.system.files import brief, fields_of
 
 MODEL, CHECK = "model.onnx", "check.safetensors"
-EXPORT = Manifest("export.json", "mvitac-export", 2, "mvitac export", frozenset((MODEL, CHECK)))
+EXPORT = SealedFolder("export.json", "mvitac-export", 2, "mvitac export", frozenset((MODEL, CHECK)))
 Runtime = Literal["auto", "onnxruntime", "openvino"]
 Call = Callable[[list[np.ndarray]], list[np.ndarray]]
 
@@ -192,10 +192,11 @@ def _openvino(path: Path, precision: str, threads: int) -> Call:
         "INFERENCE_NUM_THREADS": threads,
         "INFERENCE_PRECISION_HINT": "bf16" if bf16 else "f32",
     }
-    request = core.compile_model(path, "CPU", config).create_infer_request()
+    model = core.compile_model(path, "CPU", config)
+    names, request = [port.any_name for port in model.inputs], model.create_infer_request()
 
     def call(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        found = request.infer(arrays, share_inputs=True)
+        found = request.infer(dict(zip(names, arrays, strict=True)), share_inputs=True)
         return [np.array(found[i]) for i in range(len(found))]  # the engine reuses its buffers
 
     return call

@@ -11,7 +11,7 @@ import torch
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
-from mvitac.deploy.artifact import FORMAT, FORMAT_VERSION, HUB_ID, MANIFEST, preprocessing, read, seal
+from mvitac.deploy.artifact import ARTIFACT, HUB_ID, preprocessing, read
 from mvitac.deploy.card import card
 from mvitac.evaluation.controls import Records, controls_of, scratch
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
@@ -27,7 +27,7 @@ from mvitac.nn.encoders import build_trunk
 from mvitac.nn.linear_probe import Error, LinearProbe, ProbeInfo, ValueInfo
 from mvitac.registry import to_json
 from mvitac.run import load_run
-from mvitac.system.files import brief, digest_file, write_atomic, write_json
+from mvitac.system.files import brief, write_atomic, write_json
 from mvitac.system.locks import new_folder
 from mvitac.system.progress import work
 
@@ -175,10 +175,9 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         if learned is not None:
             write_sources(partial, learned)
         start = {"start": start} if (start := record.get("start")) else {}
-        manifest = {**_describe(model, pack), **start, "scores": scores}
-        write_atomic(partial / "README.md", lambda file: file.write(card(model, manifest).encode()))
-        manifest["files"] = {p.name: digest_file(p) for p in sorted(partial.iterdir())}
-        write_json(partial / MANIFEST, {**manifest, "digest": seal(manifest)})
+        about = {**_describe(model, pack), **start, "scores": scores}
+        write_atomic(partial / "README.md", lambda file: file.write(card(model, about).encode()))
+        ARTIFACT.write(partial, about)
         read(partial)
     return out
 
@@ -197,15 +196,13 @@ def _sensors(model: Model, pack: Pack) -> tuple[str, ...]:
 
 
 def _describe(model: Model, pack: Pack) -> dict[str, Any]:
-    """artifact.json without its files and digest."""
+    """artifact.json, without its scores."""
     keys = ("name", "licence", "source")
     infos = [r.info for r in model.probes.values()]
     return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
         "preprocessing": preprocessing(model),
         "probes": [to_json(q) for q in infos if isinstance(q, ProbeInfo)],
-        **({"values": values} if (values := [to_json(q) for q in infos if isinstance(q, ValueInfo)]) else {}),
+        "values": [to_json(q) for q in infos if isinstance(q, ValueInfo)],
         "data": {**{key: getattr(pack.spec, key) for key in keys}, "digest": pack.digest},
         "trained_on": {key: getattr(model.spec, key) for key in keys},
     }

@@ -1,4 +1,4 @@
-"""The JSON file that describes an artifact or an export: sealed, with a digest of every other file of its folder."""
+"""A folder that describes itself: a sealed JSON file with a digest of every other file. Artifacts and exports are such."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from mvitac.system.files import digest_file, read_json, write_json
 
 
 @dataclass(frozen=True)
-class Manifest:
+class SealedFolder:
     """What one kind of folder holds."""
 
     name: str  # of the JSON file
