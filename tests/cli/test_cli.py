@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -26,40 +25,6 @@ def test_importing_the_package_imports_no_torch() -> None:
     code = "import sys, mvitac; print('torch' in sys.modules, 'numpy' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.split() == ["False", "False"]
-
-
-@pytest.mark.parametrize(
-    ("given", "expected"), [({}, "10000"), ({"OMP_WAIT_POLICY": "ACTIVE"}, None), ({"GOMP_SPINCOUNT": "7"}, "7")]
-)
-def test_threads_wait_briefly_unless_told_otherwise(given: dict[str, str], expected: str | None) -> None:
-    code = "import os; from mvitac.cli.main import main; main(['--version']); print(os.environ.get('GOMP_SPINCOUNT'))"
-    clean = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
-    out = subprocess.run([sys.executable, "-c", code], env=clean | given, capture_output=True, text=True, check=True)
-    assert out.stdout.split()[-1] == str(expected)
-
-
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_reader_that_leaves_is_no_error(unbuffered: str) -> None:
-    """As in `mvitac --help | true`: nothing on stderr, and the exit code of what SIGPIPE ends."""
-    inlet, outlet = os.pipe()
-    os.close(inlet)
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
-    done = subprocess.run(
-        [sys.executable, "-m", "mvitac", "--help"], stdout=outlet, stderr=subprocess.PIPE, env=environment
-    )
-    os.close(outlet)
-    assert (done.returncode, done.stderr) == (141, b"")
-
-
-def test_a_pipe_of_its_own_that_breaks_is_one(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(arguments: list[str]) -> int:
-        raise BrokenPipeError(32, "Broken pipe")
-
-    monkeypatch.setattr("mvitac.cli.main._run", broken)
-    assert main(["probe"]) == 2
-    assert "Broken pipe" in capsys.readouterr().err
 
 
 def test_help_names_every_command_in_80_columns() -> None:
@@ -135,33 +100,6 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     assert main(command) == 0
     assert weights.stat().st_mtime_ns == before
     assert json.loads((tmp_path / "demo" / "summary.json").read_text()) == summary
-
-
-def test_completion_in_bash(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    from mvitac.cli import completion
-
-    some = ("data info", "data pack", "find")  # the options of all commands take ten seconds
-    monkeypatch.setattr(completion, "COMMANDS", {name: COMMANDS[name] for name in some})
-    assert main(["completion", "bash"]) == 0
-    script = tmp_path / "script"
-    script.write_text(capsys.readouterr().out)
-    tried = """
-    try() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _mvitac; echo "${COMPREPLY[@]}"; }
-    complete -p mvitac
-    try mvitac fi
-    try mvitac data ""
-    try mvitac data pack --data fol
-    try mvitac data pack --data folder --touch-
-    try mvitac find --jso
-    try mvitac find picture
-    """
-    shell = ["bash", "-c", f"source {script}\n{tried}"]
-    shown = subprocess.run(shell, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert shown[0] == "complete -o default -F _mvitac mvitac"
-    assert shown[1:] == ["find", "info pack", "folder", "--touch-group", "--json", ""]
-    assert main(["completion", "fish"]) == 2
 
 
 def test_data_check_of_simulated_data_has_options(capsys: pytest.CaptureFixture[str]) -> None:

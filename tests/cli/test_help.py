@@ -12,8 +12,8 @@ import pytest
 
 from mvitac.cli.main import COMMANDS, help_file, main
 
-WITHOUT_OPTIONS = ("data simulate", "completion")
-"""Commands that have a short text of their own, or an argument only."""
+WITHOUT_OPTIONS = ("data simulate",)
+"""Commands that have a short text of their own."""
 TYRO = [name for name in COMMANDS if name not in WITHOUT_OPTIONS]
 
 

@@ -14,7 +14,6 @@ from typing import Any, TextIO, TypeVar
 
 import tyro
 
-from mvitac.registry import unknown
 from mvitac.system.files import check_place, write_json
 
 T = TypeVar("T")
@@ -33,8 +32,6 @@ def parse(
         default: instance of ``kind`` with other defaults than its own.
         description: text of ``--help`` above the options, instead of the docstring of ``kind``.
     """
-    argv = [re.sub(r"^--(data\.)?(no-)?difference(?==|$)", r"--\1\2subtract-background", w) for w in argv]
-    argv = [re.sub(r"^(--[\w.-]+=)(~.*)", lambda m: m[1] + os.path.expanduser(m[2]), w) for w in argv]  # no shell does
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
     if default is not None:
         options["default"] = default
@@ -45,7 +42,7 @@ def parse(
         with contextlib.redirect_stderr(boxed):
             if {"-h", "--help"} & set(argv):
                 # A flag is shown in the one form that changes something; --x and --no-x are both accepted.
-                with _joined_lines(), contextlib.nullcontext():
+                with _joined_lines():
                     return tyro.cli(kind, **options, config=(tyro.conf.FlagCreatePairsOff,))  # type: ignore[arg-type]
             with _columns("10000"):  # the lines of an error must not be wrapped
                 return tyro.cli(kind, **options)  # type: ignore[arg-type]
@@ -128,44 +125,9 @@ def save_json(path: Path | None, value: Any, *, sealed: bool = False) -> None:
         print(f"written: {path}")
 
 
-def _one_line(text: str, prog: str) -> str:
-    """A boxed error of tyro in our words, e.g. ``--batch-size: 'x' is not an int (see mvitac probe --help)``."""
-    whole = _unframed(text)
-    see = f"(see mvitac {prog} --help)"
-    if found := re.match(r"Error parsing (?!-)[\w.]*: (.*)", whole):
-        return found[1]  # a config's own check, which names its field and what is allowed
-    if found := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of (\(.*\))", whole):
-        return f"{found[2]}: {unknown('choice', found[1], re.findall(chr(39) + '(.*?)' + chr(39), found[3]))}"
-    if found := re.match(r"Missing value for argument '(\S+)'\. Expected (\d+) values", whole):
-        return f"{found[1]}: expected {found[2]} value{'s' * (found[2] != '1')} after it {see}"
-    if found := re.match(r"Unrecognized (?:or misplaced )?options: (.*?)(?: Perhaps you meant:? (--\S+).*)?$", whole):
-        near = f"; did you mean {found[2]}?" if found[2] else ""
-        return f"unknown option {found[1].replace(', ', ' ')}{near} {see}"
-    if found := re.match(r"Error parsing (\S+): (.*?)(?: Argument helptext: (.*))?$", whole):
-        return f"{found[1]}: {_wrong_value(found[2], found[3] or '')} {see}"
-    if found := re.match(r"Missing from .*?: (.*)", whole):
-        return f"missing {found[1].split(' (required)')[0]} {see}"
-    return f"{whole} {see}"
-
-
-def _unframed(text: str) -> str:
-    """The message inside tyro's frame: lines of ╭─ in a terminal, a title and rules of - where it is ASCII only."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
+def _one_line(boxed: str, prog: str) -> str:
+    """tyro's error without its frame and the repeated help of the option, which names its option or field."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", boxed)
     lines = [line.strip(" │|") for line in text.splitlines() if not re.match(r"\s*([╭╰├]|[│|]?\s*[-─]{3,})", line)]
-    lines = [line for line in lines if line and not line.startswith("For full helptext")]
-    titles = ("Value error", "Missing argument", "Invalid choice", "Unrecognized options", "Required options")
-    return " ".join(lines[1:] if lines and lines[0] in titles else lines)
-
-
-def _wrong_value(text: str, help_text: str) -> str:
-    """Why a value cannot be parsed; ``help_text`` of the option begins with its type."""
-    if found := re.search(r"invalid literal for int\(\) with base 10: (.*)$", text):
-        return f"{found[1]} is not an int"
-    if found := re.match(r"could not convert string to float: (.*)$", text):
-        return f"{found[1]} is not a number"
-    if "Exceeds the limit" in text:
-        return "a number of so many digits is too long"
-    if found := re.search(r"(?:instantiated from|parse arguments) \[(.*?)\]", text):
-        kind = re.search(r"(?:[A-Z]{3,}|\{\S+)(?: [A-Z]{3,})*", help_text)  # FLOAT FLOAT, {None}|INT
-        return f"{found[1]} is not {kind[0] if kind else 'possible'}"
-    return text
+    text = re.split(r" (?:Argument helptext:|For full helptext)", " ".join(line for line in lines if line))[0]
+    return f"{text} (see mvitac {prog} --help)"

@@ -32,9 +32,7 @@ class _Options:
 
 def pretrain(argv: list[str]) -> None:
     """mvitac pretrain --data D|--from run.json [--method M] [--recipe R] [--init RUN] [fields] --out DIR [--resume]"""
-    chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger", "--sink"))
-    if "--sink" in chosen:  # the name of --logger in 0.1.0
-        chosen.setdefault("--logger", chosen["--sink"])
+    chosen, rest = selectors(argv, ("--method", "--data", "--recipe", "--from", "--logger"))
     rest = [re.sub(r"^--init(?==|$)", "--init.path", word) for word in rest]
     base = _chosen_run(chosen, phased=False)
     if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():
