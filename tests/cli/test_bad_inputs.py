@@ -32,6 +32,7 @@ from PIL import Image
 import mvitac
 from mvitac.cli.main import main
 from mvitac.data import build as packing
+from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
@@ -44,6 +45,7 @@ from mvitac.system.files import write_json
 from mvitac.training import views as batches_module
 from mvitac.training.loop import train
 from support.forged_packs import Spoil, described, edited, seal
+from support.toy import Toy
 
 
 class WorkBegan(AssertionError):
