@@ -20,7 +20,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.recipes import RECIPES, recipe, with_method
+from mvitac.recipes import RECIPES, recipe
 from mvitac.registry import find, from_json, to_json
 from mvitac.run import Run, load_run
 
@@ -185,19 +185,3 @@ def test_rows_with_other_phases_are_no_grasps(pack: Pack) -> None:
         other.table = pack.table.append_column("phase", pa.array(values * (pack.num // 2)))
         assert other.phased is phased
     assert not pack.phased
-
-
-def test_records_without_later_fields_mean_what_they_meant() -> None:
-    """Runs before these fields: nearly frozen prototypes, all of CMC's negatives, long queues, decayed norms. Digests are
-    unchanged."""
-    then = {"dino": {"prototype_norm": 16.0}, "cmc": {"negatives_per_row": 0.0}, "moco": {"queue_per_row": 0.5}}
-    for name, fields in then.items():
-        run = with_method(recipe("modern"), name)
-        old = to_json(run)
-        for inner, key in (*(("method", key) for key in fields), ("optim", "decay_norms")):
-            old[inner].pop(key)
-        loaded = Run.load(old)
-        assert loaded.optim.decay_norms and loaded.digest() != run.digest()
-        assert loaded.method == replace(run.method, **fields)
-        written = to_json(loaded, for_digest=True)
-        assert not set(fields) & set(written["method"]) and "decay_norms" not in written["optim"]

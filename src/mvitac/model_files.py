@@ -55,8 +55,6 @@ def load(path: str | Path, which: Which = "last") -> Model:
         stored = int(from_json(int, parse_json(header["stored"]), "stored"))
         if not 1 <= stored <= MAX_STORED:
             raise ValueError(f"stored {stored}: expected 1 to {MAX_STORED} px")
-        # Older headers have no spec.difference; it is in the data config.
-        spec = replace(spec, difference=spec.difference or bool(getattr(run.data, "difference", False)))
     except (KeyError, ValueError) as error:
         raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
     # The file has all weights, so the empty model needs no pretrained ones, and no download.

@@ -9,7 +9,6 @@ A *kind* is a direct subclass of ``Registered``. Each further subclass that has 
 
 import dataclasses
 import difflib
-import functools
 import importlib
 import pkgutil
 import types
@@ -64,45 +63,16 @@ def import_all(package: str, path: typing.Iterable[str]) -> None:
         importlib.import_module(f"{package}.{module.name}")
 
 
-LATER = {"later": True}
-"""Metadata for a field added to an existing format. The field is written only if it is not at its default, so that older
-files and digests stay valid."""
-
-
-LATER_IN_DIGEST = {"later in digest": True}
-"""Metadata of a field that is always written, but is omitted from digests at its default, so that old digests stay valid."""
-
-
-def formerly(value: Any) -> dict[str, Any]:
-    """Metadata of a field that older files lack and whose default is not what they mean, which is ``value``.
-
-    An absent field reads as ``value``, and digests omit it at this value, so that old digests stay valid.
-    """
-    return {"formerly": value}
-
-
-def to_json(config: Any, *, for_digest: bool = False, whole: bool = False) -> Any:
-    """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``.
-
-    With ``for_digest``, the fields of ``LATER_IN_DIGEST`` and ``formerly`` that older files lack are left out. With
-    ``whole``, none is, not even one of ``LATER`` at its default.
-    """
-    inner = functools.partial(to_json, for_digest=for_digest, whole=whole)
+def to_json(config: Any) -> Any:
+    """Convert a (nested) config dataclass to JSON-ready values; a registered class is stored with its ``name``."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        values = {field: getattr(config, field.name) for field in dataclasses.fields(config)}
-        fields = {f.name: inner(v) for f, v in values.items() if whole or not _is_omitted(f, v, for_digest)}
+        fields = {field.name: to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
         return {"name": config.name, **fields} if isinstance(config, Registered) else fields
     if isinstance(config, dict):
-        return {str(key): inner(value) for key, value in config.items()}
+        return {str(key): to_json(value) for key, value in config.items()}
     if isinstance(config, (list, tuple)):
-        return [inner(value) for value in config]
+        return [to_json(value) for value in config]
     return str(config) if isinstance(config, Path) else config
-
-
-def _is_omitted(field: dataclasses.Field, value: Any, for_digest: bool) -> bool:
-    if "formerly" in field.metadata:
-        return for_digest and value == field.metadata["formerly"]
-    return field.metadata in ((LATER, LATER_IN_DIGEST) if for_digest else (LATER,)) and value == field.default
 
 
 def from_json(annotation: Any, value: Any, where: str = "run") -> Any:
@@ -159,8 +129,6 @@ def _dataclass_from_json(cls: type, given: dict[str, Any], where: str) -> Any:
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in given:
             raise ValueError(f"{where}: field {field.name!r} is missing")
-        if "formerly" in field.metadata:
-            given.setdefault(field.name, to_json(field.metadata["formerly"]))
     return cls(**{key: from_json(hints[key], v, f"{where}.{key}") for key, v in given.items()})
 
 

@@ -1,7 +1,7 @@
 """``Run``: every setting that decides the outcome of pre-training. It is stored with each result as run.json."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import EncoderConfig
 from mvitac.nn.initial import Init
-from mvitac.registry import LATER_IN_DIGEST, from_json, to_json
+from mvitac.registry import from_json, to_json
 from mvitac.system.files import digest, read_json
 from mvitac.transforms.random_views import Augment, ViewAugment
 
@@ -37,9 +37,9 @@ class Optim:
     """Epsilon of Adam (paper: 1e-7)."""
     weight_decay: float = 0.0
     """L2 penalty (adam, sgd) or decoupled weight decay (adamw). The paper gives none."""
-    decay_norms: bool = field(default=True, metadata=LATER_IN_DIGEST)
+    decay_norms: bool = True
     """Also decay biases and the parameters of BatchNorm. Current practice is not to."""
-    layer_decay: float = field(default=1.0, metadata=LATER_IN_DIGEST)
+    layer_decay: float = 1.0
     """Learning rate of each layer of a trunk relative to that of the next one, e.g. .65 to train a pretrained ViT further
     (BEiT, MAE). 1 = the same for all. Heads have the full rate."""
     schedule: Literal["constant", "cosine", "step", "late-step"] = "constant"
@@ -95,8 +95,8 @@ class Run:
     method: MethodConfig = MViTacConfig()
     data: DatasetConfig
     encoder: EncoderConfig = EncoderConfig()
-    init: Init = field(default=Init(), metadata=LATER_IN_DIGEST)
-    renew_norms: int = field(default=0, metadata=LATER_IN_DIGEST)
+    init: Init = Init()
+    renew_norms: int = 0
     """Batches on which the running statistics of BatchNorm are estimated anew before the first step, for data of another
     sensor than that of --init. 0 = keep them."""
     augment: Augment = Augment()
@@ -118,7 +118,7 @@ class Run:
     presses do lamp, background, sensor and position differ, so that they do not reveal the match. A row without others is
     its own partner. For one-view methods (ssvtp, cmc) all three mean the vision and touch of one row. same-touch-pairs
     gives one-view methods the vision of one row and the touch of another."""
-    positives_within: float = field(default=0.0, metadata=LATER_IN_DIGEST)
+    positives_within: float = 0.0
     """Other rows are positives only up to this distance in time: K frames before or after, in units of the column that
     orders the frames of a touch (--data.order). 0 = any distance. Not for same-image."""
     precision: Literal["auto", "fp32", "tf32", "bf16"] = "fp32"
@@ -231,7 +231,7 @@ class Run:
     def digest(self) -> str:
         """Content address of all settings that decide the outcome. Start weights count by content, not by path."""
         init = self.init if self.init.digest else self.init.resolved()
-        value = to_json(replace(self, init=replace(init, path=None)), for_digest=True)
+        value = to_json(replace(self, init=replace(init, path=None)))
         for name in NOT_IN_DIGEST:
             del value[name]
         for name in self.data.without_effect:

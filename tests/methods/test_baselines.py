@@ -30,8 +30,7 @@ from mvitac.model_files import load
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Bank, Queue
 from mvitac.recipes import with_method
-from mvitac.registry import to_json
-from mvitac.run import Optim, Run
+from mvitac.run import Optim
 from mvitac.training.loader import Feed
 from mvitac.training.loop import train
 from mvitac.training.views import make_views
@@ -347,17 +346,6 @@ def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, conf
         Feed(other, torch.device("cpu")),
     )
     assert (batch.labels["bright"].numpy() == other.labels("bright", "train", "val")[rows]).all()
-
-
-def test_supervised_runs_of_before_keep_their_labels_and_digest(pack: Pack) -> None:
-    new = smoke(pack, method=SupervisedConfig())
-    old = to_json(new)
-    del old["method"]["labels"]
-    before = Run.load(old)
-    assert isinstance(before.method, SupervisedConfig) and before.method.labels == "train"
-    assert "labels" not in to_json(before, for_digest=True)["method"]
-    assert to_json(before)["method"]["labels"] == "train" and Run.load(to_json(before)) == before
-    assert new.digest() != before.digest() and Run.load(to_json(new)) == new
 
 
 def test_calandra_has_a_trunk_per_stream() -> None:

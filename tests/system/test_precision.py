@@ -201,24 +201,6 @@ def test_runs_from_before_auto_go_on(pack: Pack, tmp_path: Path, hardware: Hardw
     assert mvitac.load(out).run.precision == "bf16"
 
 
-def test_digests_of_older_settings_stay() -> None:
-    """As commit fa05dc9 had them, where `modern` and `demo` were in bf16, decayed norms and spread no duplicates."""
-
-    def then(name: str) -> str:
-        run = recipe(name)
-        old = replace(run, optim=replace(run.optim, decay_norms=True))
-        if name in ("modern", "demo"):
-            old = replace(old, precision="bf16", sampler="one-per-touch")
-        return old.digest()[:12]
-
-    assert {name: then(name) for name in ("paper", "modern", "demo", "smoke")} == {
-        "paper": "2689d79f8e4d",
-        "modern": "2dcbdc315156",
-        "demo": "4701dc4d4fd3",
-        "smoke": "3ee300f6a036",
-    }
-
-
 # -- other commands ---------------------------------------------------------------------------------------------------
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mvitac.registry import LATER, unknown
+from mvitac.registry import unknown
 
 MODALITIES = ("vision", "touch")
 UNGROUPED = "no --group was given"  # begins the note of a table whose rows are their own groups
@@ -46,7 +46,7 @@ class Task:
     """Column -> value that a row must have to belong to the task, e.g. {"phase": "during"} for grasp success."""
     split: str = "split"
     """Column with the split of this task, if it differs from that of pre-training."""
-    event: Event | None = field(default=None, metadata=LATER)
+    event: Event | None = None
     """Also score one class as an event in time."""
 
 
@@ -135,15 +135,14 @@ class DataSpec:
     """Owner and location of the data."""
     notes: tuple[str, ...] = ()
     """Notes to print with every result, e.g. what train and test of a published split share."""
-    difference: bool = field(default=False, metadata=LATER)
-    """Whether touch is stored as (touch - background) / 2 + 128. Packs from before this field have False."""
-    values: tuple[ValueTask, ...] = field(default=(), metadata=LATER)
+    difference: bool = False
+    """Whether touch is stored as (touch - background) / 2 + 128."""
+    values: tuple[ValueTask, ...] = ()
     """Tasks whose answer is a number with a unit."""
-    window: Window = field(default=Window(), metadata=LATER)
+    window: Window = Window()
     """The frames that one row shows, stacked on channels."""
-    sensors: tuple[str, ...] = field(default=(), metadata=LATER)
-    """Of a trained model: names of the touch sensors of its training rows. () in packs (``Pack.sensor_names``), and in
-    models from before this field."""
+    sensors: tuple[str, ...] = ()
+    """Of a trained model: names of the touch sensors of its training rows; () in packs (``Pack.sensor_names``)."""
 
     def __post_init__(self) -> None:
         if not (self.vision_channels or self.touch_channels):

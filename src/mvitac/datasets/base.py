@@ -1,13 +1,13 @@
 """The base class of dataset configs. A config gives a source of samples; all other code reads the pack made from it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import QUALITY, Store, Window, check_request, stored_as
 from mvitac.data.windows import windowed
-from mvitac.registry import LATER, Registered
+from mvitac.registry import Registered
 from mvitac.system.files import cache_dir, check_place, digest
 
 if TYPE_CHECKING:
@@ -39,17 +39,17 @@ class DatasetConfig(Registered):
     quality: int = QUALITY
     """JPEG quality, 1 to 100. At 95, pixels differ by 1 or 2 of 255 levels. Colours keep full resolution (4:4:4)."""
 
-    num_frames: int = field(default=1, metadata=LATER)
+    num_frames: int = 1
     """Number of frames that a row shows: the current one and earlier ones of the same touch, stacked on channels."""
-    stride: float = field(default=1.0, metadata=LATER)
+    stride: float = 1.0
     """Distance of these frames, in units of --data.order: frames, or seconds."""
-    frames_of: Literal["touch", "vision", "both"] = field(default="touch", metadata=LATER)
+    frames_of: Literal["touch", "vision", "both"] = "touch"
     """Images that show several frames; the others show the current one."""
-    order: str | None = field(default=None, metadata=LATER)
+    order: str | None = None
     """Column that orders the frames of a touch; default: frame, seq or time."""
-    short: Literal["repeat", "leave-out"] = field(default="repeat", metadata=LATER)
+    short: Literal["repeat", "leave-out"] = "repeat"
     """What is done with rows near the start of a touch: repeat its first frame, or leave the row out."""
-    minus_first: bool = field(default=False, metadata=LATER)
+    minus_first: bool = False
     """Show (frame - first frame of the touch) / 2 + 128 instead of the frame."""
 
     def __post_init__(self) -> None:

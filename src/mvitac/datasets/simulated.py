@@ -4,7 +4,7 @@ They are the default data: every experiment runs without a download. Results are
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Annotated, Any, ClassVar
 
@@ -15,7 +15,7 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import LATER, LATER_IN_DIGEST, to_json, unknown
+from mvitac.registry import to_json, unknown
 from mvitac.sim import grasps, materials
 from mvitac.sim.sensors import SENSORS, Sensor, random_sensors
 
@@ -44,7 +44,7 @@ class SimulatedConfig(DatasetConfig):
     """Side of the rendered and stored images in pixels."""
     held_out_sensor: bool = False
     """Use the sensor that is otherwise never used, to test transfer to a new sensor."""
-    contact: bool = field(default=False, metadata=LATER)
+    contact: bool = False
     """Also measure depth, position and size of the contact, as tasks with values (grasps: and the shear force)."""
 
     def __post_init__(self) -> None:
@@ -55,9 +55,7 @@ class SimulatedConfig(DatasetConfig):
             raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
 
     def _fingerprint(self, version: int) -> dict[str, Any]:
-        own = {
-            key: value for key, value in to_json(self, for_digest=True).items() if key == "size" or key not in KEEPING
-        }
+        own = {key: value for key, value in to_json(self).items() if key == "size" or key not in KEEPING}
         return {"simulator": own.pop("name"), "version": version, **own}
 
 
@@ -70,15 +68,15 @@ class MaterialsConfig(SimulatedConfig):
 
     touches: int = 5
     """Touches per instance, each with its own position, force, sensor and lamp."""
-    moments: int = field(default=1, metadata=LATER_IN_DIGEST)
+    moments: int = 1
     """Rows per touch: moments of one press, which differ in a little movement, force and noise (for same-press)."""
     difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
     """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
-    makes: tuple[str, ...] = field(default=(), metadata=LATER_IN_DIGEST)
+    makes: tuple[str, ...] = ()
     """Names of the sensors to press with (mvitac.sim.sensors). Default: all that are not held out."""
-    sensors: int = field(default=0, metadata=LATER_IN_DIGEST)
+    sensors: int = 0
     """Press with this many sensors drawn at random instead (palette, LED directions, dots, response). 0 = known makes."""
-    sensors_per_press: int = field(default=1, metadata=LATER_IN_DIGEST)
+    sensors_per_press: int = 1
     """Rows per touch: the same spot pressed with so many different sensors (for lambda_sensor)."""
 
     def __post_init__(self) -> None:

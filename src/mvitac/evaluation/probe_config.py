@@ -1,13 +1,12 @@
 """``ProbeConfig``: what `mvitac probe` and ``mvitac.probe`` are asked to score."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from mvitac.data.spec import Event
 from mvitac.evaluation.probe import Probe
 from mvitac.evaluation.sensors import Standardise
-from mvitac.registry import LATER
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,21 +25,21 @@ class ProbeConfig:
     them out."""
     imagenet: Path | None = None
     """File with ImageNet weights of the trunk, for the frozen-ImageNet control."""
-    event: tuple[str, ...] = field(default=(), metadata=LATER)
+    event: tuple[str, ...] = ()
     """TASK=CLASS, e.g. slip=yes: also score this class as an event in time. How early does a recording's frame raise an
     alarm, before the first frame of this class, or before the recording's end if all of its frames have it?"""
-    fps: float | None = field(default=None, metadata=LATER)
+    fps: float | None = None
     """Frames per second, if the --clock of --event counts frames. Otherwise times are in its units."""
-    clock: str | None = field(default=None, metadata=LATER)
+    clock: str | None = None
     """Column with the time of each frame for --event: frame numbers, or seconds. Default: the one that orders frames
     (--data.order, else frame, seq or time)."""
-    false_alarms: float = field(default=0.1, metadata=LATER)
+    false_alarms: float = 0.1
     """Share of recordings without the --event in which an alarm is accepted. It sets the threshold, on train and val."""
-    standardise: tuple[Standardise, ...] = field(default=(), metadata=LATER)
+    standardise: tuple[Standardise, ...] = ()
     """Statistics of each touch sensor (column sensor), from unlabelled images. features: standardise its features by
     their own mean and standard deviation. batch-norm: take the statistics of BatchNorm anew. colours: show images of a
     sensor that --learn-on lacks in the colours of those that it has, and take the mean features."""
-    sensors: bool = field(default=False, metadata=LATER)
+    sensors: bool = False
     """Also say how well touch features tell the sensor, and how often they find the same press through another one."""
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe import Probe
 from mvitac.recipes import recipe, with_method
-from mvitac.registry import LATER, to_json, unknown
+from mvitac.registry import to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import parse_json
 
@@ -30,7 +30,7 @@ class Row:
     """Fields of the run to change, by dotted name, e.g. {"method.temperature": 0.2, "optim.lr": 0.03}."""
     printed: Printed = field(default_factory=dict)
     """The paper's numbers for this row, with positives of the same image. Shown beside such scores of probe paper only."""
-    encoder: str = field(default="", metadata=LATER)
+    encoder: str = ""
     """Another's encoder instead of a run, e.g. "external:timm/NAME" (``bench.external``). It is probed, not trained."""
 
     def __post_init__(self) -> None:
@@ -144,7 +144,7 @@ def slug(label: str) -> str:
 
 def changed(run: Run, changes: Mapping[str, Any]) -> Run:
     """``run`` with fields changed by dotted name; values as in JSON."""
-    value = to_json(run, whole=True)
+    value = to_json(run)
     for name, new in changes.items():
         *path, last = ("init", "path") if name == "init" else name.split(".")
         inner = value

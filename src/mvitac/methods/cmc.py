@@ -16,7 +16,7 @@ https://github.com/fredfyyang/Touch-and-Go (train_CMC_touch.py: K 16384, tau .07
 Shapes: N rows of training data, B in a batch, K negatives, D = 128.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, cast
 
 import torch
@@ -28,7 +28,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
 from mvitac.nn.encoders import EncoderConfig, build_towers, heads, trunks
 from mvitac.nn.memory_bank import Bank
-from mvitac.registry import formerly
 
 EPS = 1e-7  # added to both denominators, as in the reference code
 
@@ -42,7 +41,7 @@ class CMCConfig(MethodConfig):
 
     num_negatives: int = 16384
     """Number of negatives K, drawn from the bank for each query (TAG: 16384)."""
-    negatives_per_row: float = field(default=0.18, metadata=formerly(0.0))
+    negatives_per_row: float = 0.18
     """At most this many negatives per training row (TAG: 16,384 of 91,982 rows). 0 = no limit, as in runs before this
     field."""
     temperature: float = 0.07

@@ -13,7 +13,7 @@ first epoch, gradient clipping (owners: norm 3), a weight decay that rises from 
 methods), and their truncated-normal start of the MLP.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -25,7 +25,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
-from mvitac.registry import formerly
 
 BOTTLENECK = 256
 
@@ -51,7 +50,7 @@ class DINOConfig(MethodConfig):
     """Number of prototypes K. DINO's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
     hidden: int = 2048
     """Hidden width of the 3-layer head (DINO: 2048 for every trunk)."""
-    prototype_norm: float = field(default=0.577, metadata=formerly(16.0))
+    prototype_norm: float = 0.577
     """Norm of the prototypes at the start (DINO: .577). They are normalised before use, so a larger norm means smaller
     steps of their direction: at 16, as in runs before this field, they hardly move."""
 

@@ -7,7 +7,7 @@ which can reveal the positive.
 """
 
 from abc import ABC
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 from torch import Tensor, nn
@@ -18,7 +18,6 @@ from mvitac.nn.encoders import EncoderConfig, Head, build_towers, trunks
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 from mvitac.nn.momentum import Momentum, momentum_at
-from mvitac.registry import formerly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +26,7 @@ class QueueConfig(MethodConfig, ABC):
 
     queue: int = 4096
     """Number of keys K in each queue. MoCo's 65,536 are 5 % of ImageNet; 4,096 are 5 % of Touch and Go."""
-    queue_per_row: float = field(default=0.125, metadata=formerly(0.5))
+    queue_per_row: float = 0.125
     """At most this many keys per training row. In a longer queue, a row often meets its own older key and those of its
     positives as negatives."""
     momentum: float = 0.999

@@ -16,7 +16,7 @@ Phi_t (touch, intra), Phi_v (touch, inter). In z_xy, x is the modality of the qu
 Shapes: images [B, C, H, W], features [B, D], embeddings z [B, 128].
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
 
@@ -30,7 +30,6 @@ from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, pr
 from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers, num_features, trunks
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
-from mvitac.registry import LATER_IN_DIGEST
 from mvitac.system.threads import in_branches
 
 PARTS = {"vv": ("vision", "vision"), "tt": ("touch", "touch"), "vt": ("vision", "touch"), "tv": ("touch", "vision")}
@@ -48,7 +47,7 @@ class MViTacConfig(MethodConfig):
     """Temperature tau of InfoNCE. The paper compares .07, .2, .5 and 1; .07 is best."""
     lambda_inter: float = 1.0
     """Weight of the two inter-modal losses (eq. 14). Not given in the paper; 1 in the authors' code."""
-    lambda_sensor: float = field(default=0.0, metadata=LATER_IN_DIGEST)
+    lambda_sensor: float = 0.0
     """Weight of one more loss beside eq. 14: a touch view is told from others by the same press through another sensor
     (rows with the same value in column press and another in column sensor). 0: none (paper)."""
     momentum: float = 0.99
@@ -57,7 +56,7 @@ class MViTacConfig(MethodConfig):
     """Network that computes the keys. momentum: a momentum copy of the query tower (paper). end-to-end: the query tower
     itself, with gradients (as in SimCLR; the name is from MoCo, figure 2). Each view is then query and key
     in turn, and momentum has no effect."""
-    pairs: Literal["crossed", "all"] = field(default="crossed", metadata=LATER_IN_DIGEST)
+    pairs: Literal["crossed", "all"] = "crossed"
     """Views paired by the inter-modal losses. crossed: a view of one modality with the other view of the other modality
     (paper). all: with both views of the other modality, at no extra forward pass; needs end-to-end keys."""
     losses: tuple[Literal["vv", "tt", "vt", "tv"], ...] = ("vv", "tt", "vt", "tv")

@@ -9,7 +9,7 @@ From the weights of another run (``Run.init``) the same method is fine-tuning, o
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -22,7 +22,7 @@ from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
 from mvitac.nn.finetuning import AttentivePool, Part, freeze_statistics, merged, train_part
-from mvitac.registry import LATER, formerly, unknown
+from mvitac.registry import unknown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class LabelledConfig(MethodConfig):
     """Tasks to learn. Default: all tasks with classes; if the dataset has none, all tasks with values."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
     """Modalities to learn from. Default: all modalities of the dataset."""
-    labels: Literal["train", "train-and-val"] = field(default="train-and-val", metadata=formerly("train"))
+    labels: Literal["train", "train-and-val"] = "train-and-val"
     """Splits whose labels are learned from. train-and-val: the rows that probes are fitted on. train: rows of train alone,
     as in version 0.1.0."""
 
@@ -122,19 +122,19 @@ class SupervisedConfig(LabelledConfig):
 
     name: ClassVar[str] = "supervised"
 
-    train: Part = field(default="all", metadata=LATER)
+    train: Part = "all"
     """What of the trunks is trained, beside the heads. all. last-stage. lora: low-rank updates of all layers, and
     BatchNorm. attentive: an attention over the last feature map that is added to the pooled features. head: nothing."""
-    rank: int = field(default=8, metadata=LATER)
+    rank: int = 8
     """Rank of the updates of lora."""
-    heads_from: Literal["random", "probe"] = field(default="random", metadata=LATER)
+    heads_from: Literal["random", "probe"] = "random"
     """Start of the heads. probe: linear probes fitted on the start features of the training rows (LP-FT,
     arXiv:2202.10054)."""
-    share: float = field(default=1.0, metadata=LATER)
+    share: float = 1.0
     """Share of the labelled groups to learn from, drawn at random; at least one group of each class."""
-    draw: int = field(default=1, metadata=LATER)
+    draw: int = 1
     """Which random draw: 1, 2, ..."""
-    hold_out: bool = field(default=False, metadata=LATER)
+    hold_out: bool = False
     """Leave out some of these groups, on which settings are chosen: those of split val, else a fifth."""
 
     def __post_init__(self) -> None:

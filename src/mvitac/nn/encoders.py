@@ -4,7 +4,7 @@ import copy
 import difflib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +21,6 @@ from mvitac.data.spec import DataSpec
 from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.small_conv import use_convolutions, use_products
 from mvitac.nn.weights import load_weights, read_tensors, stem_names
-from mvitac.registry import LATER, LATER_IN_DIGEST
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
@@ -81,10 +80,10 @@ class EncoderConfig:
     weights: str = IMAGENET
     """Initial weights: `imagenet` (downloaded by timm), `scratch` (random), or a file with the trunk's state dict
     (.safetensors, .pth)."""
-    stem: Literal["repeat", "random"] = field(default="repeat", metadata=LATER_IN_DIGEST)
+    stem: Literal["repeat", "random"] = "repeat"
     """Start of a pretrained trunk's first convolution for images that do not have three channels: timm repeats and rescales
     its filters, or random (the authors' code)."""
-    temporal: Literal["stack", "mean", "attention"] = field(default="stack", metadata=LATER)
+    temporal: Literal["stack", "mean", "attention"] = "stack"
     """How several frames of a window are read. stack: as channels of one image. mean: the trunk sees each frame, and their
     features are averaged. attention: their weighted mean, with weights learned from the features and the frame's age."""
 

@@ -4,14 +4,13 @@ Shapes: B images, D features (a probe on both modalities reads vision, then touc
 """
 
 from bisect import bisect_right
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mvitac.data.spec import Target
-from mvitac.registry import LATER
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +37,7 @@ class ProbeInfo(_Asked):
     accuracy: float  # accuracy on the test split of the dataset it was trained on
     majority: float  # accuracy on the same rows of always predicting the most frequent class
     num_test: int
-    leak: str = field(default="", metadata=LATER)
+    leak: str = ""
     """Which test rows the encoders were trained on, or "unknown" (``evaluation.leaks``)."""
 
     @property
@@ -74,7 +73,7 @@ class ValueInfo(_Asked):
     targets: tuple[Target, ...]
     errors: tuple[Error, ...]  # one for each target
     num_test: int
-    leak: str = field(default="", metadata=LATER)  # as for ``ProbeInfo``
+    leak: str = ""  # as for ``ProbeInfo``
 
     def __post_init__(self) -> None:
         if not self.targets or len(self.errors) != len(self.targets):

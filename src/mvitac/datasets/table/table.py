@@ -8,7 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ from mvitac.datasets.table.image_columns import Background, Refs, Selection
 from mvitac.datasets.table.manifest import Condition, Manifest
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP, group_by_video
-from mvitac.registry import LATER, to_json
+from mvitac.registry import to_json
 from mvitac.system.files import digest
 
 VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
@@ -50,7 +50,7 @@ class RowsConfig(DatasetConfig, ABC):
     labels: tuple[str, ...] = ()
     """Columns that become tasks. Classes are the sorted distinct values; an empty cell or NaN is unlabelled. Unicode
     forms and blanks are made equal."""
-    values: tuple[str, ...] = field(default=(), metadata=LATER)
+    values: tuple[str, ...] = ()
     """Columns of numbers to predict, as column:unit, e.g. force_n:N; or several as one task: pose=z_mm:mm,tilt_deg:deg.
     state[2] is the third number of a column of lists. An empty cell or NaN is not measured."""
     group: str | None = None
@@ -160,10 +160,7 @@ class Rows(Source):
         self._manifest_digest = manifest.digest
         self._title = config.title or (config.path if config.path.is_dir() else config.path.parent).resolve().name
         self._vision, self._touch = image_columns.find(manifest, config.vision, config.touch)
-        given = manifest.rows
         manifest = manifest.normalised({self._vision, *self._touch, *(config.background or ("background",))})
-        # Tables that were in this form keep their packs in the cache.
-        self._form = {} if manifest.rows == given and not _names_nan(given) else {"cells": "normal"}
         self._group = config.group or ("group" if "group" in manifest.columns else manifest.group)
         self._split = config.split or ("split" if "split" in manifest.columns else BY_GROUP)
         self._sensor = config.sensor or ("sensor" if "sensor" in manifest.columns else None)
@@ -326,7 +323,6 @@ class Rows(Source):
             "manifest": self._manifest_digest,
             "file_sizes": digest(self._sizes),
             "options": {k: v for k, v in to_json(self._config).items() if k not in ("path", *KEEPING)},
-            **self._form,
         }
 
     def stamps(self) -> list[int]:
@@ -334,11 +330,6 @@ class Rows(Source):
 
     def read(self, item: int) -> list[Sample | Lost]:
         return read_rows([self._rows[i] for i in self._items[item]], self._config.size)
-
-
-def _names_nan(rows: Sequence[dict[str, str]]) -> bool:
-    """Return whether a cell is a name such as "Nan", which earlier versions took for a missing number."""
-    return any(cell.lower() == "nan" for row in rows for cell in row.values() if len(cell) == 3)
 
 
 def _check_columns(config: RowsConfig, manifest: Manifest, chosen: Sequence[str | None]) -> None:
