@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,36 @@ def written(kind: str, folder: Path) -> Path:
         assert kind == "gray"
         Image.fromarray(rgb[..., 0]).save(path)
     return path
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n"
+
+
+def test_a_file_of_another_format_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow would run Ghostscript on an EPS, whatever the file is called."""
+    ran, program = tmp_path / "ran", tmp_path / "gs"
+    program.write_text(f"#!/bin/sh\ntouch {ran}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("PIL.EpsImagePlugin.gs_binary", None)
+    (tmp_path / "x.png").write_bytes(EPS)
+    live = Folder(tmp_path)
+    live.open()
+    for read in (lambda: decode(tmp_path / "x.png"), lambda: _picture([tmp_path / "x.png"]), live.read):
+        with pytest.raises(ValueError, match=r"x\.png cannot be read as an image"):
+            read()
+    assert not ran.exists()
+
+
+@pytest.mark.parametrize("side", [9_000, 60_000])
+def test_a_huge_image_is_refused_before_it_is_decoded(tmp_path: Path, side: int) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4) + kind + data + zlib.crc32(kind + data).to_bytes(4)
+
+    head = side.to_bytes(4) + side.to_bytes(4) + bytes([8, 2, 0, 0, 0])
+    (tmp_path / "x.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"")))
+    with pytest.raises(ValueError, match=r"x\.png (cannot be read as an image \(it has 9000|is too large)"):
+        decode(tmp_path / "x.png")
 
 
 @pytest.mark.parametrize(

@@ -321,9 +321,9 @@ def test_repaired_items_are_read_on_the_next_try(pack: Pack, tmp_path: Path) -> 
 
 
 def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
-    """Each of its packing processes would run it again and wait for the first."""
+    """Each of its packing processes would run it again and wait for the first. The source is more than a pipe holds."""
     script = tmp_path / "script.py"
-    call = f"build(Toy(), {str(tmp_path / 'p')!r}, size=32, workers=2)"
+    call = f"build(Toy(extra={{'long': 'x' * 200_000}}), {str(tmp_path / 'p')!r}, size=32, workers=2)"
     script.write_text(f"from mvitac.data.build import build\nfrom support.toy import Toy\n{call}\n")
     path = os.pathsep.join(sys.path)
     done = subprocess.run(

@@ -338,6 +338,18 @@ def test_image_parquet_of_the_hub(tmp_path: Path) -> None:
     assert len({level(image) for image in pack.images["touch"]}) == 30
 
 
+def test_a_table_shows_no_image_of_other_folders(tmp_path: Path) -> None:
+    secret, link = tmp_path / "secret.png", tmp_path / "data" / "link.png"
+    link.parent.mkdir()
+    secret.write_bytes(png(9))
+    link.symlink_to(secret)
+    for name in (str(secret), "../secret.png", "link.png"):
+        rows = [{"touch": {"bytes": None if i == 3 else png(i), "path": name}, "kind": i % 2} for i in range(20)]
+        pq.write_table(pa.Table.from_pylist(rows), link.parent / "d.parquet")
+        with pytest.raises(ValueError, match=r"1 of 20 samples .*row 3 touch holds no image"):
+            packed(HubConfig(path=link.parent / "d.parquet", labels=("kind",), size=16), tmp_path / "pack")
+
+
 def test_a_bad_cell_costs_its_own_row_only(tmp_path: Path) -> None:
     rows = [{"touch": b"no picture" if i == 3 else png(i), "kind": i % 2} for i in range(20)]
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "bad.parquet")

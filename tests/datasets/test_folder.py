@@ -282,12 +282,15 @@ def test_has_touch_is_seen_not_believed(tmp_path: Path, rows: Table) -> None:
     assert pack.has("touch").all() and not {"has_touch", "has_vision"} & set(pack.table.column_names)
 
 
-def test_a_control_must_not_take_the_place_of_a_column_of_the_pack(tmp_path: Path, rows: Table) -> None:
-    rows = [{**row, "group": i // 3} for i, row in enumerate(rows)]
-    with pytest.raises(
-        ValueError, match=r"control column 'group' holds numbers and has the name of a column of the pack"
-    ):
-        config(write(rows, tmp_path / "m.csv"), group="group", controls=("which=group",)).source()
+@pytest.mark.parametrize("name", ["group", "id", "touch_group", "crc_vision", "label_material"])
+@pytest.mark.parametrize("given", [{"values": ("{}:N",)}, {"controls": ("which={}",)}])
+def test_numbers_must_not_take_the_place_of_a_column_of_the_pack(
+    tmp_path: Path, rows: Table, given: dict[str, Any], name: str
+) -> None:
+    rows = [{**row, name: i // (1 if name == "id" else 3)} for i, row in enumerate(rows)]
+    ((option, (text,)),) = given.items()
+    with pytest.raises(ValueError, match=rf"column '{name}' has the name of one of the pack itself: copy it"):
+        config(write(rows, tmp_path / "m.csv"), labels=("material",), **{option: (text.format(name),)}).source()
 
 
 def test_a_config_survives_json(tmp_path: Path) -> None:

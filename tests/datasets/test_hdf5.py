@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -264,6 +264,47 @@ def test_bad_files_are_named_in_one_line(tmp_path: Path, name: str, capsys: pyte
     content, options, says = BAD[name]
     write(tmp_path / "a.h5", content)
     refused(tmp_path / "a.h5", options, says, capsys)
+
+
+def sparse(file: h5py.File, name: str, shape: tuple[int, ...], kind: str = "u1") -> None:
+    """A dataset of zeros that takes no room in the file."""
+    del file[name]
+    file.create_dataset(name, shape, kind, chunks=tuple(min(n, 64) for n in shape))
+
+
+def elsewhere(file: h5py.File, name: str, *, virtual: bool) -> None:
+    """A dataset of the same shape that shows another file."""
+    shape, kind = file[name].shape, file[name].dtype
+    del file[name]
+    if virtual:
+        layout = h5py.VirtualLayout(shape, kind)
+        layout[:] = h5py.VirtualSource("/etc/secret.h5", "x", shape=shape)
+        file.create_virtual_dataset(name, layout)
+    else:
+        file.create_dataset(name, shape, kind, external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
+
+
+TRAPS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
+    "external images": (lambda f: elsewhere(f, "camera", virtual=False), "camera shows the content of other files"),
+    "external numbers": (lambda f: elsewhere(f, "force_n", virtual=False), "force_n shows the content of other files"),
+    "virtual images": (lambda f: elsewhere(f, "gel", virtual=True), "gel shows the content of other files: copy it"),
+    "a huge image": (lambda f: sparse(f, "camera", (20, 60_000, 60_000, 3)), "have 3,600,000,000 pixels: at most"),
+    "no end of rows": (
+        lambda f: [sparse(f, name, (200_000_000, 4, 4, 3)) for name in ("camera", "gel")] and None,
+        "camera has 200,000,000 rows: at most 3,000,000 are read at once",
+    ),
+    "no end of numbers": (lambda f: sparse(f, "pose", (20, 10**9), "f8"), r"pose has 20,000,000,000 numbers: a column"),
+}
+
+
+@pytest.mark.parametrize("name", TRAPS)
+def test_files_that_show_others_or_fill_the_memory(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "a.h5", flat())
+    with h5py.File(path, "a") as file:
+        TRAPS[name][0](file)
+    refused(path, {"values": "pose[0]:mm"} if "numbers" in name else {}, TRAPS[name][1], capsys)
 
 
 @pytest.mark.parametrize("keep", [0, 100, 3000, -1])

@@ -29,6 +29,9 @@ def shrink(image: Image.Image, size: int) -> np.ndarray:
 
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".gif")
+MAX_PIXELS = 80_000_000  # of one image; 240 MB as RGB
+FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
+"""What a file is read as, whatever its name (JPEG: a camera's MPO, too). Pillow would start Ghostscript for an EPS."""
 
 
 def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
@@ -40,7 +43,9 @@ def decode(path: str | Path | BinaryIO, name: str = "") -> Image.Image:
     """
     name = name or str(path)
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=FORMATS) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise ValueError(f"it has {image.width} x {image.height} pixels: at most {MAX_PIXELS:,} are read")
             # A camera's MPO has a second image after the photo; GIF and TIFF stacks are refused.
             if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
                 raise ValueError(f"it holds {getattr(image, 'n_frames', 0)} frames, not one: store one image per row")

@@ -2,12 +2,15 @@
 
 import multiprocessing
 import os
+import pickle
+import tempfile
 import zlib
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -115,7 +118,13 @@ def read_parts(reader: Reader, parts: Sequence[tuple[int, int]], workers: int) -
     # spawn: a forked child may inherit locks held by torch. Starting a worker is cheap, because it does not import torch.
     context = multiprocessing.get_context("spawn")
     ahead: deque[Future[tuple[Part, Stored]]] = deque()
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(reader,)) as pool:
+    with (
+        tempfile.NamedTemporaryFile(prefix="mvitac-") as file,
+        ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(file.name,)) as pool,
+    ):
+        # In a file: the pipe to a new process is blocked for ever if that process ends before it has read all.
+        file.write(pickle.dumps(reader))
+        file.flush()
         try:
             for part in parts:
                 ahead.append(pool.submit(_read_here, *part))
@@ -134,11 +143,11 @@ def read_parts(reader: Reader, parts: Sequence[tuple[int, int]], workers: int) -
 _reader: Reader  # of this worker process
 
 
-def _start_worker(reader: Reader) -> None:
+def _start_worker(file: str) -> None:
     global _reader
     keep_freed_memory()
     os.environ["OMP_NUM_THREADS"] = "1"  # one core per worker; also fixes the order of sums
-    _reader = reader
+    _reader = pickle.loads(Path(file).read_bytes())
 
 
 def _read_here(first: int, end: int) -> tuple[Part, Stored]:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from mvitac.data.checks.table_checks import KEYS
@@ -111,6 +111,15 @@ def read_values(
         for task in tasks
     ]
     return columns, known
+
+
+def check_names(where: str, names: Iterable[str], own: Collection[str]) -> None:
+    """Raise ValueError if a column of numbers has one of the names that packing gives: it would replace that column."""
+    for name in names:
+        if name in own or name.startswith(("has_", "crc_", "bytes_")):
+            raise ValueError(
+                f"{where}: column {name!r} has the name of one of the pack itself: copy it to another name"
+            )
 
 
 def read_controls(

@@ -14,12 +14,17 @@ from typing import Any
 
 import numpy as np
 
+from mvitac.data.images import MAX_PIXELS
 from mvitac.datasets.table.image_refs import HDF5, Hdf5Row, ImageRef, open_hdf5
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.system.files import digest
 
 USUAL = ("vision", "touch", "left", "right", "background")
 """Names of image datasets that are found without being asked for."""
+MAX_ROWS = 3_000_000
+"""Rows of all files together: their table is held in memory. An empty dataset of any length is a file of 2 kB."""
+MAX_NUMBERS = 100_000_000
+"""Numbers of one dataset that is a column."""
 MAX_TEXT = 200
 """Characters of the longest attribute that is a column. robomimic keeps whole simulator files in attributes."""
 Refs = dict[str, list[ImageRef | None]]
@@ -48,7 +53,7 @@ def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vector
             for name in _demonstrations(file, everything, images):
                 demo = "/".join(filter(None, (file.stem if len(files) > 1 or not name else "", name)))
                 datasets = _datasets(opened[name]) if name else everything
-                refs = _images(file, name, datasets, images)
+                refs = _images(file, name, datasets, images, MAX_ROWS - len(rows))
                 num = len(next(iter(refs.values())))
                 cells = _constants(opened, name, vectors, left_out)
                 cells |= _columns(demo, datasets, num, refs, vectors, left_out)
@@ -69,9 +74,12 @@ def read_hdf5(path: Path, files: Sequence[Path], images: Collection[str], vector
 
 
 def _datasets(group: Any) -> dict[str, Any]:
-    """Return the datasets below ``group`` by their path."""
+    """Return the datasets below ``group`` by their path; ValueError if one shows the content of other files."""
     found: dict[str, Any] = {}
     group.visititems(lambda path, item: found.update({path: item} if getattr(item, "shape", None) is not None else {}))
+    for path, data in found.items():
+        if data.external or data.is_virtual:
+            raise ValueError(f"{group.file.filename}: {path} shows the content of other files: copy it into this one")
     return found
 
 
@@ -120,8 +128,8 @@ def _no_images(where: Path, names: Collection[str], seen: str) -> ValueError:
     )
 
 
-def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[str]) -> Refs:
-    """Return a reference per row of each image dataset of demonstration ``name``."""
+def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[str], most: int) -> Refs:
+    """Return a reference per row of each image dataset of demonstration ``name``, at most ``most``."""
     shown = {n: d for n, d in datasets.items() if n in images or (n in USUAL and d.ndim == 4)}
     for data in shown.values():
         if data.dtype != np.uint8 or data.ndim != 4 or data.shape[3] not in (1, 3) or 0 in data.shape[1:]:
@@ -129,10 +137,14 @@ def _images(file: Path, name: str, datasets: dict[str, Any], images: Collection[
                 f"{file}: {data.name} is {data.dtype} {list(data.shape)}: images must be uint8 [rows, height, width, 3],"
                 " or 1 for gray"
             )
+        if (pixels := data.shape[1] * data.shape[2]) > MAX_PIXELS:
+            raise ValueError(f"{file}: images of {data.name} have {pixels:,} pixels: at most {MAX_PIXELS:,} are read")
     (first, num), *others = ((data.name, len(data)) for data in shown.values())
     for other, length in others:
         if length != num:
             raise ValueError(f"{file}: {other} has {length} rows, {first} has {num}: images of a row must be there")
+    if num > most:
+        raise ValueError(f"{file}: {first} has {num:,} rows: at most {MAX_ROWS:,} are read at once, use several packs")
     return {c: [Hdf5Row(str(file), data.name, i) for i in range(num)] for c, data in shown.items()}
 
 
@@ -156,6 +168,8 @@ def _columns(
             left_out.setdefault(name, f"is {data.dtype} {list(data.shape)}: a column needs a number or a text per row")
         elif data.ndim == 2 and data.shape[1] != 1 and name not in vectors:
             left_out.setdefault(name, f"has {data.shape[1]} numbers per row: name one of them, as in {name}[0]")
+        elif data.size > MAX_NUMBERS:
+            left_out.setdefault(name, f"has {data.size:,} numbers: a column has at most {MAX_NUMBERS:,}")
         else:
             try:
                 values = (data.asstr("utf-8") if text else data)[()]

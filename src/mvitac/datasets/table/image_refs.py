@@ -131,8 +131,12 @@ class ParquetCell(ImageRef):
         def image(ref: Any) -> Image.Image:
             value = values[ref.row].as_py()
             if isinstance(value, dict):
-                beside = Path(first.path).parent / (value.get("path") or "")
-                value = value.get("bytes") or (beside.read_bytes() if beside.is_file() else None)
+                folder = Path(first.path).resolve().parent
+                beside = (
+                    folder / (value.get("path") or "")
+                ).resolve()  # of other folders, a stranger's table shows nothing
+                inside = beside.is_relative_to(folder) and beside.is_file()
+                value = value.get("bytes") or (beside.read_bytes() if inside else None)
             if not value:
                 raise ValueError(f"{ref} holds no image")
             return decode(io.BytesIO(value), str(ref))

@@ -185,9 +185,10 @@ class Rows(Source):
 
         own: dict[str, Sequence[Any]] = {"id": selected.ids(), "group": grouping.groups}
         own |= {"touch_group": grouping.touch_groups, "split": assigned}
-        own |= {f"label_{task.name}": label for task, label in read} | values
+        own |= {f"label_{task.name}": label for task, label in read}
         own |= {f"has_{modality}": [not lacks for lacks in lacking] for modality, lacking in missing.items()}
-        self._rows = self._make_rows(selected, own, extra)
+        columns.check_names(selected.where, [*values, *extra], {*own, "sensor"})
+        self._rows = self._make_rows(selected, own | values, extra)
 
         row_bytes = 3 * config.size**2 * sum(bool(column) for column in (self._vision, *self._touch))
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
@@ -288,11 +289,6 @@ class Rows(Source):
         """Combine the pack's ``own`` columns, the manifest's other columns and the controls' numbers (``extra``)."""
         if self._sensor:
             own["sensor"] = [row[self._sensor] for row in selected.rows]
-        if taken := extra.keys() & own.keys():
-            raise ValueError(
-                f"{selected.where}: control column {min(taken)!r} holds numbers and has the name of a column of the pack"
-                " itself: give a copy of it under another name"
-            )
         # Which modalities a row has is checked, not read; column order is part of the pack's digest.
         known = {*own, *selected.refs, "has_vision", "has_touch"}
         rows = []
