@@ -41,6 +41,8 @@ def test_predicted_values_score_as_the_artifact_says(value_artifact: Path, measu
             assert "untrained" in summary[task.name][modality] and "mean" in summary[task.name]["none"]
         assert model.targets[task.name] == task.targets
     assert set(model.classes) == {"pattern", "bright"}
+    probe = model.probes["light.touch"]
+    assert torch.equal(probe(probe.bounds[1:] + 1e6), probe(probe.bounds[1:])), "clipped as in the scores"
 
 
 def test_the_spread_of_a_prediction_is_that_of_test_rows_in_its_range(

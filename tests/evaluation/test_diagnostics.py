@@ -79,3 +79,13 @@ def test_linear_probe_is_ridge_regression_with_a_chosen_strength(rows: int, widt
     assert float(d.linear_probe(x, noise, groups, new).std()) < 0.5 * float(noise.std())  # and here a strong one
     broken = torch.cat([x, torch.full((rows, 1), torch.inf)], 1), torch.cat([new, torch.ones(30, 1)], 1)
     assert torch.isfinite(d.linear_probe(broken[0], x @ weight, groups, broken[1])).all()
+
+
+def test_a_feature_that_is_hardly_there_in_the_fitted_rows_does_not_decide_the_linear_probe() -> None:
+    rng = torch.Generator().manual_seed(0)
+    x, new = (torch.randn(n, 20, generator=rng) for n in (200, 100))
+    x[:, 7], new[:, 7] = 0.0, 0.0
+    x[3, 7], new[5, 7] = 1e-4, 0.2
+    y = x[:, :1] + 0.3 * torch.randn(200, 1, generator=rng)
+    error = d.linear_probe(x, y, torch.arange(200) // 4, new) - new[:, :1]
+    assert float(error.abs().max()) < 1

@@ -11,7 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from sklearn.linear_model import Ridge
 from sklearn.metrics import mean_absolute_error, r2_score, root_mean_squared_error
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from mvitac.data.build import build
 from mvitac.data.joined_pack import JoinedPack
@@ -108,21 +111,46 @@ def test_alpha_is_chosen_on_the_held_out_rows() -> None:
     assert fit_ridge(x, y, 20)[1][0] > fit_ridge(*memorised, 20)[1][0]
 
 
+def test_alpha_is_chosen_by_squared_error_where_r2_says_nothing() -> None:
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(80, 60)), rng.normal(2, 1, (80, 1))  # nothing to learn
+    y[60:] = 2.0  # one value in the rows it is chosen on: R2 is 0 for all alphas
+    assert fit_ridge(x, y, 20)[1][0] >= 1e3
+
+
 def test_a_feature_that_one_row_has_does_not_predict_metres() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(1100, 3))
     y = x[:, :1] + rng.normal(0, 0.1, (1100, 1))
     dead = np.zeros((1100, 1))
     dead[7], dead[1000] = 1e-6, 0.02  # after a ReLU: hardly there in one row of train, an ordinary value in one of test
-    predict, _ = fit_ridge(np.hstack([x, dead])[:1000], y[:1000], 200)
-    assert np.abs(predict(np.hstack([x, dead])[1000:]) - y[1000:]).max() < 1
+    x = np.hstack([x, dead])
+    predict, _ = fit_ridge(x[:1000], y[:1000], 200)
+    assert np.abs(predict(x[1000:]) - y[1000:]).max() < 1
+    assert predict.clipped(x[1000:]) == [1, 4] and predict.clipped(x[:1000]) == [0, 4]
     weights, bias = predict.weights()
-    assert np.allclose(np.hstack([x, dead]) @ weights.T + bias, predict(np.hstack([x, dead])))
+    assert np.allclose(x.clip(*predict.bounds) @ weights.T + bias, predict(x))
 
 
-def test_a_feature_that_few_rows_have_is_used() -> None:
-    x = np.random.default_rng(0).random((1000, 1)) * (np.arange(1000) % 100 == 0)[:, None]  # contact in 1 % of the rows
-    assert r2_score(x, fit_ridge(x, x, 200)[0](x)) > 0.99
+def test_a_single_row_far_outside_does_not_decide_r2() -> None:
+    """A feature with a small range in the fitted rows, which is not constant in more of them than in others."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(1300, 40))
+    y = x[:, :1] + rng.normal(0, 0.5, (1300, 1))
+    x[1100, 5] = 1721  # standard deviations
+    predict, _ = fit_ridge(x[:1000], y[:1000], 200)
+    usual = np.delete(np.arange(1000, 1300), 100)
+    assert r2_score(y[1000:], predict(x[1000:])) > r2_score(y[usual], predict(x[usual])) - 0.02 > 0.7
+
+
+def test_features_that_few_rows_have_are_worth_what_plain_ridge_makes_of_them() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.random((6000, 10)) * (rng.random((6000, 10)) < 0.002)  # a contact in two of a thousand rows each
+    y = x.sum(1, keepdims=True) + rng.normal(0, 0.005, (6000, 1))
+    x = np.hstack([x, rng.normal(size=(6000, 10))])
+    plain = make_pipeline(StandardScaler(), Ridge(1.0)).fit(x[:3000], y[:3000]).predict(x[3000:])
+    found = r2_score(y[3000:], fit_ridge(x[:3000], y[:3000], 600)[0](x[3000:]))
+    assert found == pytest.approx(r2_score(y[3000:], plain), abs=0.04) and found > 0.95
 
 
 def test_a_control_may_be_a_curve() -> None:
@@ -264,7 +292,7 @@ def test_a_pack_refuses_infinite_values(tmp_path: Path) -> None:
             (made,) = super().read(item)
             return [replace(made, columns={**made.columns, "level": float("inf") if item == 5 else 1.0})]
 
-    with pytest.raises(ValueError, match="level is inf: a value is a finite number"):
+    with pytest.raises(ValueError, match="level is inf in row 5: a value is a finite number"):
         build(Broken(num=12, values=True), tmp_path / "pack", size=32, workers=1, quiet=True)
 
 

@@ -29,7 +29,7 @@ FORMAT, FORMAT_VERSION = "mvitac-bench", 1
 VOLATILE = ("digest", "about")  # fields that the digest leaves out
 KEPT = (
     *("source", "seed", "task", "modality", "probe", "accuracy", "balanced_accuracy", "macro_f1", "auroc", "num_test"),
-    *("group_sizes", "group_correct", "r2", "targets", "group_sums", "C", "alpha", "steps"),
+    *("group_sizes", "group_correct", "r2", "targets", "group_sums", "C", "alpha", "clipped", "steps"),
 )
 """Fields of a record of a probe that a result keeps."""
 VERSION = re.compile(r"-v\d+$")  # at the end of a suite's name

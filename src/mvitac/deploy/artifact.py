@@ -158,7 +158,7 @@ def read_probes(folder: Path, about: dict[str, Any], model: Model) -> dict[str, 
     _, tensors = read_safetensors(path)
     for info in (*classes, *values):
         dim = sum(int(model.encoders[m].num_features) for m in info.modalities)  # type: ignore[arg-type]
-        probe = LinearProbe(info, tensors[f"{info.name}.weight"], tensors[f"{info.name}.bias"])
+        probe = LinearProbe(info, *(tensors[f"{info.name}.{part}"] for part in info.parts))
         if probe.weight.shape[1] != dim:
             raise ValueError(f"{path}: probe {info.name} reads {probe.weight.shape[1]} features, the model gives {dim}")
         probes[info.name] = probe

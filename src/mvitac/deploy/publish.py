@@ -18,6 +18,7 @@ from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
 from mvitac.evaluation.probe import fit_probe, scorable, score_rows, split_rows
+from mvitac.evaluation.regressors import Linear
 from mvitac.evaluation.scores import summarise
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.evaluation.value_scores import error_by_range
@@ -79,8 +80,12 @@ def _fit_probe(
         majority = float((labels[rows.test] == np.bincount(labels[rows.fitted]).argmax()).mean())
         about = {"accuracy": record["accuracy"], "majority": majority, "num_test": len(rows.test)}
         info = ProbeInfo(**known, classes=task.classes, **about)
-    weight, bias = (torch.from_numpy(part).float() for part in fitted.weights())
-    return LinearProbe(info, weight, bias), {**known, "probe": "linear", **record}
+    parts = [*fitted.weights(), *([fitted.bounds] if isinstance(fitted, Linear) else [])]
+    return LinearProbe(info, *(torch.from_numpy(part).float() for part in parts)), {
+        **known,
+        "probe": "linear",
+        **record,
+    }
 
 
 def _error(target: dict[str, Any], true: np.ndarray, guess: np.ndarray) -> Error:

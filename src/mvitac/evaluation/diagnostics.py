@@ -79,6 +79,13 @@ def knn_votes(
 
 
 ALPHAS = (10.0, 100.0, 1e3, 1e4, 1e5)  # candidate strengths of the ridge regularisation of ``linear_probe``
+BEYOND = 0.5
+"""Ridge regression clips each feature at this share of its range in the fitted rows, below and above that range.
+
+After a ReLU, a feature may be 0 in all fitted rows but one. Its standard deviation is then so small that an ordinary value
+in another row comes to thousands of them, and to predictions of metres where millimetres are measured. Leaving such
+features out instead would lose what only few rows have, such as contact.
+"""
 
 
 def linear_probe(
@@ -89,18 +96,29 @@ def linear_probe(
     Its strength is chosen on a fifth of the ``groups`` of the training rows; the final fit uses all of them. It costs
     milliseconds where logistic regression costs seconds. For classes, give one column per class and take the largest.
     """
-    mean, std = train.mean(0), train.std(0) + 1e-6
-    # A dimension that is not finite counts as constant.
-    x, new = (((z - mean) / std).nan_to_num(0.0, 0.0, 0.0) for z in (train, new))
     y = targets.float()
     names = torch.unique(groups)
     names = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
     held = torch.isin(groups, names[: len(names) // 5])
     alpha = 100.0
     if held.any():
-        fits = {a: _ridge(x[~held], y[~held], x[held], a) for a in ALPHAS}
-        alpha = min(ALPHAS, key=lambda a: float((fits[a] - y[held]).square().sum()))
-    return _ridge(x, y, new, alpha)
+        x, z = _standardised(train[~held], train[held])
+        errors = {a: float((_ridge(x, y[~held], z, a) - y[held]).square().sum()) for a in ALPHAS}
+        alpha = min(errors, key=errors.__getitem__)
+    x, z = _standardised(train, new)
+    return _ridge(x, y, z, alpha)
+
+
+def _standardised(train: Tensor, new: Tensor) -> tuple[Tensor, Tensor]:
+    """Both in the mean and standard deviation of ``train``, ``new`` clipped (``BEYOND``).
+
+    A dimension that is not finite counts as constant.
+    """
+    mean, std = train.mean(0), train.std(0) + 1e-6
+    least, most = train.amin(0), train.amax(0)
+    clipped = new.clamp(least - BEYOND * (most - least), most + BEYOND * (most - least))
+    x, z = (((part - mean) / std).nan_to_num(0.0, 0.0, 0.0) for part in (train, clipped))
+    return x, z
 
 
 def _ridge(x: Tensor, y: Tensor, new: Tensor, alpha: float) -> Tensor:

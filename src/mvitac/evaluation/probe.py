@@ -16,7 +16,7 @@ from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.evaluation.classifiers import Classifier, Constant, fit_knn, fit_linear, fit_papers
 from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
-from mvitac.evaluation.regressors import fit_curve, fit_neighbours, fit_ridge
+from mvitac.evaluation.regressors import Linear, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
 from mvitac.evaluation.sensors import Standardise, touch_features
 from mvitac.evaluation.trained_probes import TRAINED, fit_network
@@ -124,6 +124,8 @@ def probe_features(
     num = len(rows.fitted)
     predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
     predicted = predict(x[num:])
+    if isinstance(predict, Linear):
+        extra["clipped"] = predict.clipped(x[num:])
     if isinstance(task, Task) and task.event:
         held = _held_out(x[:num], pack, task, rows, kind, seed)
         extra = {**extra, "event": score_event(pack, task, rows.fitted, held, rows.test, predicted)}

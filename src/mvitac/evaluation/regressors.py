@@ -9,50 +9,80 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sklearn.linear_model import RidgeCV
-from sklearn.model_selection import PredefinedSplit
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.linear_model import Ridge, RidgeCV
 from sklearn.neighbors import KNeighborsRegressor
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import SplineTransformer, StandardScaler
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import SplineTransformer
 
 from mvitac.evaluation.classifiers import threadpools
+from mvitac.evaluation.diagnostics import BEYOND
 
 Regressor = Callable[[np.ndarray], np.ndarray]
 
 ALPHAS = tuple(10.0**k for k in range(-1, 6))
 """Candidate strengths of ridge regularisation, on standardised features and targets."""
 NEIGHBOURS = 20
-RARE = 0.003
-"""A feature that has one value in all but this share of the rows is left out of ridge regression."""
 
 
-class FeatureScaler(StandardScaler):
-    """Zero mean and unit variance; a feature that has one value in nearly all rows becomes 0.
+class Scaler(TransformerMixin, BaseEstimator):
+    """Zero mean and unit variance over the fitted rows; others are first clipped at ``low_`` and ``high_`` (``BEYOND``)."""
 
-    After a ReLU, a feature may be 0 in all rows but one. Its standard deviation is then so small that an ordinary value in
-    another row comes to thousands of them, and to predictions of metres where millimetres are measured.
-    """
-
-    def fit(self, X: np.ndarray, y: Any = None, sample_weight: Any = None) -> "FeatureScaler":
-        super().fit(X, y, sample_weight)
-        usual = np.median(X[:: len(X) // 1000 + 1], axis=0)  # of some rows, which is much faster and as good
-        rare = (usual != X).mean(axis=0) < RARE
-        self.scale_ = np.where(rare, np.inf, self.scale_)
+    def fit(self, x: np.ndarray, y: None = None) -> "Scaler":
+        least, most = x.min(0), x.max(0)
+        self.low_, self.high_ = least - BEYOND * (most - least), most + BEYOND * (most - least)
+        self.mean_, self.scale_ = x.mean(0), np.where(most > least, x.std(0), 1.0)
         return self
 
+    def transform(self, x: np.ndarray) -> np.ndarray:
+        return (x.clip(self.low_, self.high_) - self.mean_) / self.scale_
 
-def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> "tuple[Joined, list[float]]":
+
+@dataclass(frozen=True)
+class Linear:
+    """Ridge regression of each target on what ``before`` makes of the features."""
+
+    before: Pipeline  # a fitted ``Scaler``, and what follows it
+    ridges: list[tuple[Ridge, float, float]]  # of each standardised target, and its mean and standard deviation
+
+    @property
+    def scaler(self) -> Scaler:
+        return self.before[0]  # type: ignore[return-value]
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        x = self.before.transform(z)
+        return np.stack([ridge.predict(x) * std + mean for ridge, mean, std in self.ridges], axis=1)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, D]: features are clipped at these."""
+        return np.stack([self.scaler.low_, self.scaler.high_])
+
+    def clipped(self, z: np.ndarray) -> list[int]:
+        """How many features are clipped in any row of ``z``, and of how many."""
+        low, high = self.bounds
+        return [int(((z < low) | (z > high)).any(0).sum()), z.shape[1]]
+
+    def weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weight [T, D] and bias [T], with all scaling folded in: values = x W^T + b of features clipped at ``bounds``."""
+        weights = np.stack([ridge.coef_ / self.scaler.scale_ * std for ridge, _, std in self.ridges])
+        biases = np.array([ridge.intercept_ * std + mean for ridge, mean, std in self.ridges])
+        return weights, biases - weights @ self.scaler.mean_
+
+
+def fit_ridge(x: np.ndarray, y: np.ndarray, num_val: int) -> tuple[Linear, list[float]]:
     """Fit ridge regression on standardised features and targets; returns the regressor and each target's alpha.
 
-    Each alpha is chosen on the last ``num_val`` rows, which hold groups of their own. The final fit uses all rows.
+    Each alpha is the one with the least squared error on the last ``num_val`` rows, which hold groups of their own. The
+    final fit uses all rows.
     """
-    fitted = _fit_each(x, y, num_val, lambda: [FeatureScaler()])
-    return Joined(fitted), [float(pipeline[-1].alpha_) for pipeline, _, _ in fitted]
+    fitted = _fit_each(x, y, num_val, make_pipeline(Scaler()))
+    return fitted, [float(ridge.alpha) for ridge, _, _ in fitted.ridges]
 
 
 def fit_curve(x: np.ndarray, y: np.ndarray, num_val: int) -> Regressor:
     """Fit a smooth curve: ridge on cubic splines of each column of ``x``, for controls of a few columns."""
-    return Joined(_fit_each(x, y, num_val, lambda: [StandardScaler(), SplineTransformer(6, extrapolation="linear")]))
+    return _fit_each(x, y, num_val, make_pipeline(Scaler(), SplineTransformer(6, extrapolation="linear")))
 
 
 def fit_neighbours(x: np.ndarray, y: np.ndarray) -> Regressor:
@@ -61,42 +91,30 @@ def fit_neighbours(x: np.ndarray, y: np.ndarray) -> Regressor:
     for target in y.T:
         have = ~np.isnan(target)
         model = KNeighborsRegressor(n_neighbors=min(NEIGHBOURS, int(have.sum())), metric="cosine")
-        fitted.append((model.fit(x[have], target[have]), 0.0, 1.0))
-    return Joined(fitted)
+        fitted.append(model.fit(x[have], target[have]))
+    return lambda z: np.stack([model.predict(z) for model in fitted], axis=1)
 
 
-Fitted = tuple[Any, float, float]
-"""A scikit-learn regressor of one standardised target, and the target's mean and standard deviation."""
-
-
-def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, before: Callable[[], list[Any]]) -> list[Fitted]:
+def _fit_each(x: np.ndarray, y: np.ndarray, num_val: int, before: Pipeline) -> Linear:
     x = x.astype(np.float64)  # in float32 the normal equations of correlated features are ill-conditioned
-    held = np.where(np.arange(len(x)) < len(x) - num_val, -1, 0)  # -1: always fitted on, 0: held out
-    fitted = []
-    for target in y.T:
-        have = ~np.isnan(target)
-        mean, std = target[have].mean(), target[have].std() + 1e-12
-        both = len(set(held[have])) == 2
-        ridge = RidgeCV(ALPHAS, cv=PredefinedSplit(held[have]) if both else None)
-        with threadpools().limit(limits=1):  # as for logistic regression: threads wait longer than they compute
-            pipeline = make_pipeline(*before(), ridge).fit(x[have], (target[have] - mean) / std)
-        fitted.append((pipeline, mean, std))
-    return fitted
+    first = np.arange(len(x)) < len(x) - num_val
+    ridges = []
+    with threadpools().limit(limits=1):  # as for logistic regression: threads wait longer than they compute
+        part = before.fit(x[first]).transform(x) if first.any() else x
+        whole = before.fit(x).transform(x)
+        for target in y.T:
+            have = ~np.isnan(target)
+            mean, std = float(target[have].mean()), float(target[have].std()) + 1e-12
+            scaled = (target - mean) / std
+            alpha = _strength(part, scaled, have & first, have & ~first)
+            ridges.append((Ridge(alpha).fit(whole[have], scaled[have]), mean, std))
+    return Linear(before, ridges)
 
 
-@dataclass(frozen=True)
-class Joined:
-    """The regressors of all targets as one: features [N, D] to values [N, T]."""
-
-    fitted: list[Fitted]
-
-    def __call__(self, z: np.ndarray) -> np.ndarray:
-        return np.stack([model.predict(z) * std + mean for model, mean, std in self.fitted], axis=1)
-
-    def weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weight [T, D] and bias [T] of ridge regression, with all scaling folded in: values = x W^T + b."""
-        weights, biases = [], []
-        for (scaler, ridge), mean, std in self.fitted:
-            weights.append(ridge.coef_ / scaler.scale_ * std)
-            biases.append(ridge.intercept_ * std + mean - weights[-1] @ scaler.mean_)
-        return np.stack(weights), np.array(biases)
+def _strength(x: np.ndarray, y: np.ndarray, fitted: np.ndarray, held: np.ndarray) -> float:
+    """The alpha with the least squared error on the rows ``held``; without such rows, by leaving out row by row."""
+    if not fitted.any() or not held.any():
+        chosen: Any = RidgeCV(ALPHAS).fit(x[fitted | held], y[fitted | held])
+        return float(chosen.alpha_)
+    errors = [((Ridge(a).fit(x[fitted], y[fitted]).predict(x[held]) - y[held]) ** 2).mean() for a in ALPHAS]
+    return ALPHAS[int(np.argmin(errors))]

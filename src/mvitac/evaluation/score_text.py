@@ -44,6 +44,13 @@ def error_text(target: dict[str, Any], key: str = "mae") -> str:
     return f"{target[key]:.3g} {target['unit']}"
 
 
+def clipped_text(task: dict[str, Any]) -> str:
+    """Which sources of one task's summary have test features that ridge regression clipped; "" if none has."""
+    cells = [(source, m, cell) for m, found in task.items() for source, cell in found.items() if cell.get("clipped")]
+    found = [f"{source} {m} {num} of {of}" for source, m, cell in cells for num, of in [cell["clipped"]] if num]
+    return f"test features far beyond the fitted rows were clipped: {', '.join(found)}" if found else ""
+
+
 def lead_text(event: dict[str, Any]) -> str:
     """How early the alarms of an event are, such as '480 [320, 640] ms' before its onset; negative = after it."""
     lead, unit = event["lead"], event["unit"]

@@ -60,6 +60,8 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
         whole = pool_values(parts) if "group_sums" in parts[0] else _pool_classes(parts)
         if leaks := leaks_in(parts):
             whole["leak"] = leaks
+        if clipped := most_clipped(parts):
+            whole["clipped"] = clipped
         if all("event" in part for part in parts):
             whole["event"] = pool_events([part["event"] for part in parts])
         pooled.append({**{key: parts[0][key] for key in keys}, **whole})
@@ -99,6 +101,11 @@ def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[di
     return found
 
 
+def most_clipped(records: Sequence[dict[str, Any]]) -> list[int]:
+    """The largest number of features that ridge clipped in test rows, and of how many; [] of records without ridge."""
+    return max((record["clipped"] for record in records if "clipped" in record), default=[])
+
+
 def leaks_in(records: Sequence[dict[str, Any]]) -> str:
     """The leaks of records (``evaluation.leaks``), without repetition; controls and records of 0.1.0 have none."""
     return "; ".join(dict.fromkeys(record["leak"] for record in records if record.get("leak")))
@@ -108,7 +115,8 @@ def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[
     """Scores as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``).
 
     Of values, the score is R2, and "targets" has the scores of each target (``targets_of``). With one test group R2 has
-    no lower end: ``low`` is None. Of a task with an event, "event" has its scores (``event_of``).
+    no lower end: ``low`` is None. "clipped" is ``most_clipped`` of ridge regression. Of a task with an event, "event" has
+    its scores (``event_of``).
     """
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
@@ -120,6 +128,8 @@ def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[
             cell["targets"] = targets_of(found)
         if all("event" in record for record in found):
             cell["event"] = event_of([record["event"] for record in found])
+        if clipped := most_clipped(found):
+            cell["clipped"] = clipped
         if leaks := leaks_in(found):
             cell["leak"] = leaks
         summary.setdefault(task, {}).setdefault(modality, {})[source] = cell

@@ -5,6 +5,7 @@ Shapes: B images, D features (a probe on both modalities reads vision, then touc
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -33,6 +34,7 @@ class _Asked:
 class ProbeInfo(_Asked):
     """Task, modality and test score of a probe of classes."""
 
+    parts: ClassVar[tuple[str, ...]] = ("weight", "bias")  # tensors of its ``LinearProbe``
     classes: tuple[str, ...]
     accuracy: float  # accuracy on the test split of the dataset it was trained on
     majority: float  # accuracy on the same rows of always predicting the most frequent class
@@ -70,6 +72,7 @@ class Error:
 class ValueInfo(_Asked):
     """Task, modality and test errors of a probe of values."""
 
+    parts: ClassVar[tuple[str, ...]] = ("weight", "bias", "bounds")
     targets: tuple[Target, ...]
     errors: tuple[Error, ...]  # one for each target
     num_test: int
@@ -87,13 +90,15 @@ class ValueInfo(_Asked):
 class LinearProbe(nn.Module):
     """softmax(features W^T + b) for classes; features W^T + b, in the units of the targets, for values.
 
-    ``weight`` is [K, D] or [T, D], ``bias`` [K] or [T], both fp32.
+    ``weight`` is [K, D] or [T, D], ``bias`` [K] or [T]. Features of values are first clipped at ``bounds`` [2, D]: lower
+    and upper ones. All are fp32.
     """
 
     weight: Tensor
     bias: Tensor
+    bounds: Tensor | None
 
-    def __init__(self, info: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor) -> None:
+    def __init__(self, info: ProbeInfo | ValueInfo, weight: Tensor, bias: Tensor, bounds: Tensor | None = None) -> None:
         super().__init__()
         num = len(info.outputs)
         if weight.ndim != 2 or weight.shape[0] != num or tuple(bias.shape) != (num,):
@@ -102,15 +107,23 @@ class LinearProbe(nn.Module):
                 f" do not fit {num} {'classes' if isinstance(info, ProbeInfo) else 'targets'}: expected [{num}, D] and"
                 f" [{num}]"
             )
-        if weight.dtype != torch.float32 or bias.dtype != torch.float32:
+        if bounds is not None and bounds.shape != (2, weight.shape[1]):
+            raise ValueError(
+                f"probe {info.name}: bounds of shape {tuple(bounds.shape)}: expected [2, {weight.shape[1]}]"
+            )
+        tensors = [weight, bias] + ([] if bounds is None else [bounds])
+        if any(tensor.dtype != torch.float32 for tensor in tensors):
             raise ValueError(f"probe {info.name}: weights are {weight.dtype}, expected torch.float32")
-        if not (weight.isfinite().all() and bias.isfinite().all()):
+        if not all(tensor.isfinite().all() for tensor in tensors):
             raise ValueError(f"probe {info.name}: its weights are not all finite")
         self.info = info
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)
+        self.register_buffer("bounds", bounds)
 
     def forward(self, features: Tensor) -> Tensor:
         """Probabilities [B, K] or values [B, T] of ``features`` [B, D]."""
+        if self.bounds is not None:
+            features = features.clamp(self.bounds[0], self.bounds[1])
         found = nn.functional.linear(features, self.weight, self.bias)
         return torch.softmax(found, dim=1) if isinstance(self.info, ProbeInfo) else found

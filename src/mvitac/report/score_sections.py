@@ -7,6 +7,7 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import (
     MODALITY_ORDER,
     cell_text,
+    clipped_text,
     columns_of,
     error_text,
     percent,
@@ -102,7 +103,10 @@ def _target_table(study: Study, task: str, found: dict[str, Any]) -> str:
         error = ("" if c is None else error_text(c) for c in cells)
         rows.append([source, *(text for pair in zip(score, error, strict=True) for text in pair)])
     heads = [head for m in columns_of(found) for head in (f"{m}: R2 %", "mean absolute error")]
-    return html.table([task, *heads], rows, muted=set(sources_of(found)) - set(study.sources), label=f"{task}: targets")
+    table = html.table(
+        [task, *heads], rows, muted=set(sources_of(found)) - set(study.sources), label=f"{task}: targets"
+    )
+    return table + (html.paragraph(f"{clipped}.") if (clipped := clipped_text(found)) else "")
 
 
 def _every_probe(records: Sequence[dict[str, Any]]) -> list[str]:

@@ -10,6 +10,7 @@ from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.score_text import (
     cell_text,
+    clipped_text,
     columns_of,
     covered,
     error_text,
@@ -59,6 +60,8 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
         print(text_table(title, [f"{score} %", *modalities], cells), file=file)
         if score == "R2":
             print(_targets(name, task), file=file)
+        if clipped := clipped_text(task):
+            print(clipped, file=file)
         if events := event_rows(task):
             print(text_table(event_title(name, task), EVENT, events, words=2), file=file)
     _print_notes(result, trained, file)

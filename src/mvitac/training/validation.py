@@ -1,9 +1,10 @@
 """Evaluation during training on held-out groups (split val, never test): what the features are worth, from step 0 on.
 
 A linear probe, kNN accuracy, retrieval and signs of collapse. The start (step 0) is the baseline. The best weights are
-those with the highest mean of the linear probe over tasks and modalities: accuracy of classes, R2 of values (below 0: 0).
+those with the lowest errors of the linear probe (``_error``).
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from mvitac.run import Run
 from mvitac.training.log import Log
 
 NUM_EVAL_TRAIN, NUM_EVAL_VAL = 1024, 512
+MIN_GROUPS = 10  # with fewer groups in val, an interval over them says nothing
 Cells = dict[str, Tensor]
 """Task and modality -> [targets, groups, 2]: the sum of errors of each group, and that of a guess. A score is 1 - their
 ratio: accuracy of a class (errors: wrong rows; guess: all rows), R2 of a value (squared errors; those of the mean)."""
@@ -49,8 +51,8 @@ class Validation:
         self.method.train()
         if step == 0:
             self.kept["start"] = cells
-        if cells and (mean := _mean(cells)) > self.kept.get("best", -1.0):
-            self.kept |= {"best": mean, "best_step": step}
+        if cells and (error := _error(cells)) < self.kept.get("best", math.inf):
+            self.kept |= {"best": error, "best_step": step}
             if self.run.eval_every:
                 model.save(self.out / BEST)
                 self.method.train()
@@ -63,7 +65,8 @@ class Validation:
         text = verdict(start, cells, self.pack.spec.group_by)
         best = self.kept.get("best_step")
         if self.run.eval_every and cells and best is not None:
-            text += f"; best at step {best} ({100 * (self.kept['best'] - _mean(start)):+.1f}, {BEST})"
+            change = 100 * (self.kept["best"] / _error(start) - 1)
+            text += f"; best at step {best} (errors {change:+.0f} % in the mean over tasks, {BEST})"
         return text
 
 
@@ -77,22 +80,12 @@ def validate(model: Model, pack: Pack, run: Run) -> tuple[dict[str, float], Cell
     if not isinstance(pack, MixedPack):
         return _validate(model, pack, run)
     values: dict[str, float] = {}
-    found: list[Cells] = []
+    cells: Cells = {}
     for part in pack.parts:
-        own, cells = _validate(model, pack.alone(part), run)
+        own, found = _validate(model, pack.alone(part), run)
         values |= {f"{part} {name}": value for name, value in own.items()}
-        found.append({f"{part} {name}": cell for name, cell in cells.items()})
-    return values, _side_by_side(found)
-
-
-def _side_by_side(parts: list[Cells]) -> Cells:
-    """The cells of all parts, each with a column for every group of every part; those of other parts are 0."""
-    nums = [next(iter(cells.values())).shape[1] if cells else 0 for cells in parts]
-    joined: Cells = {}
-    for i, cells in enumerate(parts):
-        around = (0, 0, sum(nums[:i]), sum(nums[i + 1 :]))
-        joined |= {name: torch.nn.functional.pad(cell, around) for name, cell in cells.items()}
-    return joined
+        cells |= {f"{part} {name}": cell for name, cell in found.items()}
+    return values, cells
 
 
 @torch.no_grad()
@@ -199,37 +192,53 @@ def _scores(cell: Tensor) -> Tensor:
     return 1 - errors / guess.clamp(min=1e-12)
 
 
-def _mean(cells: Cells) -> float:
-    """Mean score over tasks and modalities; an R2 below 0, worse than the mean value, counts as 0."""
-    return float(torch.stack([_scores(cell).clamp(min=0).mean() for cell in cells.values()]).mean())
+def _error(cells: Cells) -> float:
+    """Geometric mean over tasks and modalities of the error, as a share of that of a guess; under .01 it counts as .01.
+
+    Halving it counts alike for every task. A mean of accuracies and R2, which has no lower end, would follow the worst R2.
+    """
+    each = [(1 - _scores(cell)).clamp(min=0.01).log().mean() for cell in cells.values()]
+    return float(torch.stack(each).mean().exp())
 
 
 def verdict(start: Cells, end: Cells, by: str) -> str:
-    """One sentence: are the features better, level or worse than at the start, by the linear probe on split val?
+    """One sentence: what of the linear probe's scores on split val rose since the start, and what fell.
 
-    The interval (95 %) is over groups, of the mean over tasks and modalities: a jackknife that leaves out one group at a
-    time. Level means that it includes 0. It leaves out the variation between seeds.
+    Each interval (95 %) is over groups: a jackknife that leaves out one at a time. Variation between seeds is not in it.
     """
-    same = [name for name in sorted(start.keys() & end.keys()) if start[name].shape == end[name].shape]
-    names = [name for name in same if _groups(end[name]).sum() > 1]
-    every = torch.stack([_groups(end[name]) for name in names]).any(0).nonzero()[:, 0] if names else torch.empty(0)
-    if (num := len(every)) < 2:
-        found = f"one labelled {by}" if same else "no labels of two classes, and no values,"
-        return f"{found} in split val: nothing says whether the features are better than at the start"
+    few = f"cannot tell with under {MIN_GROUPS} {by}s"
+    said: dict[str, list[str]] = {word: [] for word in ("rose", "fell", "neither", few)}
+    for name in sorted(start.keys() & end.keys()):
+        keep = _groups(end[name])
+        if start[name].shape != end[name].shape or not (num := int(keep.sum())):
+            continue
+        points, margin = _change(start[name][:, keep], end[name][:, keep])
+        text = f"{name.replace('linear ', '')} {points:+.1f}"
+        if num < MIN_GROUPS:
+            word = few
+        else:
+            word = "neither" if abs(points) <= margin else "rose" if points > 0 else "fell"
+            text += f" [{points - margin:+.1f}, {points + margin:+.1f}]"
+        said[word].append(text)
+    found = "; ".join(f"{word}: {', '.join(texts)}" for word, texts in said.items() if texts)
+    if not found:
+        return "no labels of two classes, and no values, in split val: nothing says what the features are worth"
+    return f"compared with the start (linear probe, points of accuracy or R2 on {by}s of val), {found}"
 
-    def gain(keep: Tensor) -> float:
-        before, after = ({name: cells[name][:, keep] for name in names} for cells in (start, end))
-        return 100 * (_mean(after) - _mean(before))
 
-    points = gain(every)
-    without = torch.tensor([gain(every[every != g]) for g in every])
-    margin = float(stdtrit(num - 1, 0.975) * ((num - 1) / num * (without - without.mean()).square().sum()).sqrt())
-    word = "level" if abs(points) <= margin else "better" if points > 0 else "worse"
-    interval = f"[{points - margin:+.1f}, {points + margin:+.1f}]"
-    return (
-        f"compared with the start, the features are {word}: {points:+.1f} points {interval}"
-        f" (linear probe on {num} {by}s of val, mean of {', '.join(name.replace('linear ', '') for name in names)})"
-    )
+def _change(start: Tensor, end: Tensor) -> tuple[float, float]:
+    """How many points a score has risen, and half the width of its interval over groups (0 for one group)."""
+
+    def gain(keep: Tensor) -> Tensor:
+        return 100 * (_scores(end[:, keep]).mean() - _scores(start[:, keep]).mean())
+
+    every = torch.arange(num := end.shape[1])
+    points = float(gain(every))
+    if num < 2:
+        return points, 0.0
+    without = torch.stack([gain(every[every != g]) for g in every])
+    squares = (num - 1) / num * float((without - without.mean()).square().sum())
+    return points, float(stdtrit(num - 1, 0.975)) * squares**0.5
 
 
 def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[str, Tensor]) -> dict[str, float]:
