@@ -17,12 +17,11 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from mvitac.data.build import build
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.folder import FolderConfig
 from mvitac.datasets.pack import PackConfig
-from mvitac.datasets.simulated import Materials, MaterialsConfig
 from mvitac.evaluation.evaluate import ProbeConfig, chosen, probe_runs
 from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.probe import split_rows
@@ -211,11 +210,6 @@ def test_columns_of_a_table_become_values(tmp_path: Path) -> None:
     assert set(pack.column("split")) == {"train", "val", "test"}
 
 
-def test_a_pack_without_values_has_the_digest_it_had(tmp_path: Path) -> None:
-    file = manifest(tmp_path, ["1"] * 8)
-    assert "values" not in FolderConfig(path=file).source().fingerprint()["options"]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -253,22 +247,6 @@ def test_a_name_is_one_task_and_a_column_has_one_unit() -> None:
     other = ValueTask(name="weight", targets=(Target(name="force_n", unit="mN"),))
     with pytest.raises(ValueError, match="two units, N and mN"):
         DataSpec(tasks=(), values=(ValueTask(name="force_n", targets=NEWTON), other), **kept)
-
-
-def test_a_cached_pack_from_before_values_gets_them_from_its_reader(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
-    data, spec = MaterialsConfig(num=40, touches=1, size=32), Materials.spec
-    with monkeypatch.context() as before:
-        before.setattr(Materials, "spec", lambda self: replace(spec(self), values=()))
-        old = data.open(quiet=True)
-    assert not old.spec.values and not Pack(old.path).spec.values
-    new = data.open(quiet=True)
-    assert new.path == old.path and new.digest == old.digest
-    (force,) = new.spec.values
-    assert force.targets == NEWTON
-    assert np.array_equal(new.values(force)[:, 0], old.column("force_n"))
 
 
 def test_data_without_labels_and_values_says_where_they_are_named(measured: Pack) -> None:

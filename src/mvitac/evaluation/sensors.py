@@ -13,9 +13,9 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import update_bn
 
-from mvitac.data.joined_pack import JoinedPack
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
+from mvitac.data.several import JoinedPack
 from mvitac.data.spec import listed
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.classifiers import fit_linear
