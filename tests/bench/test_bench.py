@@ -188,6 +188,25 @@ def test_what_is_not_there_is_said(results: list[Path], root: Path, capsys: pyte
     assert not list((root / "nothing").glob("*.json"))
 
 
+@pytest.mark.parametrize(
+    ("given", "wrong", "says"),
+    [
+        ("folds = 3", "folds = -3", "folds -3: give 2 or more"),
+        ("folds = 3", "folds = 3\nval_every = 0", "val_every 0: give 1 or more"),
+        ('probes = ["linear"]', "probes = []", "needs at least one of probes, untrained and sets"),
+        ("labels = [0.3]", "labels = [nan]", "task 'pattern': labels nan: give fractions above 0 and below 1"),
+        ('modalities = ["vision"]', "modalities = []", "task 'pattern' has no modalities"),
+        ("seed = 0", "seed = -1", "seed -1: give a number >= 0"),
+    ],
+)
+def test_a_suite_that_asks_for_nothing_is_told(
+    tmp_path: Path, given: str, wrong: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert given in SUITE
+    (tmp_path / "toys.toml").write_text(SUITE.replace(given, wrong, 1))
+    assert says in said(capsys, "bench", RANDOM.format(0), "--suite", tmp_path / "toys.toml")
+
+
 def test_folds_test_every_group_once(root: Path, results: list[Path]) -> None:
     opened = open_set(find_suite(str(root / "toys.toml")).sets[1], root)
     assert not isinstance(opened, str) and len(opened.packs) == 3

@@ -195,6 +195,13 @@ def wrong():
 
 def six():
     return nn.Conv2d(6, 5, 4, 4), {}
+
+class Nothing(nn.Module):
+    def forward(self, x):
+        return x[:, :0, 0, 0]
+
+def nothing():
+    return Nothing(), {}
 """
 
 
@@ -228,6 +235,7 @@ def test_onnx_torchscript_and_python_files(pack: Pack, tmp_path: Path, monkeypat
         ("bare", "a torch module and a dict"),
         ("wrong", "'sides'"),
         ("six", "does not take images"),
+        ("nothing", r"nets_here:nothing: the network returned \[2, 0\] for two images"),
         ("no", "cannot be imported"),
     ):
         with pytest.raises(ValueError, match=words):

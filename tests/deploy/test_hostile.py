@@ -203,6 +203,7 @@ RUNS: list[tuple[str, Change, str]] = [
     ("a field that is none", setting("exec", value="rm"), "unknown field in run 'exec'"),
     ("a list for a number", setting("steps", value=[1]), "steps"),
 ]
+NO_SPREAD = {"name": "n", "unit": "N", "edges": [], "spread": []}
 ABOUT: list[tuple[str, str, Change, str]] = [
     ("artifact", "file above", above, "names others than"),
     ("artifact", "files are a list", setting("files", value=["model.safetensors"]), "lacks files"),
@@ -215,6 +216,7 @@ ABOUT: list[tuple[str, str, Change, str]] = [
     ("onnx", "no tolerance", lambda trap, about: about.pop("tolerance"), "is damaged"),
     ("onnx", "a number for a class", setting("classes", value={"pattern": [1]}), "expected str, got 1"),
     ("onnx", "a value without unit", setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
+    ("onnx", "no spread", setting("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
     ("onnx", "a number for outputs", setting("outputs", value=1e308), "is damaged"),
     ("onnx", "no inputs", setting("inputs", value={}), "cannot be run"),
 ]

@@ -260,6 +260,9 @@ def test_pretrain_warns_of_seen_test_rows(
 def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.safetensors").write_text("no tensors")
+    nan = build_trunk(smoke(pack).encoder, 3).state_dict()
+    nan[min(nan)].fill_(float("nan"))
+    save_file(nan, tmp_path / "nan.safetensors")
     with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
         train(smoke(pack, checkpoint_every=1, eval_every=0), tmp_path / "unfinished", quiet=True)
     touch = toy_pack(tmp_path / "touch", vision_channels=0)
@@ -271,6 +274,7 @@ def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, caps
         (["--init", str(tmp_path / "empty")], "is a folder without model.safetensors: give that of a finished run"),
         (["--init", str(tmp_path / "unfinished")], "its run is not finished, continue it with --resume"),
         (["--init", str(tmp_path / "text.safetensors")], "cannot be read as safetensors"),
+        (["--init", str(tmp_path / "nan.safetensors")], "nan.safetensors holds NaN or infinite numbers: "),
         (
             [f"--init={smoke_run}", "--encoder.trunk", "resnet10t"],
             "does not fit this run (vision: its trunk is mvitac_tiny",

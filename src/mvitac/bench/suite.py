@@ -38,6 +38,13 @@ class SuiteTask:
     modalities: tuple[Literal["touch", "vision", "both"], ...]  # features to probe
     labels: tuple[float, ...] = ()  # fractions of the labels with which the linear probe is fitted once more
 
+    def __post_init__(self) -> None:
+        for share in self.labels:
+            if not 0 < share < 1:
+                raise ValueError(f"task {self.name!r}: labels {share}: give fractions above 0 and below 1")
+        if not self.modalities:
+            raise ValueError(f"task {self.name!r} has no modalities: give touch, vision or both")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Form:
@@ -65,6 +72,14 @@ class SuiteSet:
     val_every: int = 2  # of the groups tested in the next fold, every n-th chooses the regularisation
     names: tuple[str, ...] = ()  # what owners of encoders call this data in their list of training data
 
+    def __post_init__(self) -> None:
+        if self.folds < 0 or self.folds == 1:
+            raise ValueError(f"set {self.name!r}: folds {self.folds}: give 2 or more, or 0 for the data's own split")
+        if self.val_every < 1:
+            raise ValueError(f"set {self.name!r}: val_every {self.val_every}: give 1 or more")
+        if not self.tasks or not self.forms:
+            raise ValueError(f"set {self.name!r} needs at least one task and one form")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
@@ -78,6 +93,10 @@ class Suite:
     sets: tuple[SuiteSet, ...]
 
     def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"suite {self.name!r}: seed {self.seed}: give a number >= 0")
+        if not (self.probes and self.untrained and self.sets):
+            raise ValueError(f"suite {self.name!r} needs at least one of probes, untrained and sets")
         names = [one.name for one in self.sets]
         if len(set(names)) < len(names):
             raise ValueError(f"suite {self.name!r}: two sets have one name")

@@ -1,6 +1,5 @@
 """Several packs as one training set."""
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,8 +39,8 @@ class MixConfig(DatasetConfig):
     def __post_init__(self) -> None:
         self.frame_window()
         check_request(self.size or 256, self.workers, store=self.store, quality=self.quality)
-        if not 0 <= self.temperature < math.inf:
-            raise ValueError(f"temperature {self.temperature}: give a number >= 0")
+        if not 0 <= self.temperature <= 10:
+            raise ValueError(f"temperature {self.temperature}: give a number from 0 to 10")
         names = [name for name, _, _ in self.named_parts()]
         for name in names:
             if names.count(name) > 1:

@@ -39,6 +39,10 @@ class _Target:
     edges: tuple[float, ...]
     spread: tuple[float, ...]
 
+    def __post_init__(self) -> None:
+        if len(self.spread) != len(self.edges) + 1 or list(self.edges) != sorted(self.edges):
+            raise ValueError(f"{len(self.edges)} edges and {len(self.spread)} spreads: give n ascending and n + 1")
+
 
 class Engine:
     """An opened export: call it with uint8 [B, S, S, C] by modality to get float32 [B, ...] by output name.

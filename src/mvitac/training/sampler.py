@@ -57,6 +57,7 @@ class PartOrder:
 
     def __init__(self, run: Run, pack: MixedPack, rows: np.ndarray, per_epoch: int, order: Order) -> None:
         self.seed, self.order, self.shape = run.seed, order, (per_epoch, run.batch_size)
+        self.part_of = pack.part_of
         self.rows = [rows[pack.part_of[rows] == number] for number in range(len(pack.parts))]
         self.touch_groups = [pack.touch_groups[own] if run.sampler != "shuffle" else None for own in self.rows]
         self.shares = pack.shares(rows)
@@ -76,7 +77,18 @@ class PartOrder:
         for part in np.unique(parts).tolist():
             wanted = self._sequence(part, int(first[part]) * self.length, int(last[part]) * self.length)
             drawn[parts == part] = wanted.reshape(-1, self.length)
-        return drawn.reshape(self.shape)
+        return self._apart(drawn.reshape(self.shape))
+
+    def _apart(self, drawn: np.ndarray) -> np.ndarray:
+        """Exchange what a batch holds twice, where a pass ends, for a row of the same part in the nearest batch."""
+        for number, batch in enumerate(drawn):
+            for place in np.setdiff1d(np.arange(len(batch)), np.unique(batch, return_index=True)[1]):
+                same = np.argwhere(self.part_of[drawn] == self.part_of[batch[place]])
+                for other in same[np.argsort(abs(same[:, 0] - number), kind="stable")]:
+                    if drawn[*other] not in batch and batch[place] not in drawn[other[0]]:
+                        batch[place], drawn[*other] = drawn[*other], batch[place]
+                        break
+        return drawn
 
     def _sequence(self, part: int, start: int, end: int) -> np.ndarray:
         """Rows ``start`` to ``end`` of the endless sequence of ``part``."""

@@ -79,7 +79,7 @@ class ExternalEncoder(nn.Module):
             raise ValueError(
                 f"the network does not take images {list(shape)} ({brief(error)}): give its size and frames"
             ) from None
-        if found.ndim != 2 or len(found) != 2:
+        if found.ndim != 2 or len(found) != 2 or not found.shape[1]:
             raise ValueError(f"the network returned {list(found.shape)} for two images: expected features [2, D]")
         self.num_features = self.width = found.shape[1]
 
