@@ -152,6 +152,22 @@ def tactip_shear(folder: Path, out: Path) -> None:
     write(rows, out / "tactip_shear.csv", folder, ("touch",))
 
 
+def tactip_pairs(folder: Path, out: Path) -> None:
+    """Pose by the pins alone, of taps on a surface and on an edge, whose angle is asked for as sine and cosine.
+
+    ``sim``, the depth image of the same pose, is left out: it is nearly the answer. Every tap is independent.
+    """
+    rows = []
+    for i, row in enumerate(row for row in read(folder / "manifest.csv") if row["motion"] == "tap"):
+        angle, on_edge = np.deg2rad(float(row["Rz_deg"])), row["surface"] == "edge_2d"
+        surface = {f"surface_{name}": row[name] for name in ("z_mm", "Rx_deg", "Ry_deg")}
+        edge = {f"edge_{name}": row[name] for name in ("y_mm", "z_mm")}
+        edge |= {"edge_sine": f"{np.sin(angle):.6f}", "edge_cosine": f"{np.cos(angle):.6f}"}
+        about = {"touch": row["real"], "split": row["split"], "block": f"{row['surface']}-{row['split']}-{i // 10:04d}"}
+        rows.append(about | surface | edge | dict.fromkeys(surface if on_edge else edge, ""))
+    write(rows, out / "tactip_pairs.csv", folder, ("touch",))
+
+
 def tactip_rigs(folder: Path, out: Path) -> None:
     """One set for both questions: columns ``same_`` and ``other_`` hold the values of the taps that each of them uses.
 
@@ -168,7 +184,9 @@ def tactip_rigs(folder: Path, out: Path) -> None:
     write(rows, out / "tactip_rigs.csv", folder, ("touch",))
 
 
-MANIFESTS = {make: make.__name__ for make in (slip_grasp, slip_gsmini, physiclear, vt60, wedge_force, tactip_shear)}
+MANIFESTS = {
+    make: make.__name__ for make in (slip_grasp, slip_gsmini, physiclear, vt60, wedge_force, tactip_shear, tactip_pairs)
+}
 MANIFESTS |= {wedge_force_pairs: "wedge_force", tactip_rigs: "tactip_shear"}
 """What makes a manifest -> the dataset's folder."""
 

@@ -387,7 +387,7 @@ def test_genuine_vt60(tmp_path: Path) -> None:
 
 def test_the_suite_of_the_bench_reads_the_clones(clones: Path, tmp_path: Path) -> None:
     """By their readers, each group tested once; manifests of copies are the other form."""
-    found = {one.name: one for one in find_suite("real-small-v2").sets}
+    found = {one.name: one for one in find_suite("real-small-v3").sets}
     for name in SETS:
         clone, manifest = found[name].forms
         (tmp_path / clone.at["path"]).symlink_to(clones / name)

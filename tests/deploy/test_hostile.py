@@ -21,7 +21,6 @@ import torch
 
 import mvitac
 from mvitac.bench.encoder import About, describe
-from mvitac.bench.result import VOLATILE
 from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.deploy.card import _harmless
@@ -31,8 +30,6 @@ from mvitac.evaluation.run_names import names_of
 from mvitac.nn.encoders import EncoderConfig, build_trunk
 from mvitac.system.files import digest, digest_file, read_json, write_json
 from support.training_runs import smoke
-
-RESULT = Path(__file__).parents[2] / "benchmarks" / "board" / "sim-v2" / "sim-v2-resnet18-random.json"
 
 _touched: list[str] | None = None
 
@@ -249,49 +246,6 @@ def test_a_description_that_is_none_is_refused(
     with pytest.raises(ValueError, match=says):
         mvitac.load(folder) if kind == "artifact" else Engine(folder)
     check(list(touched), trap)
-
-
-def record(name: str, value: Any) -> Change:
-    return lambda trap, result: result["blocks"][0]["records"][0].update({name: value})
-
-
-RESULTS: list[tuple[str, Change]] = [
-    ("check", record("accuracy", [])),
-    ("check", record("group_correct", {})),
-    ("check", lambda trap, result: result.update(blocks=["x"])),
-    ("board", lambda trap, result: result["encoder"].update(licence=["x"])),
-    ("board", lambda trap, result: result["blocks"][0].pop("data")),
-]
-
-
-def forged_result(trap: Path, out: Path, change: Change) -> Path:
-    """A result of the bench after ``change``, with a digest that fits."""
-    result = json.loads(RESULT.read_text())
-    change(trap, result)
-    result["digest"] = digest({key: part for key, part in result.items() if key not in VOLATILE})
-    out.write_text(json.dumps(result))
-    return out
-
-
-@pytest.mark.parametrize(("command", "change"), RESULTS)
-def test_results_of_a_bench(
-    trap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, change: Change
-) -> None:
-    file = forged_result(trap, tmp_path / "result.json", change)
-    assert main(["bench", command, str(file), *(["--out", f"{tmp_path}/x.html"] if command == "board" else [])]) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert f"{file} is damaged: a field is missing or of another kind" in error and not (tmp_path / "x.html").exists()
-
-
-def test_names_in_results_are_text(trap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    evil = "\x1b]0;owned\x07"
-    file = forged_result(trap, tmp_path / "result.json", lambda trap, result: result["encoder"].update(name=evil))
-    assert main(["bench", "check", str(file)]) == 2
-    assert "control character" in (error := capsys.readouterr().err) and "\x1b" not in error
-    evil = "<img src=http://198.51.100.7>"
-    file = forged_result(trap, tmp_path / "result.json", lambda trap, result: result["encoder"].update(name=evil))
-    assert main(["bench", "board", str(file), "--out", str(tmp_path / "x.html")]) == 0
-    assert "&lt;img src" in (page := (tmp_path / "x.html").read_text()) and "<img src=http" not in page
 
 
 def test_a_size_that_no_pack_has_is_refused(copy: Path, trap: Path) -> None:

@@ -1,6 +1,6 @@
 """The board: one static page that compares results of one suite. Tasks down, encoders across, controls first."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -8,19 +8,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from mvitac.bench.charts import against_labels, against_parameters, at_a_glance
-from mvitac.bench.result import problems, read_result, records_of, suite_of
+from mvitac.bench.result import GUESS, pinned_of, problems, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
 from mvitac.evaluation.intervals import paired_difference
 from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
 from mvitac.evaluation.scores import by_cell, summarise
 from mvitac.report import html as page
-from mvitac.report.figures import to_svg
+from mvitac.report.figures import bars, to_svg
 from mvitac.report.tables import probe_name
 from mvitac.system.files import fields_of, write_atomic
 
-GUESS = "majority or mean"
 CONTROLS = (GUESS, "border", "pixels", "untrained")
 """Controls from left to right; the data's own columns come after the first."""
 
@@ -34,7 +32,7 @@ class Row:
     modality: str
     records: dict[str, list[dict[str, Any]]]  # of the probe, one for each seed
     cells: dict[str, dict[str, Any]]  # their summary (``scores.summarise``)
-    few: dict[str, list[tuple[float, dict[str, Any]]]]  # (fraction of the labels, summary), from few labels to all
+    few: dict[str, dict[float, dict[str, Any]]]  # name -> fraction of the labels -> summary, from few labels to all
 
     @cached_property
     def score(self) -> str:
@@ -99,6 +97,8 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
                 not_run.append(f"{one.name}, {ask.name}: {name} was not run: {block['not_run']}")
             else:
                 forms.setdefault((block["form"], block["data"]["rows"]), []).append((name, block))
+                left_out = block["left_out"].items()
+                not_run += [f"{one.name}, {ask.name}, {m}: {name} was not run: {why}" for m, why in left_out]
         several = len({form for form, _ in forms}) > 1
         for (form, _), found in forms.items():
             task = f"{one.name}: {ask.name}{f' ({form})' if several else ''}"
@@ -122,8 +122,8 @@ def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: Su
     for modality in (m for m in ask.modalities if m in found):
         own = {**none, **found[modality]}
         lists = {name: cells.get((ask.name, modality, name)) or cells[ask.name, "none", name] for name in own}
-        few = {n: [(s, at[modality][n]) for s, at in shares.items() if n in at.get(modality, ())] for n in own}
-        whole = {name: [*line, (1.0, own[name])] for name, line in few.items() if line}
+        few = {n: {s: at[modality][n] for s, at in shares.items() if n in at.get(modality, ())} for n in own}
+        whole = {name: {**line, 1.0: own[name]} for name, line in few.items() if line}
         rows.append(Row(task, tested_on({modality: own}, by), modality, lists, own, whole))
     return rows
 
@@ -145,9 +145,6 @@ def order_of(row: Row, names: Sequence[str]) -> str:
     return text + (f"; not ordered because of LEAK: {', '.join(left_out)}" if left_out else "")
 
 
-GLANCE = """Accuracy %, or R2 % of values. The shade of a cell rises from the untrained trunk to the best of its column; one
-without a shade is no better than an untrained trunk, or has an L: LEAK or LEAK?, see below. Encoders stand by their mean
-rank, controls below them."""
 SCORES = """Mean and 95 % interval over test groups (and seeds, where an encoder has several), in percent: accuracy, or R2
 of values. Controls come first. Encoders follow by their mean rank, which is for reading only: the order of each task is
 below. An empty cell was not run."""
@@ -170,16 +167,13 @@ def _page(board: Board) -> str:
         f"<ul class='chips'>{''.join(f'<li>{escape(k)} <b>{escape(v)}</b></li>' for k, v in chips)}</ul>"
     )
     orders = [[f"{row.task}, {row.modality}", order_of(row, board.encoders)] for row in board.rows]
-    drawn = (
-        ("parameters", "Score against parameters", [*_by_parameters(board)]),
-        ("labels", "Score against labels", [*_by_labels(board)]),
-    )
+    few = [row for row in board.rows if row.few]
     sections = [
-        ("glance", "At a glance", _glance(board)),
         ("scores", "Scores", _scores(board)),
+        ("bars", "Bars", page.grid(page.figure(_bars(board, row)) for row in board.rows)),
+        *([("labels", "Few labels", _few(board, few))] if few else []),
         ("order", "Order", _text_table(ORDER, ["", "from best to worst"], orders)),
         ("encoders", "Encoders and leaks", _encoders(board)),
-        *((name, title, page.grid(figures)) for name, title, figures in drawn if figures),
         ("data", "Data", _data(board)),
     ]
     return page.html_page(f"mvitac bench: {suite.name}", head, sections, FOOT)
@@ -187,17 +181,6 @@ def _page(board: Board) -> str:
 
 def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return page.paragraph(" ".join(intro.split())) + page.table(columns, rows, words=True, label=columns[1])
-
-
-def _glance(board: Board) -> str:
-    columns = []
-    for row in board.rows:
-        one, task = row.task.split(": ", 1)
-        what = f"{task}, {row.modality}" + (", R2" if row.score == "R2" else "")
-        columns.append((one, what, row.cells))
-    drawn = at_a_glance([*board.encoders, *board.controls[::-1]], columns)
-    svg = to_svg(drawn, "glance", "All scores at a glance; the numbers are in the table below")
-    return page.paragraph(" ".join(GLANCE.split())) + page.grid([page.figure(svg)], "wide")
 
 
 def _scores(board: Board) -> str:
@@ -244,20 +227,22 @@ def _leaks(result: dict[str, Any]) -> str:
     return ". ".join([*found, *(["LEAK? not known"] if UNKNOWN in marks else [])]) or "none found"
 
 
-def _by_parameters(board: Board) -> Iterator[str]:
-    for row in (row for row in board.rows if row.modality == "touch"):
-        sizes = {name: board.results[name]["encoder"]["parameters"] for name in board.encoders if name in row.cells}
-        points = {name: (each["touch"], row.cells[name]) for name, each in sizes.items()}
-        drawn = against_parameters(row.task, points, row.cells["untrained"]["mean"], f"{row.score} %, touch")
-        yield page.figure(to_svg(drawn, f"parameters {row.task}", f"{row.task} against parameters; numbers are above"))
+def _bars(board: Board, row: Row) -> str:
+    cells = {name: row.cells[name] for name in (*board.encoders, *board.controls[::-1]) if name in row.cells}
+    drawn = bars(row.task, {row.modality: cells}, {}, f"{row.score} %")
+    return to_svg(drawn, f"{row.task} {row.modality}", f"{row.task}, {row.modality}; the numbers are in the table")
 
 
-def _by_labels(board: Board) -> Iterator[str]:
-    for row in (row for row in board.rows if row.few):
-        lines = {name: row.few[name] for name in (*board.encoders, *board.controls) if name in row.few}
-        title = f"{row.task}, {row.modality}"
-        drawn = against_labels(title, lines)
-        yield page.figure(to_svg(drawn, f"labels {title}", f"{title} against labels; numbers are in the results"))
+def _few(board: Board, rows: Sequence[Row]) -> str:
+    """A table of scores of linear probes fitted with some of the labels."""
+    names = [*board.controls, *board.encoders]
+    found = []
+    for row in rows:
+        found.append([f"{row.task}, {row.modality}{', R2' * (row.score == 'R2')}"])
+        for share in dict.fromkeys(share for line in row.few.values() for share in line):
+            cells = [row.few.get(name, {}).get(share) for name in names]
+            found.append([f"{100 * share:g} % of labels", *(percent(c["mean"]) if c else "" for c in cells)])
+    return page.table(["", *names], found, label="few labels")
 
 
 def _data(board: Board) -> str:
@@ -265,7 +250,7 @@ def _data(board: Board) -> str:
     for name, result in board.results.items():
         for block in (block for block in result["blocks"] if "not_run" not in block):
             key = (block["set"], block["form"], block["data"]["rows"][:12])
-            rows.setdefault(key, {})[f"{name} ({block['pinned']})"] = None
+            rows.setdefault(key, {})[f"{name} ({pinned_of(suite_of(result), block)})"] = None
     table = _text_table(DATA, ["", "form", "digest of rows", "results"], [[*k, ", ".join(v)] for k, v in rows.items()])
     lost = page.fold(f"{len(board.not_run)} tasks that were not run", page.code("\n".join(board.not_run)))
     return table + (lost if board.not_run else "")

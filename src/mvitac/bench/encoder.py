@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from mvitac.bench.external import ExternalModel
-from mvitac.bench.result import read_result, sign, write_result
+from mvitac.bench.result import GUESS, read_result, sign, write_result
 from mvitac.bench.score import Entry, score_suite
 from mvitac.bench.suite import Suite
 from mvitac.deploy.artifact import load
+from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.leaks import FILE, UNKNOWN, read_sources
 from mvitac.evaluation.run_names import names_of
 from mvitac.experiments.plan import slug
@@ -35,6 +36,12 @@ class About:
     """Names of all data that it was trained on. Default: what its run or its adapter says."""
     images_seen: int = 0
     """Images that it saw in training, with repeats. Default: steps x batch size of its run."""
+
+    def __post_init__(self) -> None:
+        if self.name in (*CONTROLS, GUESS):
+            raise ValueError(f"--name {self.name} is the name of a control: give another")
+        if self.images_seen < 0:
+            raise ValueError(f"--images-seen {self.images_seen}: give the number of images, 1 or more")
 
 
 def run_bench(places: Sequence[str], suite: Suite, out: Path, root: Path | None, about: About) -> Path:

@@ -3,7 +3,8 @@
     format, suite (definition), suite_digest
     encoder   name, weights (digests), parameters, images_seen, licence, trained_on, ...
     versions  of mvitac, torch and what decodes images
-    blocks    for each task: data digests, groups, leaks, scores of the encoder and of the controls per test group
+    blocks    for each task: data digests, groups, leaks, and of each probe, of the encoder and of the controls, sums per
+              test group. It holds no score: all are computed from these sums when it is read (``records_of``)
     digest    sha256 of all of this as canonical JSON (sorted keys)
     about     time, seconds, machine, commit: not in the digest, as they differ when the same is measured again
 
@@ -12,74 +13,66 @@ someone repeats them.
 """
 
 import json
-import math
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvitac.bench.suite import Suite, find_suite, shipped
+from mvitac.bench.external.base import parse
+from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, pinned, shipped
+from mvitac.evaluation.controls import CONTROLS
+from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.value_scores import SUMS, r_squared
-from mvitac.registry import from_json, to_json
+from mvitac.registry import from_json
 from mvitac.system.files import digest, read_json, write_atomic
 
-FORMAT, FORMAT_VERSION = "mvitac-bench", 1
+FORMAT, FORMAT_VERSION = "mvitac-bench", 2
 VOLATILE = ("digest", "about")  # fields that the digest leaves out
-KEPT = (
-    *("source", "seed", "task", "modality", "probe", "accuracy", "balanced_accuracy", "macro_f1", "auroc", "num_test"),
-    *("group_sizes", "group_correct", "r2", "targets", "group_sums", "C", "alpha", "clipped", "steps"),
-)
-"""Fields of a record of a probe that a result keeps."""
+KEY = ("source", "seed", "modality", "probe")
+COUNTS = ("n", "correct")  # sums per group of classes: rows, and those that are right
+ABOUT_ROWS = ("n", "value", "squared_value")  # sums that depend on the rows alone
 VERSION = re.compile(r"-v\d+$")  # at the end of a suite's name
-SHARED = ("n", "value", "squared_value")
-"""Sums per group that depend on the rows alone: they are written once for all records of a task."""
+GUESS = "majority or mean"  # what the page calls these two controls
 
 
-def trimmed(record: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a probe's record that a result keeps, with sums in ten digits."""
-    kept = {name: record[name] for name in KEPT if name in record}
-    if "targets" in kept:
-        fields = ("name", "unit", "r2", "mae", "rmse")
-        kept["targets"] = [{name: target[name] for name in fields} for target in kept["targets"]]
-        kept["group_sums"] = {
-            name: [[float(f"{x:.10g}") for x in each] for each in sums] for name, sums in kept["group_sums"].items()
-        }
-    return kept
-
-
-def _folded(block: dict[str, Any]) -> dict[str, Any]:
-    """``block`` with what its records share written once: the sizes of groups, and the sums of true values."""
-    if "records" not in block:
-        return block
-    rows: list[dict[str, Any]] = []
-    records = []
-    for record in block["records"]:
-        sums = record.get("group_sums")
-        same = {name: sums[name] for name in SHARED} if sums else {"group_sizes": record["group_sizes"]}
-        own = {"group_sums": {name: sums[name] for name in SUMS if name not in SHARED}} if sums else {}
-        if same not in rows:
-            rows.append(same)
-        records.append({**{k: v for k, v in record.items() if k != "group_sizes"}, **own, "rows": rows.index(same)})
-    return {**block, "rows": rows, "records": records}
+def kept(record: dict[str, Any]) -> dict[str, Any]:
+    """What a result keeps of a probe's record: sums per test group, of values in ten digits."""
+    about = {name: record[name] for name in (*KEY, "clipped") if name in record}
+    if "group_sums" not in record:
+        return {**about, "sums": {"n": record["group_sizes"], "correct": record["group_correct"]}}
+    sums = {name: [[float(f"{x:.10g}") for x in each] for each in record["group_sums"][name]] for name in SUMS}
+    return {**about, "targets": [[target["name"], target["unit"]] for target in record["targets"]], "sums": sums}
 
 
 def records_of(block: dict[str, Any], encoder: dict[str, Any]) -> list[dict[str, Any]]:
     """The records of a block as ``evaluation.scores`` takes them; those of the encoder get its name and leaks."""
     found = []
-    for record in block["records"]:
-        same = block["rows"][record["rows"]]
-        whole = {key: value for key, value in record.items() if key != "rows"}
-        if "group_sums" in record:
-            whole["group_sums"] = {**same, **record["group_sums"]}
-        else:
-            whole["group_sizes"] = same["group_sizes"]
-        if not record["source"]:
-            leak = block["leaks"][encoder["seeds"].index(record["seed"])]
-            whole |= {"source": encoder["name"], "leak": leak}
-        found.append(whole)
+    for one in block["records"]:
+        record = {"task": block["task"], **one, **_scores(one)}
+        if not one["source"]:
+            leak = block["leaks"][encoder["seeds"].index(one["seed"])]
+            record |= {"source": encoder["name"], "leak": leak}
+        found.append(record)
     return found
+
+
+def _scores(record: dict[str, Any]) -> dict[str, Any]:
+    """The scores that the sums of a record give."""
+    sums = record["sums"]
+    if "targets" not in record:
+        accuracy = sum(sums["correct"]) / sum(sums["n"])
+        return {"group_sizes": sums["n"], "group_correct": sums["correct"], "accuracy": accuracy}
+    total = {name: np.array(sums[name], float).sum(1) for name in SUMS}
+    r2, mae = r_squared(total), total["error"] / total["n"]
+    rmse = (total["squared_error"] / total["n"]) ** 0.5
+    targets = [
+        {"name": name, "unit": unit, "r2": float(r2[t]), "mae": float(mae[t]), "rmse": float(rmse[t])}
+        for t, (name, unit) in enumerate(record["targets"])
+    ]
+    return {"group_sums": sums, "targets": targets, "r2": float(r2.mean())}
 
 
 def sign(
@@ -90,11 +83,11 @@ def sign(
     value = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "suite": to_json(suite),
+        "suite": suite.definition(),
         "suite_digest": suite.digest(),
         "encoder": encoder,
         "versions": versions,
-        "blocks": [_folded(block) for block in blocks],
+        "blocks": list(blocks),
     }
     return {**value, "digest": digest(value), "about": here}
 
@@ -134,56 +127,114 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def suite_of(value: dict[str, Any]) -> Suite:
-    """The definition inside a result."""
-    return from_json(Suite, value["suite"], "suite")
+    """The definition inside a result. One of this version has its pins; no file can bring its own."""
+    suite = from_json(Suite, value["suite"], "suite")
+    known = find_suite(suite.name) if suite.name in shipped() else None
+    return known if known and known.digest() == suite.digest() else suite
+
+
+def pinned_of(suite: Suite, block: dict[str, Any]) -> str:
+    """Whether the data of a block is what the suite was measured on (``suite.Pinned``)."""
+    (one,) = (one for one in suite.sets if one.name == block["set"])
+    forms = {form.name: form for form in one.forms}
+    return pinned(forms[block["form"]], block["data"])
 
 
 def problems(value: dict[str, Any]) -> list[str]:
-    """What does not follow from the result's own numbers, in one line each: scores, groups, controls, missing tasks."""
-    found, suite = [], suite_of(value)
-    asked = [(one.name, ask.name) for one in suite.sets for ask in one.tasks]
-    if asked != (have := [(block["set"], block["task"]) for block in value["blocks"]]):
-        found.append(f"has the tasks {have}, the suite asks for {asked}")
-    for block in value["blocks"]:
-        where = f"{block['set']}, {block['task']}"
-        if "not_run" in block:
-            continue
-        if len(block["leaks"]) != len(value["encoder"]["seeds"]):
-            found.append(f"{where}: has {len(block['leaks'])} leak marks for {len(value['encoder']['seeds'])} seeds")
-        records = records_of(block, value["encoder"])
-        if block["records"] and value["encoder"]["name"] in {r["source"] for r in block["records"]}:
-            found.append(f"{where}: the encoder has the name of a control, {value['encoder']['name']!r}: give --name")
-        if lacking := {"untrained", "pixels"} - {r["source"] for r in records}:
-            found.append(f"{where}: lacks the controls {', '.join(sorted(lacking))}")
-        for record in records:
-            what = f"{where}, {record['modality']}, {record['source']}, {record['probe']}"
-            found += [f"{what}: {text}" for text in _wrong(record, len(block["groups"]))]
+    """What is missing in a result, or cannot be, in one line each: tasks, scores, controls, sums, data."""
+    suite, encoder = suite_of(value), value["encoder"]
+    found = list(_of_encoder(encoder))
+    asked = [(one, ask) for one in suite.sets for ask in one.tasks]
+    if (want := [(s.name, t.name) for s, t in asked]) != (have := [(b["set"], b["task"]) for b in value["blocks"]]):
+        return [*found, f"has the tasks {have}, the suite asks for {want}"]
+    for block, (one, ask) in zip(value["blocks"], asked, strict=True):
+        if "not_run" not in block:
+            found += [f"{one.name}, {ask.name}: {text}" for text in _of_block(block, suite, one, ask, encoder)]
     return found
 
 
-def _wrong(record: dict[str, Any], num_groups: int) -> list[str]:
-    """What is wrong with the scores of one record."""
-    if "group_sums" not in record:
-        sizes, correct = np.array(record["group_sizes"]), np.array(record["group_correct"])
-        if len(sizes) != len(correct) or len(sizes) > num_groups:
-            return [f"has {len(correct)} counts of {len(sizes)} groups, the task has {num_groups} groups"]
-        if (correct < 0).any() or (correct > sizes).any() or sizes.sum() != record["num_test"]:
-            return ["more correct rows than rows"]
-        return _differs("accuracy", record["accuracy"], correct.sum() / sizes.sum())
-    sums = {name: np.array(record["group_sums"][name], float) for name in SUMS}
-    shape = (len(record["targets"]), len(sums["n"][0]))
-    if any(each.shape != shape for each in sums.values()) or shape[1] > num_groups:
-        return [f"its sums are not of {shape[0]} targets and {num_groups} groups"]
-    total = {name: each.sum(1) for name, each in sums.items()}
-    wrong = _differs("r2", record["r2"], float(r_squared(total).mean()))
-    for t, target in enumerate(record["targets"]):
-        wrong += _differs(f"mae of {target['name']}", target["mae"], total["error"][t] / total["n"][t])
-        wrong += _differs(
-            f"rmse of {target['name']}", target["rmse"], (total["squared_error"][t] / total["n"][t]) ** 0.5
-        )
-    return wrong
+def _of_encoder(encoder: dict[str, Any]) -> Iterator[str]:
+    if encoder["name"] in (*CONTROLS, GUESS):
+        yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
+    if (seen := encoder["images_seen"]) is not None and not (isinstance(seen, int) and seen >= 0):
+        yield f"images_seen is {seen}"
+    if not len(encoder["seeds"]) == len(set(encoder["seeds"])) == len(encoder["weights"]):
+        yield f"has {len(encoder['weights'])} weights for seeds {encoder['seeds']}"
 
 
-def _differs(what: str, given: float, found: float) -> list[str]:
-    same = math.isclose(given, found, rel_tol=1e-5, abs_tol=1e-6)
-    return [] if same else [f"{what} is {given:.6g}, its sums per group give {found:.6g}"]
+def _of_block(
+    block: dict[str, Any], suite: Suite, one: SuiteSet, ask: SuiteTask, encoder: dict[str, Any]
+) -> Iterator[str]:
+    records = block["records"]
+    if block["form"] not in [form.name for form in one.forms]:
+        yield f"the suite has no form {block['form']!r}"
+    elif pinned_of(suite, block) == "other rows" and any(f.at for f in one.forms if f.name == block["form"]):
+        yield "the data has other rows, labels or splits than the suite"
+    if len(block["leaks"]) != len(encoder["seeds"]):
+        yield f"has {len(block['leaks'])} leak marks for {len(encoder['seeds'])} seeds"
+    if encoder["name"] in {record["source"] for record in records}:
+        yield f"the encoder has the name of a control, {encoder['name']!r}: give --name"
+    have = Counter((r["source"], r["modality"], r["probe"], r["seed"]) for r in records)
+    want = _expected(suite, ask, block, encoder["seeds"], "targets" in records[0] if records else False)
+    own = {key for key in have if key[1:] == ("none", "linear", None) and key[0] not in CONTROLS}  # columns of the data
+    for what, keys in (("lacks", want - have.keys()), ("has too much of", have.keys() - want - own)):
+        for source, *key in sorted(keys, key=str):
+            yield f"{what} {source or 'the encoder'}, {', '.join(map(str, key))}"
+    rows: dict[str, list[Any]] = {}
+    for record in records:
+        what = f"{record['modality']}, {record['source'] or 'the encoder'}, {record['probe']}, seed {record['seed']}"
+        if have[record["source"], record["modality"], record["probe"], record["seed"]] > 1:
+            yield f"{what}: is there twice"
+        if why := _impossible(record, len(block["groups"])):
+            yield f"{what}: {why}"
+        scored = [record["sums"][name] for name in ABOUT_ROWS if name in record["sums"]]
+        if rows.setdefault(record["modality"], scored) != scored:
+            yield f"{what}: is scored on other rows than those above it"
+
+
+Key = tuple[str, str, str, int | None]  # source ("" is the encoder), modality, probe, seed
+
+
+def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequence[int], values: bool) -> set[Key]:
+    """The records that a block must have: every modality, probe and seed."""
+    few = [f"{100 * share:g} % of labels" for share in ask.labels]
+    probes = [*(kind for kind in suite.probes if not values or kind in VALUE_PROBES), *few]
+    read = [m for m in ask.modalities if m not in block["left_out"]]
+    found: set[Key] = {("", m, kind, seed) for m in read for kind in probes for seed in seeds}
+    random = [parse(text).seed for text in suite.untrained]
+    found |= {("untrained", m, kind, seed) for m in ask.modalities for kind in ("linear", *few) for seed in random}
+    found |= {("pixels", m, "linear", None) for m in ask.modalities}
+    found |= {("border", "touch", "linear", None)} if "touch" in ask.modalities else set()
+    return found | {("mean" if values else "majority", "none", "linear", None)}
+
+
+def _impossible(record: dict[str, Any], num_groups: int) -> str:
+    """Why no predictions give the sums of a record; "" if some do."""
+    names = SUMS if "targets" in record else COUNTS
+    if record.keys() - {"targets", "clipped"} != {*KEY, "sums"} or {*record["sums"]} != {*names}:
+        return f"its fields are {sorted(record)}, its sums {sorted(record['sums'])}"
+    try:
+        sums = {name: np.array(record["sums"][name], float) for name in names}
+    except ValueError:
+        return "its sums are no numbers"
+    n = sums["n"] = np.atleast_2d(sums["n"])
+    if any(np.atleast_2d(each).shape != n.shape for each in sums.values()) or n.shape[1] > num_groups:
+        return f"its sums are not of {num_groups} groups"
+    if "targets" in record and len(record["targets"]) != len(n):
+        return f"it has sums of {len(n)} targets, and names of {len(record['targets'])}"
+    whole = n if "targets" in record else np.stack([n, np.atleast_2d(sums["correct"])])
+    if (
+        not all(np.isfinite(each).all() for each in sums.values())
+        or (whole != whole.round()).any()
+        or (whole < 0).any()
+    ):
+        return "a sum is not finite, or a number of rows is no natural number"
+    if (n.sum(1) == 0).any():
+        return "it has no rows"
+    if "targets" not in record:
+        return "it has more correct rows than rows" if (sums["correct"] > n).any() else ""
+    least = 1 - 1e-6  # sums have ten digits
+    if (sums["error"] < 0).any() or (sums["squared_error"] * n < least * sums["error"] ** 2).any():
+        return "its squared errors are smaller than its errors allow"
+    small = (sums["squared_value"] * n < least * sums["value"] ** 2).any()
+    return "its squares are smaller than its values allow" if small else ""

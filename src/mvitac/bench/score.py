@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mvitac.bench.external import ExternalModel, open_model
-from mvitac.bench.result import trimmed
+from mvitac.bench.result import kept
 from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
@@ -150,7 +150,8 @@ class Entry:
         for place, model in zip(self.places, self.models, strict=True):
             own = isinstance(model, ExternalModel)
             sources = None if own else read_sources(Path(place))
-            found.append(declared_leak(self.trained_on, names) if sources is None else Scored(pack).leak(sources, rows))
+            known = None if sources is None else Scored(pack).leak(sources, rows, names)
+            found.append(declared_leak(self.trained_on, names) if known is None else known)
         return found
 
 
@@ -197,19 +198,20 @@ def _block(
 ) -> dict[str, Any]:
     """The scores of one task and what they were made on."""
     pack = opened.packs[0]
+    why = {m: [misfit(entry.models[0], pack, each) for each in names_in(m, pack)] for m in ask.modalities}
+    left_out = {m: next(filter(None, reasons)) for m, reasons in why.items() if any(reasons)}
     if not own:
-        why = [misfit(entry.models[0], pack, each) for m in ask.modalities for each in names_in(m, pack)]
-        return {"set": one.name, "task": task.name, "not_run": next(filter(None, why))}
+        return {"set": one.name, "task": task.name, "not_run": next(iter(left_out.values()))}
     names = [np.unique(v.column("group")[split_rows(v, task).test].astype(str)).tolist() for v in opened.packs]
     return {
         "set": one.name,
         "task": task.name,
         "form": opened.form,
         "data": opened.digests,
-        "pinned": opened.pinned,
         "group_by": pack.spec.group_by,
         "groups": [name for fold in names for name in fold],
         "leaks": entry.leaks(opened, task, one.names),
+        "left_out": left_out,
         "records": [*own, *controls],
     }
 
@@ -218,6 +220,5 @@ def _kept(parts: Path, key: str, about: list[Any], score: Callable[[], Records])
     """The records of a part: those kept, else scored now and kept."""
     path = parts / f"{key[:16]}-{digest([key, *about])[:24]}.json"
     if not path.exists():
-        write_json(path, {"records": [trimmed(record) for record in score()]}, sealed=True)
-    kept = read_json(path, "a part of a bench")
-    return kept["records"] if isinstance(kept, dict) else kept  # parts had no seal before 2026-11-23
+        write_json(path, {"records": [kept(record) for record in score()]}, sealed=True)
+    return read_json(path, "a part of a bench")["records"]

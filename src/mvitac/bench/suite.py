@@ -1,7 +1,7 @@
 """Suites: versioned definitions of tasks (``suites/*.toml``), and their data opened as packs.
 
 A suite fixes data, rows, splits, probes, seeds and controls. Its digest covers all of it except the pins, which are the
-digests of the data that was measured. A definition that changes gets another name (sim-v2).
+digests of the data that was measured. A definition that changes gets another name (sim-v3).
 """
 
 import copy
@@ -101,13 +101,17 @@ class Suite:
         if len(set(names)) < len(names):
             raise ValueError(f"suite {self.name!r}: two sets have one name")
 
-    def digest(self) -> str:
-        """Digest of the definition without its pins."""
+    def definition(self) -> dict[str, Any]:
+        """The suite as JSON, without its pins."""
         value = to_json(self)
         for one in value["sets"]:
             for form in one["forms"]:
                 del form["pins"]
-        return digest(value)
+        return value
+
+    def digest(self) -> str:
+        """Digest of the definition."""
+        return digest(self.definition())
 
 
 def shipped() -> list[str]:
@@ -156,7 +160,6 @@ class Opened:
     packs: tuple[Pack, ...]  # one per fold, which differ in the column split only
     tasks: tuple[tuple[SuiteTask, AnyTask], ...]  # what the suite asks, and the task as the data defines it
     digests: dict[str, str]  # of the data
-    pinned: Pinned  # whether the data is what the suite was measured on
 
 
 def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
@@ -175,22 +178,22 @@ def open_set(one: SuiteSet, root: Path | None) -> Opened | str:
         tasks = tuple((asked, known[asked.name]) for asked in one.tasks)
         packs = _fold(pack, one) if one.folds else (pack,)
         found = {"rows": _rows_digest(packs, [task for _, task in tasks]), **_image_digests(made)}
-        return Opened(form.name, packs, tasks, found, _compared(one, form, found))
+        if pinned(form, found) == "other rows" and form.at:
+            raise ValueError(
+                f"the data of {one.name} ({form.name}) has other rows, labels or splits than the suite: digest"
+                f" {found['rows'][:12]}, the suite has {form.pins['rows'][:12]}. Get the data again, or leave the set out"
+            )
+        return Opened(form.name, packs, tasks, found)
     places = " or ".join(dict.fromkeys(str((root or Path()) / p) for form in one.forms for p in form.at.values()))
     return f"{places} is not there" if root else f"no --data-root was given, where {places} would be"
 
 
-def _compared(one: SuiteSet, form: Form, found: dict[str, str]) -> Pinned:
-    """Compare digests with the pins of ``form``; ValueError if rows, labels or splits of real data differ."""
+def pinned(form: Form, found: dict[str, str]) -> Pinned:
+    """Digests of data beside the pins of ``form``."""
     if not form.pins:
         return "not pinned"
-    if found["rows"] != form.pins["rows"] and not form.at:
-        return "other rows"
     if found["rows"] != form.pins["rows"]:
-        raise ValueError(
-            f"the data of {one.name} ({form.name}) has other rows, labels or splits than the suite: digest"
-            f" {found['rows'][:12]}, the suite has {form.pins['rows'][:12]}. Get the data again, or run without this set"
-        )
+        return "other rows"
     return "same" if found == form.pins else "other pixels"
 
 

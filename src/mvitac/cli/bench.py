@@ -44,7 +44,7 @@ class _BoardOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class _CheckOptions:
-    """Check results: digests, the suite inside, and every score against its own sums per test group."""
+    """Check results: digests, the suite inside, no score missing, sums per test group that predictions can give."""
 
     files: Positional[tuple[Path, ...]]
     """Results that `mvitac bench MODEL` wrote."""
@@ -98,4 +98,4 @@ def check(argv: list[str]) -> None:
             more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
             raise ValueError(f"{path}: {found[0]}{more}")
         num = sum(len(block.get("records", ())) for block in result["blocks"])
-        print(f"{path}: {result['encoder']['name']} on {result['suite']['name']}, {num} scores agree with their sums")
+        print(f"{path}: {result['encoder']['name']} on {result['suite']['name']}, {num} scores are those of its sums")

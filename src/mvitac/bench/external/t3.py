@@ -35,10 +35,8 @@ class T3(Adapter):
 
     def load(self) -> Loaded:
         files = (self.path() / "encoders" / f"{self.sensor}.pth", self.path() / "trunk.pth")
-        for file in files:
-            if not file.is_file():
-                there = ", ".join(sorted(p.stem for p in files[0].parent.glob("*.pth"))) or "none"
-                raise self.refuse(f"{file} does not exist; sensors there: {there}")
+        if missing := [file for file in files if not file.is_file()]:
+            raise self.refuse(f"{missing[0]} does not exist")
         tensors = under(read_tensors(files[0]), "", NAMES)
         own = depth(tensors)
         for name, value in read_tensors(files[1]).items():
