@@ -5,7 +5,7 @@
                                     header. sha256: digest of all
 
 The first source of a run is its own training rows. A run that starts from another model's weights adds the sources of that
-model. A source without rows stands for weights of which nothing says what they were trained on.
+model. A source without rows stands for weights of which only their owner, or nothing, says what they were trained on.
 """
 
 from collections.abc import Sequence
@@ -20,12 +20,14 @@ import safetensors.numpy
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import image_sums, known_images, row_hashes
 from mvitac.nn.encoders import IMAGENET, SCRATCH
+from mvitac.nn.weights import said_trained_on
 from mvitac.run import Run
 from mvitac.system.files import SEAL, brief, digest, write_atomic
 
 FILE = "trained_on.safetensors"
 KEYS = ("ids", "groups", "images")
 NOT_SEEN = "copies as JPEG, resized or mirrored are not seen; `mvitac data check PACK OTHER` finds resized ones"
+DECLARED = "its owner says: "  # begins the name of a source without rows whose data its owner names
 UNKNOWN = "unknown"  # a leak that cannot be checked, because nothing says what the run was trained on
 
 
@@ -50,10 +52,16 @@ def unknown_source(name: str) -> Source:
     return Source(name, *(np.zeros(0, np.uint64) for _ in KEYS))
 
 
+def file_source(file: Path) -> Source:
+    """The source of other people's weights: what their owner says of them in the file, or unknown."""
+    said = said_trained_on(file)
+    return unknown_source(f"{DECLARED}{said}" if said else file.name)
+
+
 def weights_sources(run: Run) -> list[Source]:
-    """What the file of ``--encoder.weights`` learned from, if the run starts from one: nothing says it."""
+    """What the file of ``--encoder.weights`` learned from, if the run starts from one."""
     weights = run.encoder.weights
-    return [] if weights in (IMAGENET, SCRATCH) else [unknown_source(Path(weights).name)]
+    return [] if weights in (IMAGENET, SCRATCH) else [file_source(Path(weights))]
 
 
 def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:
@@ -104,11 +112,11 @@ class Scored:
     def __init__(self, pack: Pack) -> None:
         self.pack, (self._ids, self._groups) = pack, row_hashes(pack)
 
-    def leak(self, sources: Sequence[Source] | None, rows: np.ndarray) -> str:
+    def leak(self, sources: Sequence[Source] | None, rows: np.ndarray, names: Sequence[str] = ()) -> str:
         """Say which of the test ``rows``, and how many of their groups, are in ``sources``; "" if none is.
 
-        A row is in a source by its id, or by any of its images. ``UNKNOWN`` if none is in those that are known, but not
-        all are known.
+        A row is in a source by its id, or by any of its images. Where an owner only names the data, that is compared with
+        ``names``, by default the pack's. ``UNKNOWN`` if none is in those that are known, but not all are known.
         """
         if sources is None:
             return UNKNOWN
@@ -121,7 +129,11 @@ class Scored:
             if num_rows or num_groups:
                 grouped = f" and {num_groups} of {len(groups)} test {by}s" if by != "row" else ""
                 found.append(f"{num_rows} of {len(rows)} test rows{grouped} were trained on ({source.name})")
-        unknown = any(not len(source.ids) for source in sources)
+        rest = [source.name for source in sources if not len(source.ids)]
+        said = [name.removeprefix(DECLARED) for name in rest if name.startswith(DECLARED)]
+        declared = (declared_leak(text, names or [self.pack.spec.name.split(" (")[0]]) for text in said)
+        found += dict.fromkeys(filter(None, declared))
+        unknown = len(rest) > len(said)
         return "; ".join(found) or (UNKNOWN if unknown else "")
 
 

@@ -81,6 +81,11 @@ def read_tensors(file: Path) -> State:
     return found
 
 
+def said_trained_on(file: Path) -> str:
+    """What the owner of a .safetensors file says in its header ("trained_on") that it was trained on; "" if nothing."""
+    return read_safetensors(file)[0].get("trained_on", "") if file.suffix == ".safetensors" and file.exists() else ""
+
+
 def _flat(value: Any, start: str = "") -> State:
     if isinstance(value, Tensor):
         return {start: value}

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, read_sources, unknown_source, weights_sources
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_sources
 from mvitac.methods.base import Method
 from mvitac.model_files import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
@@ -47,7 +47,7 @@ def read_start(init: Init) -> Start | None:
     trunks = {m: _below(f"encoders.{m}.", tensors) for m in ("vision", "touch")}
     heads = {m: state for m in trunks if (state := _below(f"projectors.{m}.", tensors))}
     trunks = {m: state for m, state in trunks.items() if state} or {ANY: tensors}
-    return Start(init, trunks, heads, "", [unknown_source(init.file.name)])
+    return Start(init, trunks, heads, "", [file_source(init.file)])
 
 
 def _below(prefix: str, tensors: State) -> State:

@@ -14,7 +14,31 @@ from torch import nn
 from mvitac.bench.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
 from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.weights import said_trained_on
 from mvitac.system.files import brief
+
+SETS = {
+    "in1k": "ImageNet-1k",
+    "in12k": "ImageNet-12k",
+    "in21k": "ImageNet-21k",
+    "in22k": "ImageNet-22k",
+    "dino": "ImageNet-1k",
+    "mae": "ImageNet-1k",
+    "openai": "OpenAI's image-text pairs",
+    "laion400m": "LAION-400M",
+    "laion2b": "LAION-2B",
+    "datacomp1b": "DataComp-1B",
+    "webli": "WebLI",
+    "lvd142m": "LVD-142M",
+    "lvd1689m": "LVD-1689M",
+}
+"""Parts of timm's tags for weights -> what they were trained on."""
+
+
+def said(tag: str) -> str:
+    """What timm's tag of pretrained weights says of their data."""
+    found = dict.fromkeys(SETS[part] for part in tag.split("_") if part in SETS)
+    return f"{', '.join(found)} (timm's tag {tag})" if found else UNKNOWN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +72,7 @@ class Timm(Adapter):
             files=() if named else (file,),
             licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
             source=f"https://huggingface.co/{cfg.get('hf_hub_id')}" if named and not random else self.weights,
-            trained_on=NOTHING if random else UNKNOWN,
+            trained_on=NOTHING if random else said(cfg.get("tag") or "") if named else said_trained_on(file) or UNKNOWN,
         )
 
     def _built(self, weights: str) -> nn.Module:
