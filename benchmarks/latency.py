@@ -29,7 +29,7 @@ from mvitac.deploy.engine import Call, Engine, Runtime, cosines
 from mvitac.deploy.export import ExportConfig, Precision, export
 from mvitac.deploy.export_module import ExportModule
 from mvitac.model_files import fresh
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import Encoders
 from mvitac.recipes import recipe
 from mvitac.system.provenance import provenance
 
@@ -73,7 +73,7 @@ def main() -> None:
     base = recipe("paper", config)
     run = replace(
         base,
-        encoder=EncoderConfig(trunk=options.trunk, weights="scratch"),
+        encoder=Encoders.both(trunk=options.trunk, weights="scratch"),
         augment=replace(base.augment, size=options.size),
     )
     model = fresh(run, pack.spec, options.size)

@@ -44,7 +44,7 @@ from mvitac.evaluation.classifiers import EPOCHS, train_heads
 from mvitac.evaluation.pack_features import pack_features
 from mvitac.methods.base import Views
 from mvitac.model import Model
-from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.recipes import recipe
 from mvitac.run import Run
 from mvitac.system.device import describe
@@ -162,7 +162,7 @@ def known(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
 def our_run(scale: Scale, precision: str, **changes: Any) -> Run:
     """Return recipe `paper` at this scale, without pretrained weights."""
     base = recipe("paper")
-    network = EncoderConfig(trunk=scale.trunk, weights=SCRATCH)
+    network = Encoders.both(trunk=scale.trunk, weights=SCRATCH)
     optim = replace(base.optim, lr=1e-3)
     views = replace(base.augment, size=scale.size)
     return replace(

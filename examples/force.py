@@ -25,7 +25,7 @@ from mvitac.evaluation.probe import probe_features, split_rows
 from mvitac.evaluation.score_text import percent, with_interval
 from mvitac.evaluation.scores import pool
 from mvitac.model_files import fresh
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import Encoders
 from mvitac.recipes import recipe
 
 
@@ -73,7 +73,7 @@ def main(manifest: Path) -> None:
         for trunk in ("resnet10t", "resnet18"):
             run = recipe("demo", config, phased=False)
             augment = replace(run.augment, size=96, whole=128)
-            run = replace(run, encoder=EncoderConfig(trunk=trunk, weights="scratch"), augment=augment)
+            run = replace(run, encoder=Encoders.both(trunk=trunk, weights="scratch"), augment=augment)
             z = pack_features(fresh(run, pack.spec, pack.size), pack, "touch", every).numpy()
             left_out(pack, f"untrained {trunk}, {shown}", z)
     width, moved = pack.column("width_m").astype(float)[:, None], energy(pack)

@@ -143,7 +143,7 @@ def experiment(model: Model, pack: Pack, seeds: int, candidates: int) -> dict[st
     objects = np.unique(pack.column("group")[rows.test].astype(str), return_inverse=True)[1]
     hands = [episodes(objects, candidates, seed) for seed in range(seeds)]
     x = encode(model, pack, every)
-    untrained = replace(model.run, encoder=replace(model.run.encoder, weights=SCRATCH))
+    untrained = replace(model.run, encoder=model.run.encoder.changed(weights=SCRATCH))
     random = encode(fresh(untrained, model.spec, model.stored), pack, every)
     x |= {"both": np.hstack([x["vision"], x["touch"]]), "random weights, both": np.hstack(list(random.values()))}
     x |= {name: np.stack([pack.column(c)[every] for c in columns], 1) for name, columns in pack.spec.controls.items()}

@@ -87,7 +87,9 @@ def test_the_plan_of_a_gpu_is_the_rows_of_table_1():
     plan: Plan = from_json(Plan, json.loads(json.dumps(gpu.plan(gpu.Size()))), "plan")
     data = MaterialsConfig(num=2000, size=256)
     runs = {row.label: plan.run(row, data, 0) for row in plan.rows}
-    assert all((run.encoder.trunk, run.augment.size, run.batch_size) == ("resnet18", 224, 256) for run in runs.values())
+    assert all(
+        (run.encoder.touch.trunk, run.augment.size, run.batch_size) == ("resnet18", 224, 256) for run in runs.values()
+    )
     paper, modern, ssvtp, *_ = runs.values()
     assert (paper.method.keys, paper.positives, paper.method.temperature) == ("momentum", "same-image", 0.07)
     assert (modern.method.keys, modern.positives) == ("end-to-end", "same-touch")

@@ -232,7 +232,7 @@ def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
     import timm
 
     run = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(run, encoder=replace(run.encoder, trunk="resnet10t"), augment=replace(run.augment, whole=24))
+    run = replace(run, encoder=run.encoder.changed(trunk="resnet10t"), augment=replace(run.augment, whole=24))
     model = fresh(run, pack.spec, 32)
     before = [type(layer) for layer in model.modules()]
     trunk = model.trunk("touch")
@@ -346,13 +346,13 @@ def test_loading_needs_no_network_and_no_start_weights(pack: Pack, tmp_path: Pat
     import safetensors.torch
     import timm
 
-    from mvitac.nn.encoders import EncoderConfig
+    from mvitac.nn.encoders import Encoders
 
     torch.manual_seed(0)
     start = tmp_path / "start.safetensors"
     safetensors.torch.save_file(timm.create_model("resnet10t").state_dict(), start)
     base = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(base, steps=1, encoder=EncoderConfig(trunk="resnet10t", weights=str(start)))
+    run = replace(base, steps=1, encoder=Encoders.both(trunk="resnet10t", weights=str(start)))
     out = train(run, tmp_path / "r", quiet=True)
     start.unlink()
     assert mvitac.load(out).embed(touch=pack.images["touch"][0])["touch"].shape == (1, 512)

@@ -31,7 +31,7 @@ def test_paper_constants() -> None:
     assert (run.batch_size, run.epochs, run.augment.size) == (256, 240, 224)
     assert (run.optim.name, run.optim.lr, run.optim.betas, run.optim.eps) == ("adam", 0.03, (0.9, 0.999), 1e-7)
     assert (run.optim.weight_decay, run.optim.schedule) == (0, "constant")
-    assert (run.encoder.trunk, run.encoder.weights) == ("resnet18.tv_in1k", "imagenet")
+    assert (run.encoder.touch.trunk, run.encoder.vision.weights) == ("resnet18.tv_in1k", "imagenet")
     method = run.method
     assert isinstance(method, MViTacConfig)
     assert (method.temperature, method.out, method.dropout, method.head_norm) == (0.07, 128, 0, False)
@@ -51,7 +51,7 @@ def test_authors_constants() -> None:
     assert isinstance(method, MViTacConfig)
     assert (method.momentum, method.lambda_inter, method.hidden, method.dropout) == (0.99, 1, 2048, 0.5)
     assert (run.optim.lr, run.optim.weight_decay, run.optim.eps, run.optim.schedule) == (1e-3, 1e-6, 1e-8, "late-step")
-    assert (run.encoder.stem, run.augment.eval_size, run.optim.decay_norms) == ("random", 256, True)
+    assert (run.encoder.touch.stem, run.augment.whole_of("touch"), run.optim.decay_norms) == ("random", 256, True)
     assert run.augment.touch.flip == 0.25
     assert run.augment.touch.grayscale == 0.2
     assert (run.batch_size, run.epochs) == (256, 240)

@@ -24,7 +24,6 @@ from mvitac.registry import to_json, unknown
 from mvitac.run import Run
 from mvitac.system.files import digest
 from mvitac.transforms.preprocess import ImageInput, Preprocess, check_images, encoder_input, resized, to_array
-from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 ABOUT = ("run", "spec", "stored")  # texts in the header of a file of weights
 EMBED_BATCH = 64  # images that ``Model.embed`` passes through an encoder at once: 0.5 GB with ResNet-18 at 224 px
@@ -73,14 +72,17 @@ class Model(nn.Module):
     def title(self) -> str:
         return self.run.method.name
 
-    @property
-    def sides(self) -> tuple[int, int]:
+    def sides(self, modality: str) -> tuple[int, int]:
         """Sides in pixels of the images that probes, and heads trained along, see."""
-        return self.run.augment.eval_size, self.run.augment.size
+        return self.run.augment.whole_of(modality), self.run.augment.size_of(modality)
+
+    def input(self, modality: str, images: Tensor, *, for_heads: bool = False) -> Tensor:
+        """The normalised images [B, C, S, S] that an encoder takes, of uint8 or floats in [0, 1], with their gradients."""
+        return encoder_input(images, self.sides(modality)[for_heads], self.run.encoder[modality].levels)
 
     def __repr__(self) -> str:
         widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())
-        method, trunk = self.run.method.name, self.run.encoder.trunk
+        method, trunk = self.run.method.name, self.run.encoder.named(self.encoders)
         named = self.spec.sensors not in ((), (self.spec.name,))
         sensors = f" (touch sensors {listed(self.spec.sensors)})" if named else ""
         return f"Model({method} of {trunk}, trained on {self.spec.name}{sensors}: features {widths})"
@@ -128,7 +130,7 @@ class Model(nn.Module):
             raise ValueError(f"this model has no {modality} encoder: it has {', '.join(self.encoders)}")
 
     def _encode(self, modality: str, images: Tensor, for_heads: bool) -> Tensor:
-        return self.encoders[modality](encoder_input(images, self.sides[for_heads])).float()
+        return self.encoders[modality](self.input(modality, images, for_heads=for_heads)).float()
 
     def _project(self, modality: str, features: Tensor) -> Tensor:
         if modality not in self.projectors:
@@ -149,10 +151,10 @@ class Model(nn.Module):
         """
         self.check_modality(modality)
         self._check_background(modality, background)
-        channels, size = self.spec.channels(modality), self.run.augment.eval_size if normalize else None
+        channels, size = self.spec.channels(modality), self.sides(modality)[0] if normalize else None
         frames = self.spec.frames(modality)
         free = None if background is None else to_array(background, channels // frames, "background")
-        return Preprocess(modality, channels, self.stored, size, free, frames)
+        return Preprocess(modality, channels, self.stored, size, free, frames, self.run.encoder[modality].levels)
 
     def trunk(self, modality: str) -> nn.Module:
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
@@ -163,9 +165,9 @@ class Model(nn.Module):
             ValueError: If the model has no such encoder, or it is not a single timm model.
         """
         self.check_modality(modality)
-        channels, size = self.spec.channels(modality), self.run.augment.eval_size
-        mean, std = (values * (channels // 3) for values in (IMAGENET_MEAN, IMAGENET_STD))
-        return timm_trunk(self.encoders[modality], self.run.encoder.trunk, (channels, size, size), mean, std)
+        channels, size, config = self.spec.channels(modality), self.sides(modality)[0], self.run.encoder[modality]
+        mean, std = (values * (channels // 3) for values in config.levels)
+        return timm_trunk(self.encoders[modality], config.trunk, (channels, size, size), mean, std)
 
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:
@@ -188,7 +190,7 @@ class Model(nn.Module):
     @torch.no_grad()
     def last_map(self, modality: str, images: Tensor) -> Tensor:
         """Places [B, P, D] of the trunk's last map (``nn.encoders.last_map``), of images as in ``features``."""
-        return last_map(self.encoders[modality], encoder_input(images, self.sides[0]))
+        return last_map(self.encoders[modality], self.input(modality, images))
 
     @torch.no_grad()
     def project(self, modality: str, features: Tensor) -> Tensor:
@@ -328,7 +330,7 @@ class Model(nn.Module):
     def weights_digest(self) -> str:
         """Content address of the weights and of the image size they expect, for caches."""
         tensors = {name: t.cpu().contiguous() for name, t in self.state_dict().items()}
-        return digest([safetensors_digest(tensors), self.sides[0]])
+        return digest([safetensors_digest(tensors), *dict.fromkeys(self.sides(m)[0] for m in self.encoders)])
 
     def save(self, path: Path) -> None:
         """Write a .safetensors file with the run and the description of the data in its header."""

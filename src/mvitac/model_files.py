@@ -8,7 +8,6 @@ import torch
 
 from mvitac.data.spec import DataSpec
 from mvitac.model import ABOUT, Model
-from mvitac.nn.encoders import SCRATCH
 from mvitac.nn.weights import misfit, read_model
 from mvitac.registry import from_json
 from mvitac.run import Run
@@ -58,7 +57,7 @@ def load(path: str | Path, which: Which = "last") -> Model:
     except (KeyError, ValueError) as error:
         raise ValueError(f"{file} has a damaged header ({brief(error)}): copy it again or re-train") from None
     # The file has all weights, so the empty model needs no pretrained ones, and no download.
-    empty = replace(run, encoder=replace(run.encoder, weights=SCRATCH))
+    empty = run.fresh()
     # Check shapes before allocating: a damaged header may describe a network larger than the memory.
     with torch.random.fork_rng(devices=[]):  # keep the caller's random state
         with torch.device("meta"):

@@ -8,7 +8,7 @@ from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.registry import default, unknown
 from mvitac.run import Optim, Run
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -43,7 +43,7 @@ def authors(data: DatasetConfig, phased: bool | None = None) -> Run:
         recipe="authors",
         method=MViTacConfig(hidden=2048, dropout=0.5),
         optim=Optim(lr=1e-3, eps=1e-8, weight_decay=1e-6, schedule="late-step"),
-        encoder=replace(base.encoder, stem="random"),
+        encoder=base.encoder.changed(stem="random"),
         augment=replace(base.augment, whole=256, vision=views, touch=views),
     )
 
@@ -111,7 +111,7 @@ def demo(data: DatasetConfig, phased: bool | None = None) -> Run:
         sampler="one-per-touch",
         method=MViTacConfig(head_norm=True, momentum=0.9, temperature=0.2),
         optim=replace(base.optim, lr=2e-3),
-        encoder=EncoderConfig(trunk="resnet10t", weights=SCRATCH),
+        encoder=Encoders.both(trunk="resnet10t", weights=SCRATCH),
         augment=Augment(size=48, whole=72, vision=views, touch=views),
         batch_size=64,
         steps=1150,
@@ -147,7 +147,7 @@ def smoke(data: DatasetConfig, phased: bool | None = None) -> Run:
     return replace(
         base,
         recipe="smoke",
-        encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH),
+        encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH),
         method=MViTacConfig(hidden=32, out=16),
         augment=replace(base.augment, size=32, whole=None),
         batch_size=16,

@@ -11,7 +11,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.datasets.base import DatasetConfig
 from mvitac.methods.base import MethodConfig
 from mvitac.methods.mvitac import MViTacConfig
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders
 from mvitac.nn.initial import Init
 from mvitac.registry import from_json, to_json
 from mvitac.system.files import digest, read_json
@@ -39,9 +39,6 @@ class Optim:
     """L2 penalty (adam, sgd) or decoupled weight decay (adamw). The paper gives none."""
     decay_norms: bool = True
     """Also decay biases and the parameters of BatchNorm. Current practice is not to."""
-    layer_decay: float = 1.0
-    """Learning rate of each layer of a trunk relative to that of the next one, e.g. .65 to train a pretrained ViT further
-    (BEiT, MAE). 1 = the same for all. Heads have the full rate."""
     schedule: Literal["constant", "cosine", "step", "late-step"] = "constant"
     """constant; cosine, to zero; step, x0.9 every 10 epochs from epoch 10 on; or late-step, the same from epoch 20 on (the
     authors' StepLR, which is stepped from epoch 10 on). The paper gives none."""
@@ -57,8 +54,6 @@ class Optim:
             raise ValueError(f"optim eps {self.eps}: give a positive number")
         if not (self.weight_decay >= 0 and math.isfinite(self.weight_decay)):
             raise ValueError(f"optim weight_decay {self.weight_decay}: give a number >= 0")
-        if not 0 < self.layer_decay <= 1:
-            raise ValueError(f"optim layer_decay {self.layer_decay}: give a factor above 0, at most 1")
         if not 0 <= self.warmup < 1:
             raise ValueError(f"optim warmup {self.warmup}: give a fraction of the steps in [0, 1)")
 
@@ -94,7 +89,7 @@ class Run:
     """Name of the recipe this run started from. For the record only."""
     method: MethodConfig = MViTacConfig()
     data: DatasetConfig
-    encoder: EncoderConfig = EncoderConfig()
+    encoder: Encoders = Encoders()
     init: Init = Init()
     renew_norms: int = 0
     """Batches on which the running statistics of BatchNorm are estimated anew before the first step, for data of another
@@ -195,24 +190,29 @@ class Run:
         if (self.steps or self.epochs * self.steps_per_epoch(num_rows)) > MAX_STEPS:
             given = f"steps {self.steps}" if self.steps else f"epochs {self.epochs}"
             raise ValueError(f"{given}: too many to finish on any machine, give at most {MAX_STEPS} steps in all")
-        if self.augment.size > stored_size:
-            raise ValueError(
-                f"views of {self.augment.size} px cannot be cut from images stored at {stored_size} px:"
-                f" give --augment.size {stored_size} or less, or pack the data at a larger --data.size"
-            )
-        if self.augment.eval_size > stored_size:
-            raise ValueError(
-                f"whole images of {self.augment.eval_size} px were stored at {stored_size} px:"
-                f" give --augment.whole {stored_size} or less, or pack the data at a larger --data.size"
-            )
-        if self.encoder.temporal != "stack" and spec.window.frames == 1:
-            raise ValueError(
-                f"encoder.temporal {self.encoder.temporal} has no effect on single images: give --data.num-frames 2 or"
-                " more, or leave it out"
-            )
-        self.method.check_encoder(self.encoder, self.augment.size)
+        for modality in spec.modalities:
+            self._check_encoder(modality, spec, stored_size)
         if self.precision == "bf16" and self.device.startswith("mps"):
             raise ValueError("bf16 is not supported on mps: use --precision fp32")
+
+    def _check_encoder(self, modality: str, spec: DataSpec, stored_size: int) -> None:
+        encoder, size, whole = self.encoder[modality], self.augment.size_of(modality), self.augment.whole_of(modality)
+        if max(size, whole) > stored_size:
+            raise ValueError(
+                f"{modality} of {max(size, whole)} px cannot be cut from images stored at {stored_size} px:"
+                f" give --augment.size {stored_size} or less, --augment.whole likewise, or pack at a larger --data.size"
+            )
+        if encoder.temporal != "stack" and spec.window.frames == 1:
+            raise ValueError(
+                f"encoder.{modality}.temporal {encoder.temporal} has no effect on single images: give --data.num-frames 2"
+                " or more, or leave it out"
+            )
+        if encoder.locked and self.renew_norms:
+            raise ValueError(f"renew_norms would change the locked trunk of {modality}: leave one of them out")
+        taken = self.init and modality in (self.init.modalities or spec.modalities)
+        if encoder.locked and encoder.weights == SCRATCH and not taken:
+            raise ValueError(f"{modality} is locked at random weights: give --encoder.{modality}.weights, or --init")
+        self.method.check_encoder(encoder, size)
 
     @property
     def bf16(self) -> bool:
@@ -226,7 +226,13 @@ class Run:
         Two runs that train alike on the dataset become equal.
         """
         unseen = {m: ViewAugment() for m in ("vision", "touch") if m not in spec.modalities}
-        return replace(self, recipe="", method=self.method.without_idle(spec), augment=replace(self.augment, **unseen))
+        encoder = replace(self.encoder, **dict.fromkeys(unseen, EncoderConfig()))
+        augment = replace(self.augment, **unseen)
+        return replace(self, recipe="", method=self.method.without_idle(spec), encoder=encoder, augment=augment)
+
+    def fresh(self) -> "Run":
+        """This run from random initial weights, which are all trained."""
+        return replace(self, encoder=self.encoder.fresh())
 
     def digest(self) -> str:
         """Content address of all settings that decide the outcome. Start weights count by content, not by path."""

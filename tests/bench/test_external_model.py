@@ -46,7 +46,7 @@ def rows(pack: Pack, num: int = 6) -> np.ndarray:
 
 def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_path: Path) -> None:
     run = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(run, encoder=replace(run.encoder, trunk="test_resnet"))
+    run = replace(run, encoder=run.encoder.changed(trunk="test_resnet"))
     ours = fresh(replace(run, augment=replace(run.augment, size=32, whole=None)), pack.spec, pack.size)
     trunk = ours.encoders["touch"]
     torch.save(trunk.state_dict(), tmp_path / "trunk.pth")

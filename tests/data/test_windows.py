@@ -139,7 +139,7 @@ def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, tempo
         steps=2,
         batch_size=8,
         eval_every=0,
-        encoder=replace(run.encoder, temporal=temporal),
+        encoder=run.encoder.changed(temporal=temporal),
         augment=Augment(size=16),
     )
     out = train(run, tmp_path / "run", quiet=True)

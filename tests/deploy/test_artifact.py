@@ -181,9 +181,7 @@ def test_a_network_larger_than_the_machine_is_refused_before_it_is_made(
     """A header of a few kilobytes may name one, with every digest in order."""
     path = copy / "model.safetensors"
     tensors, model = safetensors.torch.load_file(path), mvitac.load(copy)
-    monkeypatch.setattr(
-        model, "run", replace(model.run, encoder=replace(model.run.encoder, trunk="resnetv2_152x4_bit"))
-    )
+    monkeypatch.setattr(model, "run", replace(model.run, encoder=model.run.encoder.changed(trunk="resnetv2_152x4_bit")))
     monkeypatch.setattr(model, "state_dict", lambda: tensors)
     model.save(path)
     reseal(copy)

@@ -23,7 +23,6 @@ from mvitac.cli.main import main
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy import engine as runtime
-from mvitac.deploy import export_module as graphs
 from mvitac.deploy.engine import Engine, cosines, open_model
 from mvitac.deploy.export import ExportConfig, export
 from mvitac.deploy.export_module import ExportModule
@@ -31,6 +30,7 @@ from mvitac.deploy.parity import parity, reference
 from mvitac.deploy.publish import with_probes
 from mvitac.deploy.quantise import quantise
 from mvitac.model import Model
+from mvitac.nn.encoders import EncoderConfig
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from support.processes import begin, finish
@@ -89,7 +89,7 @@ def test_the_resize_in_the_graph_is_the_probes_pixel_by_pixel(stored: int, model
     was, model.stored = model.stored, stored
     try:
         graph = ExportModule(model)
-        found = graph.view(images.permute(0, 2, 3, 1), graph.filter)
+        found = graph.views["touch"](images.permute(0, 2, 3, 1))
     finally:
         model.stored = was
     torch.testing.assert_close(found, plain_view(images, 32), atol=1e-4, rtol=0)
@@ -116,7 +116,7 @@ def test_the_heads_have_a_view_of_their_own_where_they_learned_from_one(smoke_ru
     model = mvitac.load(smoke_run)
     model.run = replace(model.run, augment=replace(model.run.augment, size=24, whole=32))
     graph = ExportModule(model)
-    assert graph.twice
+    assert set(graph.head_views) == {"vision", "touch"}
     images = {m: pack.images[m][:5].copy() for m in ("vision", "touch")}
     found = dict(zip(graph.outputs, graph(*(torch.from_numpy(images[m]) for m in graph.modalities)), strict=True))
     features, shared = model.embed(**images), model.embed(**images, shared=True)
@@ -125,7 +125,9 @@ def test_the_heads_have_a_view_of_their_own_where_they_learned_from_one(smoke_ru
         torch.testing.assert_close(found[f"shared_{m}"], shared[m], atol=1e-3, rtol=1e-3)
         assert not torch.allclose(shared[m], model.project(m, features[m]), atol=1e-3)
     check(model, graph, pack)
-    graph.head_filter = graph.head_filter.flip(0)  # the parity check looks at the shared space too
+    graph.head_views["vision"].filter = graph.head_views["vision"].filter.flip(
+        0
+    )  # the parity check looks at the shared space too
     with pytest.raises(ValueError, match="shared_"):
         check(model, graph, pack)
 
@@ -211,9 +213,11 @@ def test_two_sensors_are_normalised_alike(tmp_path: Path) -> None:
 
 
 def test_a_wrong_normalisation_is_no_export(model: Model, pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(graphs, "IMAGENET_MEAN", (0.5,) * 3)
+    with monkeypatch.context() as patch:
+        patch.setattr(EncoderConfig, "levels", ((0.5,) * 3, (0.225,) * 3))
+        wrong = ExportModule(model)
     with pytest.raises(ValueError, match=r"not the trained model: embedding_vision has cosine .*--min-cosine"):
-        check(model, ExportModule(model), pack)
+        check(model, wrong, pack)
 
 
 def test_a_corrupted_graph_leaves_no_export(

@@ -27,7 +27,7 @@ from mvitac.deploy.card import _harmless
 from mvitac.deploy.engine import Engine
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.run_names import names_of
-from mvitac.nn.encoders import EncoderConfig, build_trunk
+from mvitac.nn.encoders import Encoders, build_trunk
 from mvitac.system.files import digest, digest_file, read_json, write_json
 from support.training_runs import smoke
 
@@ -148,7 +148,8 @@ def test_the_place_of_its_data_is_not_opened(
 
 def encoder(**fields: str) -> Change:
     def change(trap: Path, run: dict[str, Any]) -> None:
-        run["encoder"] |= {k: v.replace("{trap}", str(trap)) for k, v in fields.items()}
+        for own in run["encoder"].values():
+            own |= {k: v.replace("{trap}", str(trap)) for k, v in fields.items()}
 
     return change
 
@@ -270,13 +271,13 @@ def test_weights_that_an_artifact_names_are_not_opened(
     pack: Pack, trap: Path, tmp_path: Path, touched: list[str], monkeypatch: pytest.MonkeyPatch, weights: str
 ) -> None:
     """Of a trunk that timm has weights for. The artifact's controls are of random weights."""
-    scratch = EncoderConfig(trunk="test_resnet.r160_in1k", weights="scratch")
-    torch.save(build_trunk(scratch, 3).state_dict(), trap / "trunk.pth")
+    scratch = Encoders.both(trunk="test_resnet.r160_in1k", weights="scratch")
+    torch.save(build_trunk(scratch.touch, 3).state_dict(), trap / "trunk.pth")
     mvitac.train(replace(smoke(pack, steps=1, eval_every=0), encoder=scratch), tmp_path / "run", quiet=True)
     made = publish(tmp_path / "run", tmp_path / "made", pack)
     forge(made, trap, run=encoder(weights=weights))
     asked: list[str] = []
-    monkeypatch.setattr("mvitac.nn.encoders._with_imagenet", lambda trunk, arguments: asked.append(trunk))
+    monkeypatch.setattr("mvitac.nn.imagenet.load", lambda trunk, arguments: asked.append(trunk))
     touched.clear()
     publish(made, tmp_path / "again", pack, allow_leak=True)
     check(list(touched), trap)

@@ -14,7 +14,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.evaluation.classifiers import fit_knn, fit_linear
 from mvitac.evaluation.controls import borders, controls_of, start_weights, starts_of, thumbnails
 from mvitac.methods.supervised import SupervisedConfig
-from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.recipes import recipe, with_method
 from mvitac.run import Run
 from support.toy import Toy, toy_pack
@@ -43,11 +43,12 @@ def test_the_border_sees_nothing_of_the_middle() -> None:
 
 
 def test_start_weights_are_named_once_and_scratch_is_none() -> None:
-    run = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
-    trained = replace(run, encoder=replace(run.encoder, weights="b.pth"))
+    run = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
+    trained = replace(run, encoder=run.encoder.changed(weights="b.pth"))
     assert start_weights([run, run], None) == []
-    assert start_weights([trained, run, trained], Path("a.pth")) == ["a.pth", "b.pth"]
-    assert start_weights([trained], Path("b.pth")) == ["b.pth"]
+    given = run.encoder.changed(weights="a.pth")
+    assert start_weights([trained, run, trained], Path("a.pth")) == [given, trained.encoder]
+    assert start_weights([trained], Path("b.pth")) == [trained.encoder]
 
 
 def test_neighbours_are_by_cosine_and_vote_in_shares() -> None:
@@ -69,7 +70,7 @@ def modalities_of(runs: list[Run], spec: DataSpec) -> list[tuple[str, int]]:
 
 def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
     """Whatever the order of the runs, the control is of one that has all the others have."""
-    base = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
+    base = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
     spec, again = Toy().spec(), replace(base, seed=1)
     touch, vision = (replace(base, method=SupervisedConfig(modalities=(m,))) for m in ("touch", "vision"))
     apart = with_method(base, "simclr")  # both modalities, no space that they share
@@ -82,7 +83,7 @@ def test_an_untrained_trunk_stands_beside_every_modality_and_search() -> None:
 def test_the_untrained_trunk_is_of_the_runs_own_data(tmp_path: Path) -> None:
     """A classifier of ``bright`` and a method of pairs, probed on touch alone without that label."""
     pack = toy_pack(tmp_path / "p", num=60, vision_channels=0)
-    base = replace(recipe("smoke"), encoder=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH))
+    base = replace(recipe("smoke"), encoder=Encoders.both(trunk="mvitac_tiny", weights=SCRATCH))
     runs = [replace(base, method=SupervisedConfig(tasks=("bright",))), with_method(replace(base, seed=1), "ssvtp")]
     pack.spec, own = replace(pack.spec, tasks=pack.spec.tasks[:1]), Toy().spec()
     records, retrieval = controls_of(runs, pack, pack.spec.tasks, ["touch"], ["knn"], specs=[own, own])

@@ -38,7 +38,6 @@ from mvitac.nn.initial import Init
 from mvitac.recipes import recipe
 from mvitac.run import load_run
 from mvitac.training.loop import train
-from mvitac.transforms.preprocess import encoder_input
 from support.toy import Toy
 
 
@@ -179,7 +178,7 @@ def test_batch_norm_takes_the_statistics_of_the_given_images(model: Model, other
     hook = trunk.get_submodule(names[0]).register_forward_hook(lambda _, given, out: inputs.append(given[0]))
     images = torch.from_numpy(others.images["touch"][rows]).permute(0, 3, 1, 2)
     with torch.no_grad():
-        trunk(encoder_input(images, model.run.augment.eval_size))
+        trunk(model.input("touch", images))
     hook.remove()
     torch.testing.assert_close(first.running_mean, inputs[0].mean((0, 2, 3)))
     assert not made.encoders["touch"].training

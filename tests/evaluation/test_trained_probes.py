@@ -19,7 +19,7 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.regressors import fit_ridge
 from mvitac.evaluation.trained_probes import Attentive, fit_network
 from mvitac.methods.calandra import Streams
-from mvitac.nn.encoders import EncoderConfig, build_trunk, last_map
+from mvitac.nn.encoders import Encoders, build_trunk, last_map
 from mvitac.recipes import recipe
 from mvitac.training.loop import train
 from support.small_methods import TINY
@@ -142,7 +142,7 @@ def test_networks_probe_classes_and_values_of_a_run(tmp_path: Path, monkeypatch:
     pack = build(Toy(values=True), tmp_path / "pack", size=64, workers=1, quiet=True)
     run = replace(recipe("smoke", PackConfig(path=pack.path)), steps=1, eval_every=0)
     run = replace(
-        run, augment=replace(run.augment, size=64), encoder=EncoderConfig(trunk="mvitac_tiny", weights="scratch")
+        run, augment=replace(run.augment, size=64), encoder=Encoders.both(trunk="mvitac_tiny", weights="scratch")
     )
     path = train(run, tmp_path / "run", quiet=True)
     session = ProbeConfig(probes=("mlp", "attentive"), tasks=("bright", "both"), modalities=("both",))

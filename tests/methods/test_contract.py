@@ -15,6 +15,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from mvitac.data.pack import Pack
 from mvitac.methods.base import MethodConfig, Views
 from mvitac.model_files import load
+from mvitac.nn.encoders import Encoders
 from mvitac.recipes import with_method
 from mvitac.registry import default, from_json, to_json
 from mvitac.run import Optim
@@ -35,7 +36,7 @@ def test_every_trained_weight_gets_a_gradient_and_no_other(name: str, touch: int
     losses = outcome(method, views(method, touch=touch))
     assert losses["loss"].ndim == 0 and all(torch.isfinite(value) for value in losses.values())
     losses["loss"].backward()
-    trained = {id(p) for group in build_optimiser(Optim(), method).param_groups for p in group["params"]}
+    trained = {id(p) for group in build_optimiser(Optim(), method, Encoders()).param_groups for p in group["params"]}
     for parameter_name, parameter in method.named_parameters():
         assert (parameter.grad is not None) == (id(parameter) in trained), parameter_name
     assert {id(p) for trunk in method.encoders().values() for p in trunk.parameters()} <= trained
@@ -67,7 +68,7 @@ def test_on_a_gpu_nothing_stays_behind_and_nothing_is_waited_for(name: str) -> N
         assert {value.device.type for value in losses.values()} == {"cuda"}
         for parameter in method.parameters():
             parameter.grad = fake(parameter) if parameter.requires_grad else None
-        build_optimiser(Optim(name="adamw"), method).step()
+        build_optimiser(Optim(name="adamw"), method, Encoders()).step()
         method.after_step(0.5)
 
 

@@ -9,12 +9,12 @@ from mvitac.methods.byol import regression
 from mvitac.methods.dino import DINO, DINOConfig
 from mvitac.methods.simclr import nt_xent
 from mvitac.methods.vicreg import VICReg, VICRegConfig
-from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.nn.losses import queue_nce
 from support.toy import Toy
 
 loss = pytest.importorskip("lightly.loss")
-TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
+TINY = Encoders.both(trunk="mvitac_tiny", weights=SCRATCH)
 
 
 @pytest.fixture

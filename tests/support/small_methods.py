@@ -8,12 +8,12 @@ import torch
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Method, MethodConfig, Views
-from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.registry import default
 from support.toy import Toy
 
-TINY = EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
-TINY_VIT = EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH)
+TINY = Encoders.both(trunk="mvitac_tiny", weights=SCRATCH)
+TINY_VIT = Encoders.both(trunk="mvitac_tiny_vit", weights=SCRATCH)
 ROWS = torch.arange(3, 83)
 
 

@@ -24,7 +24,7 @@ from mvitac.experiments.plan import Plan, Row
 from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.model_files import fresh, load
-from mvitac.nn.encoders import EncoderConfig, PerFrame, build_trunk
+from mvitac.nn.encoders import Encoders, PerFrame, build_trunk
 from mvitac.nn.initial import Init, load_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.nn.weights import adapt_stem
@@ -34,7 +34,7 @@ from mvitac.training.start import describe, load_start, read_start
 from support.toy import Toy, toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
 
-TINY = EncoderConfig(trunk="mvitac_tiny", weights="scratch")
+TINY = Encoders.both(trunk="mvitac_tiny", weights="scratch")
 
 
 def started(pack: Pack, init: Init, **changes: object) -> tuple[Run, torch.nn.Module, dict[str, list[str]]]:
@@ -88,7 +88,7 @@ def test_takes_what_fits_and_what_was_asked_for(pack: Pack, smoke_run: Path) -> 
 
 def test_a_bare_file_and_one_modality(pack: Pack, smoke_run: Path, tmp_path: Path) -> None:
     """A trunk's state dict goes to every encoder, one with names of encoders to its own; a timm classifier is left out."""
-    trunk = build_trunk(TINY, 3)
+    trunk = build_trunk(TINY.touch, 3)
     state = {**trunk.state_dict(), "vision.weight": torch.zeros(2)}
     bare, named = tmp_path / "bare.safetensors", tmp_path / "named.safetensors"
     safetensors.torch.save_file(trunk.state_dict(), bare)
@@ -110,7 +110,7 @@ def test_a_bare_file_and_one_modality(pack: Pack, smoke_run: Path, tmp_path: Pat
 def test_stem_is_adapted_to_the_channels(channels: int, wanted: int) -> None:
     """The same picture in all places gives the same features, whatever their number."""
     torch.manual_seed(0)
-    before, after = build_trunk(TINY, channels).eval(), build_trunk(TINY, wanted).eval()
+    before, after = build_trunk(TINY.touch, channels).eval(), build_trunk(TINY.touch, wanted).eval()
     load_trunk(after, before.state_dict())
     picture = torch.randn(2, 3, 32, 32)
     expected = before(picture.repeat(1, channels // 3, 1, 1))
@@ -121,16 +121,16 @@ def test_stem_is_adapted_to_the_channels(channels: int, wanted: int) -> None:
 
 def test_trunks_of_windows_and_of_single_images_take_each_other() -> None:
     torch.manual_seed(0)
-    single = build_trunk(TINY, 3)
-    frames = build_trunk(replace(TINY, temporal="attention"), 9, 3)
+    single = build_trunk(TINY.touch, 3)
+    frames = build_trunk(replace(TINY.touch, temporal="attention"), 9, 3)
     assert isinstance(frames, PerFrame)
     load_trunk(frames, single.state_dict())
     assert_equal_states(frames.trunk, single)
     frames.age.data += 1
-    other = build_trunk(replace(TINY, temporal="attention"), 9, 3)
+    other = build_trunk(replace(TINY.touch, temporal="attention"), 9, 3)
     load_trunk(other, frames.state_dict())
     assert_equal_states(other, frames)
-    again = build_trunk(TINY, 3)
+    again = build_trunk(TINY.touch, 3)
     load_trunk(again, frames.state_dict())
     assert_equal_states(again, single)
 
@@ -220,11 +220,11 @@ def test_weights_of_a_file_are_a_leak_that_cannot_be_excluded(
     pack: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With ``--encoder.weights FILE``, too: nothing says what the file was trained on."""
-    encoder = EncoderConfig(trunk="test_resnet.r160_in1k", weights="scratch")
+    encoder = Encoders.both(trunk="test_resnet.r160_in1k", weights="scratch")
     file = tmp_path / "trunk.safetensors"
-    save_file(build_trunk(encoder, 3).state_dict(), file)
+    save_file(build_trunk(encoder.touch, 3).state_dict(), file)
     run = smoke(pack, steps=1, eval_every=0)
-    train(replace(run, encoder=replace(encoder, weights=str(file))), tmp_path / "run", quiet=True)
+    train(replace(run, encoder=encoder.changed(weights=str(file))), tmp_path / "run", quiet=True)
     said = capsys.readouterr().err
     assert said.startswith("mvitac: warning: nothing says what ") and "trunk.safetensors was trained on" in said
     assert main(["probe", str(tmp_path / "run"), "--tasks", "pattern", "--no-controls"]) == 0

@@ -81,7 +81,7 @@ def describe(models: Sequence[Model], places: Sequence[str], about: About) -> di
     return {
         **found,
         **given,
-        "size": model.sides[0],
+        "size": max(model.sides(m)[0] for m in model.encoders),
         "seeds": seeds,
         "weights": [each.weights_digest() for each in models],
         "parameters": {m: sum(p.numel() for p in trunk.parameters()) for m, trunk in model.encoders.items()},
@@ -99,14 +99,15 @@ def _of_external(model: ExternalModel) -> dict[str, Any]:
 
 def _of_run(model: Model, path: Path) -> dict[str, Any]:
     run = model.run
-    start = [] if run.encoder.weights == SCRATCH else [f"starts from {Path(run.encoder.weights).name}"]
+    weights = dict.fromkeys(run.encoder[m].weights for m in model.encoders)
+    start = [f"starts from {Path(name).name}" for name in weights if name != SCRATCH]
     if run.init.digest:
         record = load_run(path)[1] if (path / "run.json").exists() else {}
         with fields_of(path / "run.json"):
             known = record.get("start", {"name": "other weights", "trained_on": [UNKNOWN]})
             start += [f"starts from {known['name']}, which was trained on: {', '.join(known['trained_on'])}"]
     widths = {m: num_features(trunk) for m, trunk in model.encoders.items()}
-    name = f"{run.method.name} ({run.recipe}, {run.encoder.trunk})"
+    name = f"{run.method.name} ({run.recipe}, {run.encoder.named(model.encoders)})"
     about = {"name": name, "licence": None, "trained_on": "; ".join([model.spec.name, *start])}
     return {**about, "images_seen": _images_seen(model, path), "method": run.method.name, "features": widths}
 
@@ -114,7 +115,11 @@ def _of_run(model: Model, path: Path) -> dict[str, Any]:
 def _images_seen(model: Model, path: Path) -> int | None:
     """Steps x batch size, which is images of each modality. None if it started from weights, or rows are not known."""
     run, steps = model.run, model.run.steps
-    if run.encoder.weights != SCRATCH or run.init.digest or not (steps or (path / FILE).exists()):
+    if (
+        {run.encoder[m].weights for m in model.encoders} != {SCRATCH}
+        or run.init.digest
+        or not (steps or (path / FILE).exists())
+    ):
         return None
     if not steps:
         steps = run.num_steps(sum(len(source.ids) for source in read_sources(path) or ()))

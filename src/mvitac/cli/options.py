@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import inspect
 import io
+import itertools
 import json
 import os
 import re
@@ -32,6 +33,7 @@ def parse(
         default: instance of ``kind`` with other defaults than its own.
         description: text of ``--help`` above the options, instead of the docstring of ``kind``.
     """
+    argv = _for_both(argv)
     options: dict[str, Any] = {"args": list(argv), "prog": f"mvitac {prog}"}
     if default is not None:
         options["default"] = default
@@ -50,6 +52,18 @@ def parse(
         if not exit_.code:
             raise
         raise ValueError(_one_line(boxed.getvalue(), prog)) from None
+
+
+def _for_both(argv: Sequence[str]) -> list[str]:
+    """``argv`` with ``--encoder.NAME VALUE`` as ``--encoder.vision.NAME VALUE --encoder.touch.NAME VALUE``."""
+    found: list[str] = []
+    for at, word in enumerate(argv):
+        if short := re.fullmatch(r"--encoder\.((?!vision\.|touch\.).*)", word):
+            values = itertools.takewhile(lambda other: not other.startswith("--"), argv[at + 1 :])
+            found += [f"--encoder.vision.{short[1]}", *values, f"--encoder.touch.{short[1]}"]
+        else:
+            found.append(word)
+    return found
 
 
 @contextlib.contextmanager

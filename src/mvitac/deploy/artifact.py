@@ -26,7 +26,6 @@ from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import read_safetensors
 from mvitac.registry import from_json, to_json
 from mvitac.system.files import brief, fields_of
-from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
 
 ARTIFACT = SealedFolder(
     "artifact.json",
@@ -124,10 +123,10 @@ def preprocessing(model: Model) -> dict[str, Any]:
         "colour_order": "RGB",
         "channels": {m: model.spec.channels(m) for m in model.encoders},
         "stored": model.stored,
-        "size": model.run.augment.eval_size,
+        "size": {m: model.sides(m)[0] for m in model.encoders},
         "resize": "squash to stored (Pillow bilinear), then to size (antialiased bilinear)",
-        "mean": list(IMAGENET_MEAN),
-        "std": list(IMAGENET_STD),
+        "mean": {m: list(model.run.encoder[m].levels[0]) for m in model.encoders},
+        "std": {m: list(model.run.encoder[m].levels[1]) for m in model.encoders},
         "difference": model.spec.difference,
         "background": SUBTRACTED if model.spec.difference else AS_GIVEN,
         "sensors": list(model.spec.sensors),

@@ -18,16 +18,32 @@ from torch import Tensor, nn
 from mvitac.model import Model
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.transforms.gel_colours import Looks
-from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD
+
+
+class _View(nn.Module):
+    """uint8 [B, S, S, C] to the normalised [B, C, size, size] that an encoder takes, for probes or for heads."""
+
+    filter: Tensor
+    scale: Tensor
+    shift: Tensor
+
+    def __init__(self, model: Model, modality: str, for_heads: bool) -> None:
+        super().__init__()
+        mean, std = (torch.tensor(v).view(3, 1, 1) for v in model.run.encoder[modality].levels)
+        self.register_buffer("filter", _filter(model.sides(modality)[for_heads], model.stored))
+        self.register_buffer("scale", 1 / (255 * std))
+        self.register_buffer("shift", -mean / std)
+
+    def forward(self, images: Tensor) -> Tensor:
+        x, filter = images.permute(0, 3, 1, 2).float(), self.filter
+        if filter.shape[0] != filter.shape[1]:
+            x = _along_width(_along_width(x, filter).transpose(2, 3), filter).transpose(2, 3)
+        sensors = [x[:, i : i + 3] * self.scale + self.shift for i in range(0, x.shape[1], 3)]
+        return torch.cat(sensors, dim=1) if len(sensors) > 1 else sensors[0]
 
 
 class ExportModule(nn.Module):
     """The exported module. It shares no preprocessing code with ``Model.features``, so comparing them is a check."""
-
-    filter: Tensor
-    head_filter: Tensor
-    scale: Tensor
-    shift: Tensor
 
     lamps: Tensor
     mixing: Tensor
@@ -53,14 +69,10 @@ class ExportModule(nn.Module):
             + [f"shared_{m}" for m in self.projectors]
             + [output_of(r) for r in self.probes]  # type: ignore[arg-type]
         )
-        sides = model.run.augment
+        self.views = nn.ModuleDict({m: _View(model, m, for_heads=False) for m in self.modalities})
         # Heads need views of the size they were trained on.
-        self.twice = bool(self.projectors) and sides.size != sides.eval_size
-        self.register_buffer("filter", _filter(sides.eval_size, model.stored))
-        self.register_buffer("head_filter", _filter(sides.size, model.stored) if self.twice else torch.empty(0))
-        mean, std = (torch.tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
-        self.register_buffer("scale", 1 / (255 * std))
-        self.register_buffer("shift", -mean / std)
+        twice = [m for m in self.projectors if len(set(model.sides(m))) > 1]
+        self.head_views = nn.ModuleDict({m: _View(model, m, for_heads=True) for m in twice})
         if looks:
             mixing = [looks.source.mixtures @ target.colours.T for target in looks.targets]
             ground = [target.level + target.rest for target in looks.targets]
@@ -69,19 +81,11 @@ class ExportModule(nn.Module):
             self.register_buffer("minus_ground", torch.from_numpy(-np.stack(ground)).float())
         self.eval()
 
-    def view(self, images: Tensor, filter: Tensor) -> Tensor:
-        """Normalised [B, C, size, size] of uint8 [B, S, S, C], by a ``filter`` [size, S]."""
-        x = images.permute(0, 3, 1, 2).float()
-        if filter.shape[0] != filter.shape[1]:
-            x = _along_width(_along_width(x, filter).transpose(2, 3), filter).transpose(2, 3)
-        sensors = [x[:, i : i + 3] * self.scale + self.shift for i in range(0, x.shape[1], 3)]
-        return torch.cat(sensors, dim=1) if len(sensors) > 1 else sensors[0]
-
-    def encode(self, modality: str, images: Tensor, filter: Tensor) -> Tensor:
+    def encode(self, modality: str, images: Tensor, view: nn.Module) -> Tensor:
         """Features [B, D] of uint8 [B, S, S, C]."""
         if not (self.looks and modality == "touch"):
-            return self.encoders[modality](self.view(images, filter))
-        found = self.encoders[modality](self.view(self.recoloured(images), filter))
+            return self.encoders[modality](view(images))
+        found = self.encoders[modality](view(self.recoloured(images)))
         return found.reshape(len(self.mixing), -1, found.shape[1]).mean(0)
 
     def recoloured(self, images: Tensor) -> Tensor:
@@ -95,10 +99,8 @@ class ExportModule(nn.Module):
     def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
         """The outputs, in the order of ``outputs``, of the images, in the order of ``modalities``."""
         given = dict(zip(self.modalities, images, strict=True))
-        features = {m: self.encode(m, x, self.filter) for m, x in given.items()}
-        wanted = features
-        if self.twice:
-            wanted = {m: self.encode(m, given[m], self.head_filter) for m in self.projectors}
+        features = {m: self.encode(m, x, self.views[m]) for m, x in given.items()}
+        wanted = features | {m: self.encode(m, given[m], view) for m, view in self.head_views.items()}
         shared = [F.normalize(head(wanted[m]), dim=1) for m, head in self.projectors.items()]
         joined = torch.cat([features[m] for m in ("vision", "touch") if m in features], dim=1)
         return (*features.values(), *shared, *(probe(joined) for probe in self.probes))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mvitac.model import Model
-from mvitac.transforms.preprocess import check_range, encoder_input, resized
+from mvitac.transforms.preprocess import check_range, resized
 
 STATE = "observation.state"
 
@@ -45,7 +45,7 @@ class ObservationEncoder(nn.Module):
                     f" {', '.join(names)}"
                 )
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.keys})
-        self.stored, self.size, self.state, self.tune = model.stored, model.run.augment.eval_size, state, tune
+        self.stored, self.state, self.tune, self._input = model.stored, state, tune, model.input
         self._checked: set[str] = set()
         self.encoders.requires_grad_(tune)
         self.encoders.eval()
@@ -70,7 +70,7 @@ class ObservationEncoder(nn.Module):
                     raise ValueError(f"{name}: expected images [B, 3, H, W] or [B, T, 3, H, W], got {shape}")
                 self._check_range(name, image)
                 lead = image.shape[:-3]
-                views.append(encoder_input(resized(image.flatten(0, -4), self.stored), self.size))
+                views.append(self._input(modality, resized(image.flatten(0, -4), self.stored)))
             with torch.set_grad_enabled(self.tune and torch.is_grad_enabled()):
                 found.append(self.encoders[modality](torch.cat(views, dim=1)).float())
         features = torch.cat(found, dim=1).unflatten(0, lead)

@@ -13,7 +13,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.deploy.artifact import ARTIFACT, HUB_ID, preprocessing, read
 from mvitac.deploy.card import card
-from mvitac.evaluation.controls import Records, controls_of, scratch
+from mvitac.evaluation.controls import Records, controls_of
 from mvitac.evaluation.evaluate import as_trained, check_unseen, stored_result
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, write_sources
@@ -118,11 +118,12 @@ def _scores(run: Path, model: Model, pack: Pack, records: Records) -> dict[str, 
 def _controls(model: Model, pack: Pack, records: Records) -> Records:
     """The controls of the (task, modality) of ``records``. Without its weights, the ImageNet trunk is left out."""
     # The initial weights that an artifact names may be any file or download.
-    run, controls = scratch(model.run) if model.foreign else model.run, []
+    run, controls = model.run.fresh() if model.foreign else model.run, []
     try:
-        build_trunk(run.encoder, 3)
+        for modality in model.encoders:
+            build_trunk(run.encoder[modality], 3)
     except ValueError:
-        run = scratch(run)
+        run = run.fresh()
     sources: dict[tuple[str, ...], list[AnyTask]] = {}
     for task in pack.spec.all_tasks:
         sources.setdefault(tuple(r["modality"] for r in records if r["task"] == task.name), []).append(task)

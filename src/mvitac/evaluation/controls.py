@@ -28,7 +28,7 @@ from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.sensors import Standardise
 from mvitac.model import Model
 from mvitac.model_files import fresh
-from mvitac.nn.encoders import SCRATCH
+from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.run import Run
 from mvitac.system.progress import work
 from mvitac.system.threads import in_threads
@@ -80,16 +80,15 @@ def controls_of(
     with work("fitting probes of the controls", num, "probes"):
         records += pixel_controls(pack, tasks, modalities)
         # Built one by one: threads would share the random generator.
-        models = [fresh(scratch(run), spec, pack.size) for run, spec in starts]
+        models = [fresh(run.fresh(), spec, pack.size) for run, spec in starts]
         retrieval: Records = []
         scored = in_threads(lambda model: (probed(model), cross_modal(model, pack)), models)
         for (run, _), (found, ranked) in zip(starts, scored, strict=True):
             records += _named("untrained", run.seed, found)
             retrieval += _named("untrained", run.seed, ranked)
-        for name in weights:
+        for encoder in weights:
             run, spec = starts[0]
-            start = fresh(replace(run, encoder=replace(run.encoder, weights=name)), spec, pack.size)
-            records += _named("imagenet", None, probed(start))
+            records += _named("imagenet", None, probed(fresh(replace(run, encoder=encoder), spec, pack.size)))
     return records, retrieval
 
 
@@ -143,27 +142,23 @@ def starts_of(runs: Sequence[Run], specs: Sequence[DataSpec]) -> list[tuple[Run,
 
     def parts_of(run: Run, spec: DataSpec) -> tuple[set[str], int]:
         with torch.device("meta"):
-            method = run.method.build(spec, scratch(run).encoder)
+            method = run.method.build(spec, run.encoder.fresh())
         return set(method.encoders()), len(method.projectors())
 
     built = [(run, spec, *parts_of(run, spec)) for run, spec in zip(runs, specs, strict=True)]
     built.sort(key=lambda each: (len(each[2]), each[3]), reverse=True)
     found: list[tuple[Run, DataSpec]] = []
-    covered: dict[tuple[int, str, int], set[str]] = {}
+    covered: set[tuple[int, str, str, int]] = set()
     for run, spec, modalities, _ in built:
-        known = covered.setdefault((run.seed, run.encoder.trunk, run.augment.eval_size), set())
-        if not modalities <= known:
-            known |= modalities
+        parts = {(run.seed, m, run.encoder[m].trunk, run.augment.whole_of(m)) for m in modalities}
+        if not parts <= covered:
+            covered |= parts
             found.append((run, spec))
     return found
 
 
-def scratch(run: Run) -> Run:
-    """``run`` from random initial weights."""
-    return replace(run, encoder=replace(run.encoder, weights=SCRATCH))
-
-
-def start_weights(runs: Sequence[Run], imagenet: Path | None) -> list[str]:
-    """The pre-trained weights to probe as they are: those that ``runs`` started from, and ``imagenet``."""
-    weights = {str(imagenet)} if imagenet else set()
-    return sorted(weights | {run.encoder.weights for run in runs if run.encoder.weights != SCRATCH})
+def start_weights(runs: Sequence[Run], imagenet: Path | None) -> list[Encoders]:
+    """The pre-trained encoders to probe as they are: those that ``runs`` started from, and ``imagenet``."""
+    given = [runs[0].encoder.changed(weights=str(imagenet))] if imagenet else []
+    started = [e for e in (run.encoder for run in runs) if {e.vision.weights, e.touch.weights} != {SCRATCH}]
+    return list(dict.fromkeys([*given, *started]))

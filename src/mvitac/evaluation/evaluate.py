@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from mvitac.data.several import JoinedPack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
-from mvitac.evaluation.controls import Records, controls_of, scratch, start_weights
+from mvitac.evaluation.controls import Records, controls_of, start_weights
 from mvitac.evaluation.encoders import open_encoders, probe_encoders
 from mvitac.evaluation.events import check_event, with_event
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
@@ -116,7 +115,7 @@ def probe_runs(
         check_channels(path, model, pack, pack.spec.modalities)
     _check_tasks(pack, tasks, modalities)
     # The initial weights that an artifact names may be any file or download.
-    runs = [scratch(m.run) if m.foreign else m.run for m in models]
+    runs = [m.run.fresh() if m.foreign else m.run for m in models]
     _check_weights(runs, session)
     sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak)
     each = [*zip(paths, models, names, sources, strict=True)]
@@ -280,8 +279,9 @@ def check_unseen(
 
 def _check_weights(runs: Sequence[Run], session: ProbeConfig) -> None:
     """Load the weights of the controls once, so that missing ones are found before any probe is fitted."""
-    for weights in start_weights(runs, session.imagenet) if session.controls else ():
-        build_trunk(replace(runs[0].encoder, weights=weights), 3)
+    for encoder in start_weights(runs, session.imagenet) if session.controls else ():
+        for config in {encoder.vision, encoder.touch}:
+            build_trunk(config, 3)
 
 
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:

@@ -57,7 +57,7 @@ def features(
 
 def _place(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool, maps: bool) -> Path:
     """The file of these features in the cache."""
-    whole, heads = model.sides  # the weights' digest covers the first
+    whole, heads = model.sides(modality)  # the weights' digest covers the first
     kind = [*([heads] if for_heads and heads != whole else []), *(["map"] if maps else [])]
     device = next(model.parameters()).device.type
     key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device, *kind])

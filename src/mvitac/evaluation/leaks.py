@@ -19,6 +19,7 @@ import safetensors.numpy
 
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import image_sums, known_images, row_hashes
+from mvitac.data.spec import MODALITIES
 from mvitac.nn.encoders import IMAGENET, SCRATCH
 from mvitac.nn.weights import said_trained_on
 from mvitac.run import Run
@@ -59,9 +60,9 @@ def file_source(file: Path) -> Source:
 
 
 def weights_sources(run: Run) -> list[Source]:
-    """What the file of ``--encoder.weights`` learned from, if the run starts from one."""
-    weights = run.encoder.weights
-    return [] if weights in (IMAGENET, SCRATCH) else [file_source(Path(weights))]
+    """What the files of ``--encoder.weights`` learned from, if the run starts from some."""
+    weights = dict.fromkeys(run.encoder[m].weights for m in MODALITIES)
+    return [file_source(Path(name)) for name in weights if name not in (IMAGENET, SCRATCH)]
 
 
 def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:

@@ -22,7 +22,6 @@ from mvitac.evaluation.classifiers import fit_linear
 from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, Looks, learn_colours, recolour
-from mvitac.transforms.preprocess import encoder_input
 
 Standardise = Literal["colours", "batch-norm", "features"]
 NUM_STATISTICS = 256  # images of a sensor that statistics are taken from, at most
@@ -124,12 +123,12 @@ def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
     made = copy.deepcopy(model)
     trunk = made.encoders["touch"]
     if not any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in trunk.modules()):
-        raise ValueError(f"trunk {model.run.encoder.trunk} has no BatchNorm: leave --standardise batch-norm out")
+        raise ValueError(f"trunk {model.run.encoder.touch.trunk} has no BatchNorm: leave --standardise batch-norm out")
     device = next(trunk.parameters()).device
 
     def images(rows: np.ndarray) -> torch.Tensor:
         found = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][rows])).permute(0, 3, 1, 2).to(device)
-        return encoder_input(found, model.run.augment.eval_size)
+        return model.input("touch", found)
 
     update_bn((images(chunk) for chunk in np.array_split(rows, max(1, len(rows) // 64))), trunk)
     return made.eval()

@@ -12,7 +12,6 @@ from typing import Any
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.controls import scratch
 from mvitac.evaluation.evaluate import check_channels, check_unseen
 from mvitac.evaluation.leaks import Scored, Source, read_sources
 from mvitac.evaluation.probe import probe_model, scorable, split_rows
@@ -102,7 +101,7 @@ def adapt(
 
 def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, asked: Adaptation) -> Run:
     """The run of ``model`` on the new data, from its weights."""
-    old = scratch(model.run)
+    old = model.run.fresh()
     lr = old.optim.lr / 10 if asked.lr is None else asked.lr
     size = asked.batch_size or max(2, min(old.batch_size, len(old.method.training_rows(pack))))
     optim = replace(old.optim, lr=lr, schedule="cosine", warmup=0.1)

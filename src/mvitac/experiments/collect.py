@@ -196,7 +196,7 @@ def cost(label: str, jobs: Sequence[Job], pack: Pack) -> dict[str, Any]:
     """Steps, pairs, images, median seconds and (if measured) peak GPU memory of one run of a row."""
     run = jobs[0].run
     rows = len(run.method.training_rows(pack))
-    method = run.method.build(pack.spec, replace(run.encoder, weights=SCRATCH))
+    method = run.method.build(pack.spec, run.encoder.changed(weights=SCRATCH))
     steps = run.num_steps(rows)
     peaks = [read_json(p, "peak memory")["peak_bytes"] for job in jobs if (p := job.out / "memory.json").exists()]
     return {

@@ -22,7 +22,6 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.controls import scratch
 from mvitac.evaluation.evaluate import ProbeConfig, check_channels, check_unseen, chosen
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
@@ -139,10 +138,12 @@ def _method(
 
 def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
     """Fine-tuning with all labels: light views at the size at which the frozen features are probed."""
-    side = min(model.run.augment.eval_size, pack.size)
-    run = replace(scratch(model.run), recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
+    sides = {m: min(model.sides(m)[0], pack.size) for m in model.encoders}
+    run = replace(model.run.fresh(), recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
     run = replace(run, init=Init(path=ancestor, modalities=method.modalities, heads=False).resolved(), renew_norms=0)
-    run = replace(run, augment=Augment(size=side, vision=LIGHT, touch=LIGHT), sampler="shuffle", positives="same-image")
+    views: Any = {m: replace(LIGHT, size=side) for m, side in sides.items()}
+    augment = Augment(size=max(sides.values()), **views)
+    run = replace(run, augment=augment, sampler="shuffle", positives="same-image")
     return replace(run, chunk=0, eval_every=0, checkpoint_every=0)
 
 

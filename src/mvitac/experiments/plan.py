@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from mvitac.data.spec import MODALITIES
 from mvitac.datasets.base import DatasetConfig
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe import Probe
@@ -144,9 +145,13 @@ def slug(label: str) -> str:
 
 def changed(run: Run, changes: Mapping[str, Any]) -> Run:
     """``run`` with fields changed by dotted name; values as in JSON."""
-    value = to_json(run)
+    value, whole = to_json(run), {}
     for name, new in changes.items():
-        *path, last = ("init", "path") if name == "init" else name.split(".")
+        both = name.startswith("encoder.") and name.count(".") == 1  # short for both modalities
+        names = [name.replace(".", f".{m}.") for m in MODALITIES] if both else ["init.path" if name == "init" else name]
+        whole |= dict.fromkeys(names, new)
+    for name, new in whole.items():
+        *path, last = name.split(".")
         inner = value
         for part in path:
             inner = inner.get(part) if isinstance(inner, dict) else None

@@ -6,7 +6,7 @@ Shapes: B images in a batch, V views of each image, C channels, H x W pixels, D 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import SCRATCH, EncoderConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, keep_modes
 from mvitac.registry import Registered
 
 Embeddings = dict[Hashable, Tensor]
@@ -49,6 +49,11 @@ class Method(nn.Module, ABC):
 
     views: ClassVar[int] = 1
     """Views per image that ``forward`` needs."""
+
+    def train(self, mode: bool = True) -> Self:
+        super().train(mode)
+        keep_modes(self)
+        return self
 
     @abstractmethod
     def forward(self, batch: Views) -> dict[str, Tensor]:
@@ -170,13 +175,13 @@ class MethodConfig(Registered, ABC):
             if not 1 <= getattr(self, name) <= 65536:
                 raise ValueError(f"{name} {getattr(self, name)}: give 1 to 65536")
 
-    def on_tiny_trunk(self, spec: DataSpec, encoder: EncoderConfig) -> Method:
+    def on_tiny_trunk(self, spec: DataSpec, encoder: Encoders) -> Method:
         """The method on a trunk that is built in no time, to find out whether and how it works on the dataset."""
         trunk = "mvitac_tiny_vit" if self.needs_vit else "mvitac_tiny"
-        return self.build(spec, replace(encoder, trunk=trunk, weights=SCRATCH))
+        return self.build(spec, encoder.changed(trunk=trunk, weights=SCRATCH))
 
     def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
-        """Raise ValueError if the method cannot train ``encoder`` on views of ``size`` px."""
+        """Raise ValueError if the method cannot train ``encoder`` of a modality on views of ``size`` px."""
         return
 
     def check_modalities(self, spec: DataSpec) -> None:
@@ -249,5 +254,5 @@ class MethodConfig(Registered, ABC):
         return self
 
     @abstractmethod
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> Method:
+    def build(self, spec: DataSpec, encoder: Encoders) -> Method:
         """Create the method with fresh weights. Raises ValueError if it cannot work on the dataset."""

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import EncoderConfig, Head, Projected, build_trunk, num_features, trunks
+from mvitac.nn.encoders import Encoders, Head, Projected, build_trunk, num_features, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
 
 
@@ -36,7 +36,7 @@ class BYOLConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(share=("momentum", "momentum_end"), width=("out", "hidden"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "BYOL":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "BYOL":
         return BYOL(self, spec, encoder)
 
 
@@ -50,12 +50,12 @@ class BYOL(Contrastive):
 
     views = 2
 
-    def __init__(self, config: BYOLConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: BYOLConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.online, self.predictor = nn.ModuleDict(), nn.ModuleDict()
         for modality in spec.modalities:
-            trunk = build_trunk(encoder, spec.channels(modality), spec.frames(modality))
+            trunk = build_trunk(encoder[modality], spec.channels(modality), spec.frames(modality))
             self.online[modality] = Projected(trunk, Head(num_features(trunk), config.hidden, config.out, norm=True))
             self.predictor[modality] = Head(config.out, config.hidden, config.out, norm=True)
         self.target = nn.ModuleDict({m: Momentum(tower) for m, tower in self.online.items()})

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.supervised import LabelledConfig, Supervised
-from mvitac.nn.encoders import EncoderConfig, build_trunk, last_map, num_features
+from mvitac.nn.encoders import EncoderConfig, Encoders, build_trunk, last_map, num_features
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +30,10 @@ class CalandraConfig(LabelledConfig):
             if not 1 <= width <= 65536:
                 raise ValueError(f"widths {self.widths}: give two numbers, each 1 to 65536")
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> Supervised:
-        streams: dict[str, nn.Module] = {m: Streams(encoder, spec.channels(m) // 3) for m in self.modalities_of(spec)}
+    def build(self, spec: DataSpec, encoder: Encoders) -> Supervised:
+        streams: dict[str, nn.Module] = {
+            m: Streams(encoder[m], spec.channels(m) // 3) for m in self.modalities_of(spec)
+        }
         width = sum(num_features(stream) for stream in streams.values())
         first, second = self.widths
 

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, build_towers, heads, trunks
+from mvitac.nn.encoders import Encoders, build_towers, heads, trunks
 from mvitac.nn.memory_bank import Bank
 
 EPS = 1e-7  # added to both denominators, as in the reference code
@@ -65,7 +65,7 @@ class CMCConfig(MethodConfig):
         limit = max(1, int(self.negatives_per_row * num_rows)) if self.negatives_per_row else self.num_negatives
         return min(self.num_negatives, limit)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "CMC":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "CMC":
         self.check_modalities(spec)
         return CMC(self, spec, encoder)
 
@@ -84,7 +84,7 @@ class CMC(Contrastive):
     rows: Tensor
     z_norm: Tensor
 
-    def __init__(self, config: CMCConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: CMCConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.towers = build_towers(encoder, spec, lambda width: nn.Linear(width, config.out))

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
+from mvitac.nn.encoders import Encoders, build_towers, trunks
 from mvitac.nn.momentum import Momentum, momentum_at
 
 BOTTLENECK = 256
@@ -61,7 +61,7 @@ class DINOConfig(MethodConfig):
             width=("out", "hidden"),
         )
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "DINO":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "DINO":
         return DINO(self, spec, encoder)
 
 
@@ -91,7 +91,7 @@ class DINO(Contrastive):
     centre: Tensor
     """[modalities, K], in the order of ``student``."""
 
-    def __init__(self, config: DINOConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: DINOConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         sizes = config.hidden, config.out, config.prototype_norm

@@ -35,7 +35,7 @@ from torch import Tensor, nn
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
 from mvitac.nn import vit
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import EncoderConfig, Encoders
 from mvitac.nn.momentum import Momentum
 
 TRIES = 8
@@ -84,7 +84,7 @@ class IJEPAConfig(MethodConfig):
     def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
         vit.check_vit(encoder, self.name, size)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "IJEPA":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "IJEPA":
         return IJEPA(self, spec, encoder)
 
     def ema_at(self, progress: float) -> float:
@@ -159,7 +159,7 @@ def multi_block(config: IJEPAConfig, seed: Tensor, rows: Tensor, stream: int, gr
 class IJEPA(Contrastive):
     """A ViT, its momentum copy (the teacher) and a predictor per modality."""
 
-    def __init__(self, config: IJEPAConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: IJEPAConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
@@ -168,24 +168,25 @@ class IJEPA(Contrastive):
         self.predictors = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             width = vit.vit_of(trunk).embed_dim
-            self.predictors[modality] = vit.Predictor(trunk, width, config.senses, shape, 1 / 2, (384, 12))
+            other = vit.other_trunk(self.trunks, modality, config.senses)
+            self.predictors[modality] = vit.Predictor(trunk, width, other, shape, 1 / 2, (384, 12))
 
-    def blocks(self, batch: Views, modality: str) -> tuple[Blocks, tuple[int, int]]:
-        """The blocks of each image that the ViT of ``modality`` sees, and the grid of its patches."""
+    def blocks(self, batch: Views, modality: str) -> Blocks:
+        """The blocks of each image that the ViT of ``modality`` sees."""
         trunk, stream = self.trunks[modality], list(self.trunks).index(modality)
         grid = vit.grid_of(trunk, batch.images[modality][0])
-        return multi_block(self.config, batch.seed, batch.rows, stream, grid).each(vit.frames_of(trunk)), grid
+        return multi_block(self.config, batch.seed, batch.rows, stream, grid).each(vit.frames_of(trunk))
 
     def queries(self, batch: Views) -> Embeddings:
         """("predicted", modality) -> [B, M S, D], with the frames of a window one after another."""
         found = {m: self.blocks(batch, m) for m in self.trunks}
         seen = {}
-        for m, (blocks, _) in found.items():
+        for m, blocks in found.items():
             seen[m] = vit.encode_visible(self.trunks[m], batch.images[m][0], blocks.context, blocks.in_context)
         result: Embeddings = {}
-        for modality, (blocks, grid) in found.items():
+        for modality, blocks in found.items():
             other = next((seen[m] for m in seen if m != modality), None)
-            predicted = self.predictors[modality](seen[modality], blocks.targets, grid, blocks.in_target, other)
+            predicted = self.predictors[modality](seen[modality], blocks.targets, blocks.in_target, other)
             result["predicted", modality] = predicted.reshape(len(batch.rows), -1, predicted.shape[-1])
         return result
 
@@ -194,7 +195,7 @@ class IJEPA(Contrastive):
         """("target", modality) -> [B, M S, D], and ("weight", modality) -> [B, M S], which sums to 1 for each row."""
         result: Embeddings = {}
         for modality, trunk in self.trunks.items():
-            blocks, _ = self.blocks(batch, modality)
+            blocks = self.blocks(batch, modality)
             teacher: VisionTransformer = self.teachers[modality].module  # type: ignore[assignment]
             tokens = teacher.forward_features(vit.each_frame(trunk, batch.images[modality][0]))
             tokens = tokens[:, teacher.num_prefix_tokens :]

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, with_sum
 from mvitac.nn import vit
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import EncoderConfig, Encoders
 
 EPS = 1e-6  # added to the variance of a patch, as in the authors' code
 
@@ -61,7 +61,7 @@ class MAEConfig(MethodConfig):
     def check_encoder(self, encoder: EncoderConfig, size: int) -> None:
         vit.check_vit(encoder, self.name, size)
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MAE":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "MAE":
         return MAE(self, spec, encoder)
 
 
@@ -84,7 +84,7 @@ def pixel_targets(values: Float[Tensor, "B N P"], pixel_norm: bool) -> Float[Ten
 class MAE(Contrastive):
     """A ViT and a decoder per modality."""
 
-    def __init__(self, config: MAEConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: MAEConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.trunks = vit.build_vits(encoder, spec, config.name, config.senses)
@@ -92,7 +92,8 @@ class MAE(Contrastive):
         self.decoders = nn.ModuleDict()
         for modality, trunk in self.trunks.items():
             pixels = vit.patches(trunk, torch.zeros(1, spec.channels(modality), 1, 1)).shape[2]
-            self.decoders[modality] = vit.Predictor(trunk, pixels, config.senses, shape, 2 / 3, (512, 8))
+            other = vit.other_trunk(self.trunks, modality, config.senses)
+            self.decoders[modality] = vit.Predictor(trunk, pixels, other, shape, 2 / 3, (512, 8))
 
     def queries(self, batch: Views) -> Embeddings:
         """("loss", modality) -> [B], the loss of each row."""
@@ -108,8 +109,7 @@ class MAE(Contrastive):
             images = batch.images[modality][0]
             other = next((seen[m] for m in seen if m != modality), None)
             decoder = self.decoders[modality]
-            size = vit.grid_of(trunk, images)
-            predicted = decoder(seen[modality], hidden[modality][:, None], size, other=other)[:, 0]
+            predicted = decoder(seen[modality], hidden[modality][:, None], other=other)[:, 0]
             with torch.autocast(images.device.type, enabled=False):
                 values = vit.take(vit.patches(trunk, images.float()), hidden[modality])
                 error = (predicted.float() - pixel_targets(values, self.config.pixel_norm)) ** 2

@@ -22,7 +22,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, Views
 from mvitac.methods.moco import QueueConfig
 from mvitac.methods.mvitac import PARTS, MViTac, MViTacConfig
-from mvitac.nn.encoders import EncoderConfig
+from mvitac.nn.encoders import Encoders
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 
@@ -47,7 +47,7 @@ class MCTConfig(QueueConfig):
         super().__post_init__()
         self.check_fields(positive=("temperature",), weight=("margin", "lambda_inter"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MCT":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "MCT":
         self.check_modalities(spec)
         return MCT(self, spec, encoder)
 
@@ -66,7 +66,7 @@ class MCT(Contrastive):
 
     views = 2
 
-    def __init__(self, config: MCTConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: MCTConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         same = ("temperature", "lambda_inter", "momentum", "out", "hidden", "head_norm")

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import EncoderConfig, Head, build_towers, trunks
+from mvitac.nn.encoders import Encoders, Head, build_towers, trunks
 from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Queue
 from mvitac.nn.momentum import Momentum, momentum_at
@@ -66,7 +66,7 @@ class MoCoConfig(QueueConfig):
         super().__post_init__()
         self.check_fields(positive=("temperature",))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MoCo":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "MoCo":
         return MoCo(self, spec, encoder)
 
 
@@ -75,7 +75,7 @@ class MoCo(Contrastive):
 
     views = 2
 
-    def __init__(self, config: MoCoConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: MoCoConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.query = build_towers(

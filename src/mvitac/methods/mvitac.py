@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, row_pairs
-from mvitac.nn.encoders import EncoderConfig, Head, build_trunk, draws_random_numbers, num_features, trunks
+from mvitac.nn.encoders import EncoderConfig, Encoders, Head, build_trunk, draws_random_numbers, num_features, trunks
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
 from mvitac.system.threads import in_branches
@@ -107,7 +107,7 @@ class MViTacConfig(MethodConfig):
             mine = replace(mine, lambda_sensor=0.0)
         return mine if len(spec.modalities) > 1 else replace(mine, lambda_inter=1.0, pairs="crossed")
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "MViTac":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "MViTac":
         possible = possible_losses(spec)
         if not set(self.losses) & set(possible):
             raise ValueError(
@@ -152,11 +152,11 @@ class MViTac(Contrastive):
 
     views = 2
 
-    def __init__(self, config: MViTacConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: MViTacConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         # vision: theta, phi_v (intra), phi_t (inter); touch: psi, Phi_t (intra), Phi_v (inter)
-        towers = {m: Tower(config, encoder, spec.channels(m), spec.frames(m)) for m in spec.modalities}
+        towers = {m: Tower(config, encoder[m], spec.channels(m), spec.frames(m)) for m in spec.modalities}
         self.query = nn.ModuleDict(towers)
         momentum = self.query if config.keys == "momentum" else {}
         self.key = nn.ModuleDict({m: Momentum(tower) for m, tower in momentum.items()})

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import EncoderConfig, Head, build_towers, trunks
+from mvitac.nn.encoders import Encoders, Head, build_towers, trunks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class SimCLRConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(positive=("temperature",), width=("out", "hidden"))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "SimCLR":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "SimCLR":
         return SimCLR(self, spec, encoder)
 
 
@@ -55,7 +55,7 @@ class SimCLR(Contrastive):
 
     views = 2
 
-    def __init__(self, config: SimCLRConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: SimCLRConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.towers = build_towers(

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views
-from mvitac.nn.encoders import EncoderConfig, build_towers, heads, trunks
+from mvitac.nn.encoders import Encoders, build_towers, heads, trunks
 from mvitac.nn.losses import info_nce
 
 
@@ -35,7 +35,7 @@ class SSVTPConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(positive=("temperature",), width=("out",))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "SSVTP":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "SSVTP":
         self.check_modalities(spec)
         return SSVTP(self, spec, encoder)
 
@@ -43,7 +43,7 @@ class SSVTPConfig(MethodConfig):
 class SSVTP(Contrastive):
     """Two towers, one symmetric loss."""
 
-    def __init__(self, config: SSVTPConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: SSVTPConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         self.towers = build_towers(encoder, spec, lambda width: nn.Linear(width, config.out))

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
-from mvitac.nn.encoders import EncoderConfig, build_trunk, num_features
+from mvitac.nn.encoders import Encoders, build_trunk, is_locked, num_features
 from mvitac.nn.finetuning import AttentivePool, Part, freeze_statistics, merged, train_part
 from mvitac.registry import unknown
 
@@ -176,8 +176,8 @@ class SupervisedConfig(LabelledConfig):
             )
         return [name for name in drawn if name not in held], held
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "Supervised":
-        trunks = {m: build_trunk(encoder, spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
+    def build(self, spec: DataSpec, encoder: Encoders) -> "Supervised":
+        trunks = {m: build_trunk(encoder[m], spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
         for m in trunks if self.train == "attentive" else ():
             trunks[m] = AttentivePool(trunks[m])
         width = sum(num_features(trunk) for trunk in trunks.values())
@@ -212,7 +212,8 @@ class Supervised(Method):
 
     def prepare(self, rows: Tensor) -> None:
         for trunk in self.trunks.values():
-            train_part(trunk, self.part, self.rank)
+            if not is_locked(trunk):
+                train_part(trunk, self.part, self.rank)
 
     def train(self, mode: bool = True) -> Self:
         super().train(mode)

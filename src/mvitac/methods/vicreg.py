@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, with_sum
-from mvitac.nn.encoders import EncoderConfig, build_towers, trunks
+from mvitac.nn.encoders import Encoders, build_towers, trunks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class VICRegConfig(MethodConfig):
     def __post_init__(self) -> None:
         self.check_fields(weight=("invariance", "variance", "covariance"), width=("hidden",))
 
-    def build(self, spec: DataSpec, encoder: EncoderConfig) -> "VICReg":
+    def build(self, spec: DataSpec, encoder: Encoders) -> "VICReg":
         return VICReg(self, spec, encoder)
 
 
@@ -63,7 +63,7 @@ class VICReg(Contrastive):
 
     views = 2
 
-    def __init__(self, config: VICRegConfig, spec: DataSpec, encoder: EncoderConfig) -> None:
+    def __init__(self, config: VICRegConfig, spec: DataSpec, encoder: Encoders) -> None:
         super().__init__()
         self.config = config
         hidden = config.hidden

@@ -3,7 +3,7 @@
 import copy
 import difflib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,13 +11,14 @@ from typing import Any, Literal
 import timm
 import torch
 import torch.nn.functional as F
-from huggingface_hub import constants, get_session, try_to_load_from_cache
+from timm.data.constants import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
 from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
 from timm.models.vision_transformer import VisionTransformer
 from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
+from mvitac.nn import imagenet
 from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.small_conv import use_convolutions, use_products
 from mvitac.nn.weights import load_weights, read_tensors, stem_names
@@ -25,7 +26,6 @@ from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
 MAP_SIDE = 7  # a feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px
-_WEIGHTS = ("model.safetensors", "pytorch_model.bin")  # names of timm's files on the hub
 _VITS = ("timm.models.vision_transformer", "timm.models.deit", "timm.models.eva")
 """timm's files of ViTs that take images of any size ..."""
 _ANY_SIZE = {"dynamic_img_size": True, "dynamic_img_pad": True}
@@ -73,25 +73,73 @@ def _small_vit(name: str, pretrained: bool, shape: dict[str, Any], kwargs: dict[
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
-    """The network that encodes each modality."""
+    """The network that encodes one modality."""
 
     trunk: str = "resnet18.tv_in1k"
     """Name of a timm model. The paper uses ResNet-18; resnet18.tv_in1k is torchvision's."""
     weights: str = IMAGENET
-    """Initial weights: `imagenet` (downloaded by timm), `scratch` (random), or a file with the trunk's state dict
-    (.safetensors, .pth)."""
+    """Initial weights: `imagenet` (from timm's cache, an installed package, or the network), `scratch` (random), or a file
+    with the trunk's state dict (.safetensors, .pth)."""
     stem: Literal["repeat", "random"] = "repeat"
     """Start of a pretrained trunk's first convolution for images that do not have three channels: timm repeats and rescales
     its filters, or random (the authors' code)."""
     temporal: Literal["stack", "mean", "attention"] = "stack"
     """How several frames of a window are read. stack: as channels of one image. mean: the trunk sees each frame, and their
     features are averaged. attention: their weighted mean, with weights learned from the features and the frame's age."""
+    locked: bool = False
+    """Keep the trunk as it starts; its heads and the other trunk are trained (LiT, arXiv:2111.07991)."""
+    keep_norms: bool = False
+    """BatchNorm keeps the statistics that the trunk starts with, also for the images of training."""
+    lr_scale: float = 1.0
+    """Learning rate of the trunk relative to that of its heads, e.g. .1 to change pretrained weights slowly."""
+    layer_decay: float = 1.0
+    """Learning rate of each layer of the trunk relative to that of the next one, e.g. .65 to train a pretrained ViT further
+    (BEiT, MAE). 1 = the same for all."""
 
     def __post_init__(self) -> None:
+        for name in ("lr_scale", "layer_decay"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} {getattr(self, name)}: give a factor above 0, at most 1")
         if not timm.is_model(self.trunk.split(".")[0]):
             near = difflib.get_close_matches(self.trunk.split(".")[0], timm.list_models(), n=3)
             hint = f"; did you mean {', '.join(near)}?" if near else ""
             raise ValueError(f"unknown trunk {self.trunk!r}: give the name of a timm model, e.g. resnet18{hint}")
+
+    @property
+    def levels(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Mean and standard deviation by which the trunk's images are normalised: those of timm's weights for it."""
+        known = timm.get_pretrained_cfg(self.trunk)
+        return (known.mean, known.std) if known else (IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoders:
+    """The network of each modality. --encoder.NAME is short for --encoder.vision.NAME and --encoder.touch.NAME."""
+
+    vision: EncoderConfig = EncoderConfig()
+    touch: EncoderConfig = EncoderConfig()
+
+    @classmethod
+    def both(cls, **fields: Any) -> "Encoders":
+        """The same network for both modalities. ``fields`` are those of ``EncoderConfig``."""
+        return cls(vision=EncoderConfig(**fields), touch=EncoderConfig(**fields))
+
+    def __getitem__(self, modality: str) -> EncoderConfig:
+        return self.vision if modality == "vision" else self.touch
+
+    def changed(self, **fields: Any) -> "Encoders":
+        """These with the same new values of ``fields`` for both modalities."""
+        return Encoders(vision=replace(self.vision, **fields), touch=replace(self.touch, **fields))
+
+    def fresh(self) -> "Encoders":
+        """These with random initial weights, all of which are trained at the full rate."""
+        return self.changed(weights=SCRATCH, locked=False, keep_norms=False, lr_scale=1.0, layer_decay=1.0)
+
+    def named(self, modalities: Iterable[str]) -> str:
+        """The trunks of ``modalities``: ``resnet18``, or ``vision resnet18, touch resnet10t``."""
+        found = {m: self[m].trunk for m in modalities}
+        same = len(set(found.values())) == 1
+        return next(iter(found.values())) if same else ", ".join(f"{m} {trunk}" for m, trunk in found.items())
 
 
 def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Module:
@@ -101,10 +149,27 @@ def build_trunk(config: EncoderConfig, channels: int, frames: int = 1) -> nn.Mod
     The channels are those of all ``frames`` of a window together. ValueError if the requested weights are not
     available: there is no silent fallback to random weights.
     """
-    if frames == 1 or config.temporal == "stack":
-        return use_products(_with_stem(config, channels))
-    trunk = use_products(_with_stem(config, channels // frames))
-    return PerFrame(trunk, frames, attention=config.temporal == "attention")
+    single = frames == 1 or config.temporal == "stack"
+    trunk = use_products(_with_stem(config, channels if single else channels // frames))
+    trunk = trunk if single else PerFrame(trunk, frames, attention=config.temporal == "attention")
+    trunk.locked, trunk.keep_norms = config.locked, config.keep_norms  # type: ignore[assignment]
+    return trunk.requires_grad_(False) if config.locked else trunk
+
+
+def is_locked(module: nn.Module) -> bool:
+    """Whether ``module`` is a trunk that is not trained (``EncoderConfig.locked``)."""
+    return getattr(module, "locked", False) is True
+
+
+def keep_modes(network: nn.Module) -> None:
+    """Put locked trunks in ``network``, and BatchNorm that is kept, in eval mode. Called after ``train()``."""
+    for trunk in network.modules():
+        if is_locked(trunk):
+            trunk.eval()
+        elif getattr(trunk, "keep_norms", False) is True:
+            for layer in trunk.modules():
+                if isinstance(layer, nn.modules.batchnorm._BatchNorm):
+                    layer.eval()
 
 
 class PerFrame(nn.Module):
@@ -195,24 +260,7 @@ def _from_timm(config: EncoderConfig, channels: int) -> nn.Module:
         trunk = _from_timm(replace(config, weights=SCRATCH), channels)
         load_weights(trunk, read_tensors(Path(config.weights)), config.weights)
         return trunk
-    return _with_imagenet(config.trunk, arguments)
-
-
-def _with_imagenet(trunk: str, arguments: dict[str, Any]) -> nn.Module:
-    """The trunk with timm's weights. The hub is asked once before, because its client tries again for 50 seconds."""
-    known = timm.get_pretrained_cfg(trunk)
-    hub = known.hf_hub_id if known else None
-    url = f"{constants.ENDPOINT}/{hub}/resolve/main/{_WEIGHTS[0]}"
-    try:
-        if hub and not any(isinstance(try_to_load_from_cache(hub, name), str) for name in _WEIGHTS):
-            get_session().head(url, timeout=10)
-        return timm.create_model(trunk, pretrained=True, **arguments)
-    except Exception as error:
-        file = f"download {url} elsewhere and " if hub else ""
-        raise ValueError(
-            f"ImageNet weights for {trunk} could not be loaded ({brief(error)}): check the network; or {file}give"
-            " --encoder.weights FILE; or start from random weights with --encoder.weights scratch"
-        ) from None
+    return imagenet.load(config.trunk, arguments)
 
 
 def timm_trunk(
@@ -279,11 +327,11 @@ def draws_random_numbers(network: nn.Module) -> bool:
     return any(isinstance(rate := getattr(m, name, 0), float) and rate > 0 for m in network.modules() for name in rates)
 
 
-def build_towers(config: EncoderConfig, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
+def build_towers(config: Encoders, spec: DataSpec, head: Callable[[int], nn.Module]) -> nn.ModuleDict:
     """A ``Projected`` trunk and head per modality of ``spec``. ``head`` creates a head for D features."""
     towers = nn.ModuleDict()
     for modality in spec.modalities:
-        trunk = build_trunk(config, spec.channels(modality), spec.frames(modality))
+        trunk = build_trunk(config[modality], spec.channels(modality), spec.frames(modality))
         towers[modality] = Projected(trunk, head(num_features(trunk)))
     return towers
 

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from mvitac.nn.encoders import is_locked
+
 
 def momentum_at(progress: float, start: float, end: float | None) -> float:
     """Momentum m at ``progress`` (0 to 1) of a run: constant, or rising to ``end`` along a half cosine (BYOL, MoCo v3)."""
@@ -18,7 +20,8 @@ class Momentum(nn.Module):
 
     def __init__(self, query: nn.Module) -> None:
         super().__init__()
-        self.module = copy.deepcopy(query).requires_grad_(False)
+        shared = {id(module): module for module in query.modules() if is_locked(module)}
+        self.module = copy.deepcopy(query, shared).requires_grad_(False)
         self._query = (query,)  # in a tuple, or its parameters would be listed here, too
 
     @torch.no_grad()
@@ -33,7 +36,7 @@ class Momentum(nn.Module):
     def follow(self, m: float) -> None:
         """Move all parameters and floating-point buffers towards the query's. Copy integer buffers (counters)."""
         mine, theirs = ([*module.parameters(), *module.buffers()] for module in (self.module, *self._query))
-        floating = [(k, q) for k, q in zip(mine, theirs, strict=True) if k.is_floating_point()]
+        floating = [(k, q) for k, q in zip(mine, theirs, strict=True) if k is not q and k.is_floating_point()]
         torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage] - one call for all tensors
             [k for k, _ in floating], [q.detach() for _, q in floating], 1 - m
         )

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mvitac.data.spec import DataSpec
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, PerFrame, build_trunk
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, PerFrame, build_trunk
 from mvitac.nn.positions import sin_cos_positions
 
 Senses = Literal["own", "both"]  # whether a predictor sees tokens of its own modality, or of both
@@ -65,11 +65,11 @@ def _plain(trunk: nn.Module, name: str, method: str) -> VisionTransformer:
     return trunk
 
 
-def build_vits(config: EncoderConfig, spec: DataSpec, method: str, senses: Senses) -> nn.ModuleDict:
+def build_vits(config: Encoders, spec: DataSpec, method: str, senses: Senses) -> nn.ModuleDict:
     """A ViT per modality of ``spec``, or ``PerFrame`` of one, whose features are the mean over its patches.
 
     The mean because no class token is trained here. ValueError if the trunk is no plain ViT, or ``senses`` or
-    ``config.temporal`` do not fit the data.
+    how windows are read does not fit the data.
     """
     if senses == "both" and len(spec.modalities) < 2:
         raise ValueError(
@@ -77,21 +77,26 @@ def build_vits(config: EncoderConfig, spec: DataSpec, method: str, senses: Sense
         )
     trunks = nn.ModuleDict()
     for modality in spec.modalities:
-        windows = spec.frames(modality) > 1
-        if windows and config.temporal == "attention":
+        own, windows = config[modality], spec.frames(modality) > 1
+        if windows and own.temporal == "attention":
             raise ValueError(
                 f"method {method!r} does not train temporal attention: give --encoder.temporal mean or stack"
             )
-        if windows and config.temporal == "mean" and senses == "both":
+        if windows and own.temporal == "mean" and senses == "both":
             raise ValueError("senses both reads the frames of a window together: give --encoder.temporal stack")
-        trunks[modality] = build_trunk(config, spec.channels(modality), spec.frames(modality))
-        _plain(vit_of(trunks[modality]), config.trunk, method).reset_classifier(0, "avg")
+        trunks[modality] = build_trunk(own, spec.channels(modality), spec.frames(modality))
+        _plain(vit_of(trunks[modality]), own.trunk, method).reset_classifier(0, "avg")
     return trunks
 
 
 def vit_of(trunk: nn.Module) -> VisionTransformer:
     """The ViT of a trunk from ``build_vits``."""
     return trunk.trunk if isinstance(trunk, PerFrame) else trunk  # type: ignore[return-value]
+
+
+def other_trunk(trunks: nn.ModuleDict, modality: str, senses: Senses) -> nn.Module | None:
+    """The trunk whose tokens a predictor of ``modality`` also reads, if there is one."""
+    return next((trunk for m, trunk in trunks.items() if m != modality), None) if senses == "both" else None
 
 
 def frames_of(trunk: nn.Module) -> int:
@@ -128,6 +133,7 @@ class Tokens:
 
     values: Float[Tensor, "B F+K D"]
     at: Int[Tensor, "B K"]  # the patch of each token after the prefix
+    grid: tuple[int, int]  # rows and columns of all patches
     live: Bool[Tensor, "B F+K"] | None = None  # which of them count. None = all.
 
 
@@ -143,7 +149,9 @@ def encode_visible(
     front = vit.num_prefix_tokens
     tokens = torch.cat([tokens[:, :front], take(tokens[:, front:], at)], dim=1)
     live = None if live is None else F.pad(live, (front, 0), value=True)
-    return Tokens(vit.norm(_pass(vit.blocks, tokens, live, recompute=vit.grad_checkpointing)), at, live)
+    return Tokens(
+        vit.norm(_pass(vit.blocks, tokens, live, recompute=vit.grad_checkpointing)), at, grid_of(trunk, images), live
+    )
 
 
 def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None, *, recompute: bool = False) -> Tensor:
@@ -175,19 +183,19 @@ class Predictor(nn.Module):
     Args:
         trunk: The trunk whose tokens it reads.
         out: Width of the predictions.
-        senses: Whether it also reads tokens of the other modality.
+        other: The trunk of the other modality, if it also reads its tokens.
         shape: Width and number of blocks. None = ``share`` of the trunk's, in whole heads of 32 features, up to ``most``.
     """
 
     def __init__(
-        self, trunk: nn.Module, out: int, senses: Senses, shape: Shape, share: float, most: tuple[int, int]
+        self, trunk: nn.Module, out: int, other: nn.Module | None, shape: Shape, share: float, most: tuple[int, int]
     ) -> None:
         super().__init__()
         vit = vit_of(trunk)
         width = shape[0] or min(most[0], 32 * max(1, round(vit.embed_dim * share / 32)))
         depth = shape[1] or min(most[1], max(1, round(len(vit.blocks) * share)))
         self.embed = nn.Linear(vit.embed_dim, width)
-        self.other = nn.Linear(vit.embed_dim, width) if senses == "both" else None
+        self.other = nn.Linear(vit_of(other).embed_dim, width) if other else None
         self.mask_token = nn.Parameter(torch.zeros(1, 1, 1, width))
         norm: Any = partial(nn.LayerNorm, eps=1e-6)
         heads = max(1, width // 32) if width % 32 == 0 else 1
@@ -204,7 +212,6 @@ class Predictor(nn.Module):
         self,
         seen: Tokens,
         hidden: Int[Tensor, "B M T"],
-        grid: tuple[int, int],
         live: Bool[Tensor, "B M T"] | None = None,
         other: Tokens | None = None,
     ) -> Float[Tensor, "B M T O"]:
@@ -213,10 +220,12 @@ class Predictor(nn.Module):
         ``live`` says which of ``hidden`` count, if the visible tokens say which of them do. No token attends to the
         others.
         """
-        positions = sin_cos_positions(*grid, self.mask_token.shape[3], hidden.device)
+        width = self.mask_token.shape[3]
+        positions = sin_cos_positions(*seen.grid, width, hidden.device)
         known, known_live = _placed(self.embed(seen.values), seen.at, positions), seen.live
         if self.other is not None and other is not None:
-            known = torch.cat([known, _placed(self.other(other.values), other.at, positions)], dim=1)
+            places = sin_cos_positions(*other.grid, width, hidden.device)
+            known = torch.cat([known, _placed(self.other(other.values), other.at, places)], dim=1)
             known_live = None if seen.live is None or other.live is None else torch.cat([seen.live, other.live], dim=1)
         num_sets, length = hidden.shape[1:]
         masked = (self.mask_token + positions[hidden]).to(known.dtype)

@@ -159,15 +159,15 @@ def _page(study: Study) -> str:
 
 
 def _head(study: Study, title: str) -> str:
-    runs = study.runs
+    runs, modalities = study.runs, study.pack.spec.modalities
     seeds = sorted({r.run.seed for r in runs})
     chips = {
         "method": ", ".join(dict.fromkeys(r.run.method.name for r in runs)),
         "data": study.pack.spec.name,
         "recipe": ", ".join(dict.fromkeys(r.run.recipe for r in runs)),
         "seeds" if len(seeds) > 1 else "seed": ", ".join(map(str, seeds)),
-        "trunk": ", ".join(dict.fromkeys(r.run.encoder.trunk for r in runs)),
-        "input": ", ".join(dict.fromkeys(f"{r.run.augment.eval_size} px" for r in runs)),
+        "trunk": ", ".join(dict.fromkeys(r.run.encoder.named(modalities) for r in runs)),
+        "input": ", ".join(dict.fromkeys(f"{r.run.augment.whole_of(m)} px" for r in runs for m in modalities)),
     }
     items = "".join(f"<li>{escape(name)} <b>{escape(value)}</b></li>" for name, value in chips.items())
     text = "; ".join(verdicts(study)) or "nothing is scored on this data"

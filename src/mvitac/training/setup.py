@@ -19,6 +19,8 @@ from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import load
+from mvitac.nn.encoders import IMAGENET
+from mvitac.nn.imagenet import source
 from mvitac.nn.momentum import Momentum
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
@@ -95,6 +97,11 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     if not resumed and world.writes:
         record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(spec)}
         here = {"device": describe(device), "precision": run.precision}
+        used = {m: run.encoder[m] for m in method.encoders() if run.encoder[m].weights == IMAGENET}
+        if imagenet := {m: source(config.trunk) for m, config in used.items()}:
+            record |= {"imagenet": imagenet}
+            for modality, found in {} if quiet else imagenet.items():
+                print(f"mvitac: {modality} starts from ImageNet weights of {found}", file=sys.stderr)
         if start_weights:
             record |= {"start": taken}
             for line in [] if quiet else [describe_start(taken)]:
@@ -236,6 +243,6 @@ def _check_image_size(method: Method, run: Run, pack: Pack) -> None:
             model.features(modality, blank)
         except Exception as error:  # the type differs between trunks
             raise ValueError(
-                f"trunk {run.encoder.trunk} does not support images of {run.augment.eval_size} px ({brief(error)}):"
-                " give another --augment.size or --encoder.trunk"
+                f"trunk {run.encoder[modality].trunk} does not support images of {model.sides(modality)[0]} px"
+                f" ({brief(error)}): give another --augment.size or --encoder.trunk"
             ) from None

@@ -43,7 +43,7 @@ def read_start(init: Init) -> Start | None:
         trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
         heads = {m: head.state_dict() for m, head in model.projectors.items()}
         learned = _learned(init.file)
-        return Start(init, trunks, heads, model.run.encoder.trunk, learned, model.spec.sensors)
+        return Start(init, trunks, heads, model.run.encoder.named(model.encoders), learned, model.spec.sensors)
     trunks = {m: _below(f"encoders.{m}.", tensors) for m in ("vision", "touch")}
     heads = {m: state for m in trunks if (state := _below(f"projectors.{m}.", tensors))}
     trunks = {m: state for m, state in trunks.items() if state} or {ANY: tensors}
@@ -124,7 +124,7 @@ def warning(run: Run, start: Start | None, pack: Pack) -> str:
     tested = [pack.rows("test", only=task.only, by=task.split) for task in tasks] or [pack.rows("test")]
     rows = np.unique(np.concatenate(tested))
     leak = Scored(pack).leak(sources, rows) if len(rows) else ""
-    path = start.init.path if start else run.encoder.weights
+    path = start.init.path if start else ", ".join(source.name for source in sources)
     if leak == UNKNOWN:
         return f"nothing says what {path} was trained on: leaks of test rows cannot be excluded"
     return leak and f"{path} has seen what this data tests: {leak}; `mvitac probe` will need --allow-leak"

@@ -15,8 +15,9 @@ import torch
 from timm.optim import param_groups_layer_decay  # pyright: ignore[reportPrivateImportUsage]
 from torch import Tensor
 
+from mvitac.data.spec import MODALITIES
 from mvitac.methods.base import Contrastive, Embeddings, Method, Views
-from mvitac.nn.encoders import PerFrame
+from mvitac.nn.encoders import Encoders, PerFrame
 from mvitac.run import Optim, Run
 from mvitac.system.distributed import World
 
@@ -33,7 +34,7 @@ class Step:
     def __init__(self, run: Run, method: Method, device: torch.device, world: World | None = None) -> None:
         self.method, self.device, self.world = method, device, world or World()
         self.bf16 = run.bf16
-        self.optimiser = build_optimiser(run.optim, method)
+        self.optimiser = build_optimiser(run.optim, method, run.encoder)
         if (run.chunk or self.world.size > 1) and not isinstance(method, Contrastive):
             raise ValueError(
                 f"method {run.method.name!r} supports neither several processes nor --chunk: leave them out"
@@ -41,7 +42,9 @@ class Step:
         if run.recompute:
             for name, trunk in method.encoders().items():
                 if not hasattr(trunk, "set_grad_checkpointing"):
-                    raise ValueError(f"trunk {run.encoder.trunk} ({name}) cannot recompute: leave out --recompute")
+                    raise ValueError(
+                        f"trunk {run.encoder[name].trunk} ({name}) cannot recompute: leave out --recompute"
+                    )
                 trunk.set_grad_checkpointing(True)  # pyright: ignore[reportCallIssue]
         set_precision(run.precision)
         self.forward = torch.compile(method, fullgraph=True) if run.compile else method
@@ -136,12 +139,12 @@ def _running_statistics(method: Method) -> list[Tensor]:
     return [buffer for layer in layers for buffer in layer.buffers(recurse=False)]
 
 
-def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
+def build_optimiser(config: Optim, method: Method, encoders: Encoders) -> torch.optim.Optimizer:
     """Create the optimiser of the trainable parameters (momentum copies have none). Uses a fused kernel if available."""
     parameters: Any = [p for p in method.parameters() if p.requires_grad]
     fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
-    if config.layer_decay < 1:
-        parameters = _by_layer(config, method, parameters)
+    if scales := _scales(method, encoders):
+        parameters = _by_scale(config, parameters, scales)
     elif config.weight_decay and not config.decay_norms:
         vectors = [p for p in parameters if p.ndim <= 1]  # biases and BatchNorm
         matrices = [p for p in parameters if p.ndim > 1]
@@ -153,16 +156,27 @@ def build_optimiser(config: Optim, method: Method) -> torch.optim.Optimizer:
     return kind(parameters, config.lr, config.betas, config.eps, config.weight_decay, fused=fused)
 
 
-def _by_layer(config: Optim, method: Method, parameters: list[Tensor]) -> list[dict[str, Any]]:
-    """Groups of ``parameters`` with equal weight decay and, by layer of their trunk, equal share of the rate (lr_scale)."""
+def _scales(method: Method, encoders: Encoders) -> dict[int, float]:
+    """id -> learning rate relative to that of the heads, of the parameters of trunks that are not trained like them."""
     scales: dict[int, float] = {}
-    for name, encoder in method.encoders().items():
+    for name in MODALITIES:
+        config = encoders[name]
+        if config.lr_scale == config.layer_decay == 1 or name not in method.encoders():
+            continue
+        encoder = method.encoders()[name]
+        scales |= dict.fromkeys(map(id, encoder.parameters()), config.lr_scale)
         trunk = encoder.trunk if isinstance(encoder, PerFrame) else encoder
-        if not hasattr(trunk, "group_matcher"):
-            raise ValueError(f"the trunk of {name} names no layers: leave out --optim.layer-decay")
+        if config.layer_decay < 1 and not hasattr(trunk, "group_matcher"):
+            raise ValueError(f"the trunk of {name} names no layers: leave out --encoder.{name}.layer-decay")
         # timm gives a trunk without its classifier's layer the full rate at the end; here the heads are that layer.
-        for group in param_groups_layer_decay(trunk, layer_decay=config.layer_decay):
-            scales |= {id(p): config.layer_decay * group["lr_scale"] for p in group["params"]}
+        for group in param_groups_layer_decay(trunk, layer_decay=config.layer_decay) if config.layer_decay < 1 else ():
+            scale = config.lr_scale * config.layer_decay * group["lr_scale"]
+            scales |= {id(p): scale for p in group["params"]}
+    return scales
+
+
+def _by_scale(config: Optim, parameters: list[Tensor], scales: dict[int, float]) -> list[dict[str, Any]]:
+    """Groups of ``parameters`` with equal weight decay and equal share of the learning rate (lr_scale)."""
     groups: dict[tuple[float, bool], list[Tensor]] = {}
     for p in parameters:
         groups.setdefault((scales.get(id(p), 1.0), p.ndim > 1 or config.decay_norms), []).append(p)

@@ -244,7 +244,7 @@ def _change(start: Tensor, end: Tensor) -> tuple[float, float]:
 def _shared_space(model: Model, pack: Pack, run: Run, rows: np.ndarray, z: dict[str, Tensor]) -> dict[str, float]:
     """Alignment, uniformity and retrieval in the space shared by both modalities, on ``rows``, whose features are ``z``."""
     device = next(model.parameters()).device
-    if run.augment.size != run.augment.eval_size:
+    if any(whole != heads for whole, heads in map(model.sides, z)):
         z = {m: pack_features(model, pack, m, rows, for_heads=True, bf16=run.bf16) for m in z}
     shared = {m: model.project(m, z[m].to(device)).cpu() for m in z}
     groups = torch.from_numpy(np.unique(pack.column("group")[rows], return_inverse=True)[1])

@@ -86,11 +86,12 @@ def make_views(
         both = {m: torch.from_numpy(np.flatnonzero(pairs[there])).to(device) for m, there in has.items()}
         sources = {m: _some(sources[m], there) for m, there in has.items()}
     for modality in has:
-        config, images[modality] = getattr(run.augment, modality), []
+        config, images[modality] = run.augment.of(modality), []
+        size, levels = run.augment.size_of(modality), run.encoder[modality].levels
         fed: dict[int, Tensor] = {}  # load an image once for two views
         for source in sources[modality]:
             seen = fed[id(source)] if id(source) in fed else fed.setdefault(id(source), feed(modality, source))
-            view = random_view(seen, config, run.augment.size, generator, dtype)
+            view = random_view(seen, config, size, generator, dtype, levels)
             images[modality].append(view)
     splits = run.method.label_splits
     labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(device) for t in pack.spec.tasks}

@@ -16,6 +16,9 @@ from torch import Tensor
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+Levels = tuple[tuple[float, ...], tuple[float, ...]]
+"""Mean and standard deviation of R, G, B, by which levels in [0, 1] are normalised."""
+IMAGENET: Levels = (IMAGENET_MEAN, IMAGENET_STD)
 
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, as PIL and torchvision use it
 NUM_TRIES = 10  # to draw a crop that fits, then the largest possible one, as in torchvision's RandomResizedCrop
@@ -33,6 +36,10 @@ class ViewAugment:
     """Probability of grayscale (paper: .2 for materials, none for grasping)."""
     jitter: float = 0.0
     """Strength of brightness, contrast and per-channel gain jitter; each factor is 1 +- jitter (paper: none)."""
+    size: int | None = None
+    """Side in pixels of the crops of this modality. Default: that of both."""
+    whole: int | None = None
+    """Side in pixels of whole images of this modality. Default: its own size, else that of both."""
 
     def __post_init__(self) -> None:
         if not 0 < self.scale[0] <= self.scale[1] <= 1:
@@ -58,14 +65,23 @@ class Augment:
     touch: ViewAugment = ViewAugment()
 
     def __post_init__(self) -> None:
-        for name, side in (("size", self.size), ("whole", self.eval_size)):
-            if not 8 <= side <= 1024:
-                raise ValueError(f"augment {name} {side}: give a side of 8 to 1024 pixels")
+        given = (self.size, self.whole, *(side for own in (self.vision, self.touch) for side in (own.size, own.whole)))
+        for side in given:
+            if side is not None and not 8 <= side <= 1024:
+                raise ValueError(f"augment size or whole {side}: give a side of 8 to 1024 pixels")
 
-    @property
-    def eval_size(self) -> int:
-        """Side in pixels of the whole images that probes and predictions see."""
-        return self.size if self.whole is None else self.whole
+    def of(self, modality: str) -> ViewAugment:
+        """The views of ``modality``."""
+        return self.vision if modality == "vision" else self.touch
+
+    def size_of(self, modality: str) -> int:
+        """Side in pixels of the crops of ``modality``."""
+        return self.of(modality).size or self.size
+
+    def whole_of(self, modality: str) -> int:
+        """Side in pixels of the whole images of ``modality`` that probes and predictions see."""
+        own = self.of(modality)
+        return own.whole or own.size or self.whole or self.size
 
 
 @dataclass(frozen=True)
@@ -103,33 +119,37 @@ def draw(config: ViewAugment, num: int, size: int, generator: torch.Generator) -
 
 
 def apply(
-    images: UInt8[Tensor, "B C H W"], drawn: Drawn, size: int, dtype: torch.dtype = torch.float32
+    images: UInt8[Tensor, "B C H W"],
+    drawn: Drawn,
+    size: int,
+    dtype: torch.dtype = torch.float32,
+    levels: Levels = IMAGENET,
 ) -> Float[Tensor, "B C S S"]:
     """Apply the parameters ``drawn``: crop to [size, size], flip, colour, normalise. Returns channels-last on their device.
 
     Computed in fp32 and rounded to ``dtype`` once, as autocast would round it before the first convolution.
     """
     implementation = _one_by_one if images.device.type == "cpu" else _batched
-    return implementation(images, drawn, size, dtype)
+    return implementation(images, drawn, size, dtype, levels)
 
 
-def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
+def _one_by_one(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, levels: Levels) -> Tensor:
     """The implementation for CPUs. One image at a time stays in the cache, as uint8 until the last step."""
     num, channels = images.shape[:2]
     out = torch.empty(num, size, size * channels, dtype=dtype)  # lines of pixels with their channels: long inner loops
-    factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device))
+    factors, offsets = (t.repeat(size * channels // 3) for t in _normalisation(images.device, levels))
     luma = _luma(images.device).flatten()
     jittered = (drawn.gains != 1).any(1)
     for i, line in enumerate(out):
         pixels = _crop(images[i], drawn.boxes[i].tolist(), bool(drawn.flip[i]), size)
-        levels = pixels.reshape(size, -1).float()
+        tones = pixels.reshape(size, -1).float()
         if jittered[i]:
             sensors = pixels.permute(2, 0, 1).unflatten(0, (-1, 3))[None].float().div_(255)
             one = Drawn(*(getattr(drawn, name)[i : i + 1] for name in ("boxes", "flip", "grayscale", "gains")))
-            levels = _colour(sensors, one)[0].mul_(255).permute(2, 3, 0, 1).reshape(size, -1)
+            tones = _colour(sensors, one)[0].mul_(255).permute(2, 3, 0, 1).reshape(size, -1)
         elif drawn.grayscale[i]:
-            levels = (levels.view(-1, 3) @ luma)[:, None].expand(-1, 3).reshape(size, -1)
-        torch.addcmul(offsets, levels, factors, out=line)
+            tones = (tones.view(-1, 3) @ luma)[:, None].expand(-1, 3).reshape(size, -1)
+        torch.addcmul(offsets, tones, factors, out=line)
     return out.view(num, size, size, channels).permute(0, 3, 1, 2)
 
 
@@ -146,7 +166,7 @@ def _crop(image: UInt8[Tensor, "C H W"], box: list[int], flip: bool, size: int) 
     return crop.permute(2, 3, 0, 1).reshape(size, size, -1)
 
 
-def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Tensor:
+def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype, levels: Levels = IMAGENET) -> Tensor:
     """The implementation for GPUs: crop, resize and flip the whole batch by two matrix products, Y @ image @ X'.
 
     The antialiased filter is the same as on the CPU. On a GPU it uses fp16, in which pixels are exact and the weights cause
@@ -162,7 +182,7 @@ def _batched(images: Tensor, drawn: Drawn, size: int, dtype: torch.dtype) -> Ten
     with torch.autocast(device.type, enabled=False):
         cropped = rows @ images.to(exact) @ columns.mT
     sensors = cropped.float().round_().div_(255).unflatten(1, (-1, 3))
-    scale, shift = (t.view(3, 1, 1) for t in _normalisation(device))
+    scale, shift = (t.view(3, 1, 1) for t in _normalisation(device, levels))
     view = torch.addcmul(shift, _colour(sensors, drawn), scale * 255)
     return view.flatten(1, 2).to(dtype, memory_format=torch.channels_last)
 
@@ -179,9 +199,9 @@ def _resampling(start: Tensor, length: Tensor, side: int, size: int) -> Float[Te
 
 
 @lru_cache
-def _normalisation(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Factor and offset [3] that normalise levels 0-255 by ImageNet's mean and standard deviation."""
-    mean, std = (torch.tensor(v, dtype=torch.float64) for v in (IMAGENET_MEAN, IMAGENET_STD))
+def _normalisation(device: torch.device, levels: Levels) -> tuple[Tensor, Tensor]:
+    """Factor and offset [3] that normalise levels 0-255 by mean and standard deviation."""
+    mean, std = (torch.tensor(v, dtype=torch.float64) for v in levels)
     return (1 / (255 * std)).float().to(device), (-mean / std).float().to(device)
 
 
@@ -211,21 +231,22 @@ def random_view(
     size: int,
     generator: torch.Generator,
     dtype: torch.dtype = torch.float32,
+    levels: Levels = IMAGENET,
 ) -> Float[Tensor, "B C S S"]:
     """One random view of each image. All randomness comes from ``generator``, which is on the CPU."""
     num, _, side, _ = images.shape
-    return apply(images, draw(config, num, side, generator), size, dtype)
+    return apply(images, draw(config, num, side, generator), size, dtype, levels)
 
 
-def plain_view(images: UInt8[Tensor, "B C H W"], size: int) -> Float[Tensor, "B C S S"]:
+def plain_view(images: UInt8[Tensor, "B C H W"], size: int, levels: Levels = IMAGENET) -> Float[Tensor, "B C S S"]:
     """Whole images resized to ``size`` and normalised, without randomness, for probes and predictions."""
     num, _, height, width = images.shape
     whole = torch.tensor([[0, 0, height, width]]).expand(num, 4)
     never = torch.zeros(num, dtype=torch.bool)
-    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size)
+    return apply(images, Drawn(whole, never, never, torch.ones(num, 5)), size, levels=levels)
 
 
-def normalise(images: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
-    """Normalise levels in [0, 1] by ImageNet's mean and standard deviation. Returns channels-last."""
-    scale, shift = (t.repeat(images.shape[1] // 3).view(-1, 1, 1) for t in _normalisation(images.device))
+def normalise(images: Float[Tensor, "B C H W"], levels: Levels = IMAGENET) -> Float[Tensor, "B C H W"]:
+    """Normalise images with levels in [0, 1]. Returns channels-last."""
+    scale, shift = (t.repeat(images.shape[1] // 3).view(-1, 1, 1) for t in _normalisation(images.device, levels))
     return torch.addcmul(shift, images, scale * 255).contiguous(memory_format=torch.channels_last)

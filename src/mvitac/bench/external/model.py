@@ -51,7 +51,7 @@ class ExternalModel(Model):
         nn.Module.__init__(self)
         self.text, self.parts, self.spec, self.notes = text, parts, spec, notes
         self.name = " + ".join(dict.fromkeys(part.loaded.title for part in parts.values()))
-        self.stored = stored or self.sides[0]
+        self.stored = stored or max(self.sides(modality)[0] for modality in parts)
         gains = {"touch": 2.0 if spec.difference else 0.0, "vision": 0.0}
         if spec.window.minus_first:
             gains |= {m: 2.0 * max(1.0, gains[m]) for m in spec.window.of}
@@ -75,10 +75,9 @@ class ExternalModel(Model):
         """Seed of the probes, and of random weights."""
         return next(iter(self.parts.values())).adapter.seed
 
-    @property
-    def sides(self) -> tuple[int, int]:
-        """The largest side of its inputs."""
-        side = max(max(part.encoder.preprocessing.size) for part in self.parts.values())
+    def sides(self, modality: str) -> tuple[int, int]:
+        """The larger side of the inputs of ``modality``."""
+        side = max(self.parts[modality].encoder.preprocessing.size)
         return side, side
 
     @property

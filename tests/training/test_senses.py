@@ -1,0 +1,147 @@
+"""A network of its own for each sense, locked or not: training, resuming, momentum copies, probes, export, loading."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+import mvitac
+from mvitac.data.pack import Pack
+from mvitac.deploy.engine import Engine
+from mvitac.deploy.export import ExportConfig, export
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.methods.base import MethodConfig
+from mvitac.methods.mvitac import MViTacConfig
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk
+from mvitac.nn.momentum import Momentum
+from mvitac.run import Optim, Run
+from mvitac.training.loop import train
+from mvitac.training.step import build_optimiser
+from mvitac.transforms.random_views import Augment, ViewAugment
+from support.small_methods import small
+from support.toy import Toy
+from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+
+VISION = "test_resnet.r160_in1k"  # 96 features; its inputs are normalised by .5, not by ImageNet's mean and deviation
+TWO = Encoders(
+    vision=EncoderConfig(trunk=VISION, weights=SCRATCH), touch=EncoderConfig(trunk="mvitac_tiny", weights=SCRATCH)
+)
+SIZES = Augment(size=32, vision=ViewAugment(size=24, whole=28), touch=ViewAugment(whole=30))
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(7)
+    path = tmp_path_factory.mktemp("weights") / "vision.safetensors"
+    save_file(build_trunk(TWO.vision, 3).state_dict(), path)
+    return path
+
+
+def started(pack: Pack, file: Path, **vision: object) -> Run:
+    """MViTac with momentum keys, vision from the file."""
+    encoder = replace(TWO, vision=replace(TWO.vision, weights=str(file), **vision))  # type: ignore[arg-type]
+    method = MViTacConfig(hidden=32, out=16)
+    return smoke(pack, encoder=encoder, augment=SIZES, method=method, steps=4, eval_every=0, checkpoint_every=2)
+
+
+@pytest.mark.parametrize("locked", [False, True])
+def test_from_training_to_the_exported_model(pack: Pack, file: Path, tmp_path: Path, locked: bool) -> None:
+    run = started(pack, file, locked=locked)
+    train(run, tmp_path / "straight", quiet=True)
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "cut", quiet=True)
+    train(run, tmp_path / "cut", resume=True, quiet=True)
+    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+    trained, start = weights(tmp_path / "cut"), build_trunk(run.encoder.vision, 3).state_dict()
+    same = [torch.equal(trained[f"encoders.vision.{name}"], value) for name, value in start.items()]
+    assert all(same) if locked else not any(same)
+
+    model = mvitac.load(tmp_path / "cut")
+    assert "vision test_resnet.r160_in1k, touch mvitac_tiny" in repr(model)
+    assert all(p.requires_grad for p in model.parameters())  # a loaded model can be trained further
+    images = {m: pack.images[m][:5].copy() for m in ("vision", "touch")}
+    features = model.embed(**images)
+    assert {m: tuple(z.shape) for m, z in features.items()} == {"vision": (5, 96), "touch": (5, 64)}
+    assert model.transform("vision", normalize=True)(images["vision"][0]).shape == (3, 28, 28)
+    pixels = (images["vision"][:1] / 255 - 0.5) / 0.5
+    model.run = replace(run, augment=replace(SIZES, vision=ViewAugment(size=32)))
+    torch.testing.assert_close(
+        model.embed(vision=images["vision"][0])["vision"],
+        model.encoders["vision"](torch.from_numpy(pixels).float().permute(0, 3, 1, 2)).detach(),
+    )
+
+    scores = probe_runs([tmp_path / "cut"], ProbeConfig(probes=("linear",)), pack)["records"]
+    assert {r["modality"] for r in scores if r.get("source") == "mvitac"} == {"vision", "touch", "both"}
+    model = mvitac.load(tmp_path / "cut")
+    export(model, pack, tmp_path / "onnx", ExportConfig(min_cosine=0.9999))
+    found = Engine(tmp_path / "onnx")(**images)
+    for m in images:
+        np.testing.assert_allclose(found[f"embedding_{m}"], features[m].numpy(), atol=1e-3, rtol=1e-3)
+        shared = model.embed(**{m: images[m]}, shared=True)[m]
+        np.testing.assert_allclose(found[f"shared_{m}"], shared.numpy(), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", [name for name, kind in MethodConfig.choices.items() if not kind.needs_vit])  # type: ignore[attr-defined]
+def test_every_method_trains_two_networks_and_leaves_a_locked_one(
+    pack: Pack, file: Path, tmp_path: Path, name: str
+) -> None:
+    run = replace(started(pack, file, locked=True), method=small(name), steps=2)
+    train(run, tmp_path / "run", quiet=True)
+    trained = weights(tmp_path / "run")
+    for parameter, value in build_trunk(run.encoder.vision, 3).state_dict().items():
+        inner = "trunks.0." if name == "calandra" else ""
+        assert torch.equal(trained[f"encoders.vision.{inner}{parameter}"], value), parameter
+
+
+@pytest.mark.parametrize("name", ["mae", "ijepa"])
+def test_masked_methods_read_tokens_of_another_width_and_grid(pack: Pack, tmp_path: Path, name: str) -> None:
+    vits = Encoders(
+        vision=EncoderConfig(trunk="mvitac_vit", weights=SCRATCH),
+        touch=EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH),
+    )
+    method = replace(small(name), senses="both")  # type: ignore[call-arg]
+    run = smoke(pack, encoder=vits, method=method, augment=SIZES, steps=1)
+    model = mvitac.load(train(run, tmp_path / "run", quiet=True))
+    assert {m: e.num_features for m, e in model.encoders.items()} == {"vision": 192, "touch": 64}
+
+
+def test_a_momentum_copy_shares_a_locked_trunk() -> None:
+    locked = replace(TWO, vision=replace(TWO.vision, locked=True))
+    method = MViTacConfig(hidden=32, out=16).build(Toy().spec(), locked).train()
+    copies = {m: key.module for m, key in method.key.items() if isinstance(key, Momentum)}
+    assert copies["vision"].trunk is method.query["vision"].trunk and not copies["vision"].trunk.training  # type: ignore[union-attr]
+    assert copies["touch"].trunk is not method.query["touch"].trunk and copies["touch"].trunk.training  # type: ignore[union-attr]
+
+
+def test_kept_norms_and_rates_of_one_trunk() -> None:
+    """BatchNorm keeps its statistics while its own parameters learn; the rate of a trunk, by layers, beside its heads'."""
+    vision = replace(TWO.vision, keep_norms=True, lr_scale=0.5, layer_decay=0.5)
+    encoders = replace(TWO, vision=vision)
+    method = MViTacConfig(hidden=32, out=16).build(Toy().spec(), encoders).train()
+    layers = {m: tower.trunk.modules() for m, tower in method.query.items()}  # type: ignore[union-attr]
+    training = {
+        m: {x.training for x in found if isinstance(x, torch.nn.BatchNorm2d)}  # type: ignore[union-attr]
+        for m, found in layers.items()
+    }
+    assert training == {"vision": {False}, "touch": {True}}
+    groups = build_optimiser(Optim(), method, encoders).param_groups
+    scales = {id(p): group["lr_scale"] for group in groups for p in group["params"]}
+    tower = method.query["vision"]
+    assert scales[id(tower.intra[0].weight)] == 1 == scales[id(method.query["touch"].trunk.conv1[0].weight)]  # type: ignore[index,union-attr]
+    last, first = tower.trunk.layer4[0].conv1.weight, tower.trunk.conv1[0].weight  # type: ignore[index,union-attr]
+    assert scales[id(last)] == 0.25 and scales[id(first)] < 0.1
+
+
+def test_what_cannot_be_locked_is_said(pack: Pack, file: Path) -> None:
+    locked = replace(TWO, touch=replace(TWO.touch, locked=True))
+    with pytest.raises(
+        ValueError, match=r"touch is locked at random weights: give --encoder\.touch\.weights, or --init"
+    ):
+        smoke(pack, encoder=locked).check(pack.spec, 80, 32)
+    with pytest.raises(ValueError, match="renew_norms would change the locked trunk of vision"):
+        replace(started(pack, file, locked=True), renew_norms=2).check(pack.spec, 80, 32)
