@@ -48,12 +48,12 @@ from mvitac.nn.encoders import SCRATCH, Encoders
 from mvitac.recipes import recipe
 from mvitac.run import Run
 from mvitac.system.device import describe
-from mvitac.system.distributed import World
 from mvitac.system.files import brief, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
+from mvitac.training.sampler import Batches
 from mvitac.training.step import Step
-from mvitac.training.views import load_chunks
+from mvitac.training.views import StepViews
 from mvitac.transforms import random_views
 from mvitac.transforms.random_views import ViewAugment, draw
 
@@ -275,7 +275,7 @@ def with_cudnn(call: Callable[..., object], **flags: bool) -> Callable[..., obje
 
 def feed(run: Run, pack: Pack, device: torch.device) -> Any:
     """Yield the chunks of one step after another, as the training loop does, without end."""
-    return load_chunks(run, pack, pack.rows("train"), 2, device, World(), 0, 10**9)
+    return StepViews(run, pack, 2, device).each(Batches(run, pack, pack.rows("train")), 0, 10**9)
 
 
 def measure_whole(scale: Scale, folder: Path, pack: Pack, device: torch.device, workers: int) -> dict[str, Any]:

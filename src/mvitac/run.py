@@ -106,13 +106,12 @@ class Run:
     """Order of the rows. shuffle: random permutation (paper). The others keep near-duplicates from being negatives of each
     other: spread distributes the rows of a touch group over the whole epoch. one-per-touch takes one row of each group,
     then a second one, and so on, if all groups have the same size, and is the same as spread if not."""
-    positives: Literal["same-image", "same-press", "same-touch", "same-touch-pairs"] = "same-image"
-    """Which image is the positive. same-image: another view of the same row (paper). same-press: a view of another moment
-    of the same press (rows with the same value in column press). same-touch: a view of another row of the same touch group:
-    another press of the same instance in the simulator, another frame of the same contact in Touch and Go. Only between
-    presses do lamp, background, sensor and position differ, so that they do not reveal the match. A row without others is
-    its own partner. For one-view methods (ssvtp, cmc) all three mean the vision and touch of one row. same-touch-pairs
-    gives one-view methods the vision of one row and the touch of another."""
+    positives: Literal["same-image", "same-touch", "same-touch-pairs"] = "same-image"
+    """Which image is the positive. same-image: another view of the same row (paper). same-touch: a view of another
+    row of the same touch group: another press of the same instance in the simulator, another frame of the same contact in
+    Touch and Go. Only between presses do lamp, background, sensor and position differ, so that they do not reveal the
+    match. A row without others is its own partner. For one-view methods (ssvtp, cmc) both mean the vision and touch of one
+    row. same-touch-pairs gives one-view methods the vision of one row and the touch of another."""
     positives_within: float = 0.0
     """Other rows are positives only up to this distance in time: K frames before or after, in units of the column that
     orders the frames of a touch (--data.order). 0 = any distance. Not for same-image."""
@@ -123,8 +122,6 @@ class Run:
     chunk: int = 0
     """Pairs that are embedded at a time (gradient caching). A batch of any size then needs the memory of one chunk, for
     about a quarter more arithmetic. BatchNorm uses the statistics of each chunk. 0 = the whole batch at once."""
-    recompute: bool = False
-    """Recompute activations in the backward pass instead of storing them (activation checkpointing)."""
     compile: bool = False
     """Compile the forward pass with torch.compile, as one graph. Worthwhile on GPUs."""
     seed: int = 0
@@ -149,9 +146,7 @@ class Run:
         if not 0 <= self.positives_within < math.inf:
             raise ValueError(f"positives_within {self.positives_within}: give a number of frames >= 0")
         if self.positives_within and self.positives == "same-image":
-            raise ValueError(
-                "positives_within has no effect on same-image positives: choose --positives same-touch, or same-press"
-            )
+            raise ValueError("positives_within has no effect on same-image positives: choose --positives same-touch")
         if not 0 <= self.renew_norms <= 1000:
             raise ValueError(f"renew_norms {self.renew_norms}: give 0 to 1000 batches")
         if self.steps is not None and self.steps < (0 if self.renew_norms else 1):

@@ -42,8 +42,8 @@ from mvitac.model import Model
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.system.files import write_json
-from mvitac.training import views as batches_module
 from mvitac.training.loop import train
+from mvitac.training.views import StepViews
 from support.forged_packs import Spoil, described, edited, seal
 from support.toy import Toy
 
@@ -84,7 +84,7 @@ def refused(
         words = command.split() if isinstance(command, str) else command
         for name, place in places.items():
             words = [word.replace(f"{{{name}}}", str(place)) for word in words]
-        traps = ((batches_module, "make_views"), (packing, "read_parts"), (probe_module, "features"))
+        traps = ((StepViews, "make"), (packing, "read_parts"), (probe_module, "features"))
         for module, name in () if work else traps:
             monkeypatch.setattr(module, name, trap(name))
         before, elsewhere = snapshot(tmp_path), snapshot(finished)
@@ -567,7 +567,7 @@ def test_random_damage_to_a_model(finished: Path, model: Model, tmp_path: Path) 
 @pytest.mark.parametrize("kind", ["run.json", "checkpoint.pt"])
 def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """Resuming trains, or refuses in one line; it never shows a traceback."""
-    monkeypatch.setattr(batches_module, "make_views", trap("make_views"))
+    monkeypatch.setattr(StepViews, "make", trap("views"))
     shutil.copytree(finished, tmp_path / "r")
     (tmp_path / "r" / MODEL).unlink()
     data, rng = (finished / kind).read_bytes(), np.random.default_rng(13)

@@ -29,8 +29,9 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.pack_features import pack_features
 from mvitac.recipes import recipe
 from mvitac.run import Run
-from mvitac.training import views
 from mvitac.training.loop import train
+from mvitac.training.sampler import Batches
+from mvitac.training.views import StepViews
 from support.forged_packs import described, seal
 from support.toy import Toy
 from support.training_runs import assert_equal_weights, power_cut, smoke
@@ -366,17 +367,14 @@ def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch
     """By a thread for JPEGs; a raw pack's views are made where they are used, as ever."""
     import threading
 
-    from mvitac.system.distributed import World
-
     makers: list[str] = []
-    real = views.make_views
-    monkeypatch.setattr(
-        views, "make_views", lambda *args: makers.append(threading.current_thread().name) or real(*args)
-    )
+    real = StepViews.make
+    monkeypatch.setattr(StepViews, "make", lambda *args: makers.append(threading.current_thread().name) or real(*args))
     for pack, name in ((small, "prefetch"), (decoded, "MainThread")):
         makers.clear()
         run, rows = run_on(pack), pack.rows("train")
-        for parts in views.load_chunks(run, pack, rows, 2, torch.device("cpu"), World(), 0, 3):
+        views = StepViews(run, pack, 2, torch.device("cpu"))
+        for parts in views.each(Batches(run, pack, rows), 0, 3):
             assert len(parts[0]().rows) == run.batch_size
         assert len(makers) == 3 and all(maker.startswith(name) for maker in makers)
 

@@ -28,9 +28,8 @@ from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
 from mvitac.recipes import recipe
 from mvitac.report.tables import print_summary
-from mvitac.training.loader import Feed
 from mvitac.training.loop import train
-from mvitac.training.views import make_views
+from mvitac.training.views import StepViews
 
 GEL, KINECT = (24, 32, 3), (54, 96, 3)
 OBJECTS = ("lemon", "lime", "potato", "onion", "soft_zebra", "metal_can", "some_other_thing")
@@ -421,8 +420,7 @@ def test_labels_are_only_of_rows_the_task_is_about(tmp_path: Path) -> None:
     run = recipe("smoke", PackConfig(path=pack.path))
     rows = pack.rows("train")
     run = replace(run, augment=replace(run.augment, size=16))
-    cpu = torch.device("cpu")
-    views = make_views(run, pack, rows, 1, torch.Generator(), cpu, Feed(pack, cpu))
+    views = StepViews(run, pack, 1, torch.device("cpu")).make(rows, 0)
     assert np.array_equal(views.labels["success"].numpy() >= 0, about[rows])
 
 

@@ -25,9 +25,9 @@ from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.recipes import recipe
 from mvitac.report.explorer_data import ExplorerData
-from mvitac.training import views as batches_module
 from mvitac.training.loop import train
 from mvitac.training.sampler import partners
+from mvitac.training.views import StepViews
 from support.toy import Toy
 
 
@@ -76,10 +76,8 @@ def test_an_image_must_agree_with_its_mark(tmp_path: Path, column: bool | None) 
 
 def test_training_sees_whole_pairs_only(holes: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    real = batches_module.make_views
-    monkeypatch.setattr(
-        batches_module, "make_views", lambda run, pack, rows, *rest: seen.extend(rows) or real(run, pack, rows, *rest)
-    )
+    real = StepViews.make
+    monkeypatch.setattr(StepViews, "make", lambda self, rows, seed: seen.extend(rows) or real(self, rows, seed))
     run = replace(recipe("smoke", PackConfig(path=holes.path, size=32)), steps=4, eval_every=4, positives="same-touch")
     train(run, tmp_path / "run", quiet=True)
     whole = holes.has("vision") & holes.has("touch")

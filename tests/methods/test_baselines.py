@@ -31,9 +31,8 @@ from mvitac.nn.losses import queue_nce
 from mvitac.nn.memory_bank import Bank, Queue
 from mvitac.recipes import with_method
 from mvitac.run import Optim
-from mvitac.training.loader import Feed
 from mvitac.training.loop import train
-from mvitac.training.views import make_views
+from mvitac.training.views import StepViews
 from support.slow_losses import slow_info_nce
 from support.small_methods import ROWS, TINY, build, outcome, small, views
 from support.toy import Toy
@@ -336,15 +335,7 @@ def test_supervised_learns_the_labels_that_probes_are_fitted_on(pack: Pack, conf
             assert set(rows[learned >= 0]) == set(fitted) and 0 < len(fitted) < len(rows)
     alone = config(labels="train").training_rows(other)  # as before: pre-training's rows, and labels of train
     assert set(alone) == set(other.rows("train", having=("vision", "touch")))
-    batch = make_views(
-        smoke(pack, method=config()),
-        other,
-        rows,
-        1,
-        torch.Generator().manual_seed(0),
-        torch.device("cpu"),
-        Feed(other, torch.device("cpu")),
-    )
+    batch = StepViews(smoke(pack, method=config()), other, 1, torch.device("cpu")).make(rows, 0)
     assert (batch.labels["bright"].numpy() == other.labels("bright", "train", "val")[rows]).all()
 
 

@@ -20,8 +20,8 @@ from mvitac.nn.encoders import PerFrame
 from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.vit import Predictor, row_uniform
 from mvitac.recipes import recipe
-from mvitac.system.distributed import World
-from mvitac.training.views import load_chunks
+from mvitac.training.sampler import Batches
+from mvitac.training.views import StepViews
 from support.small_methods import TINY, TINY_VIT, build, outcome, views
 from support.toy import Toy
 from support.training_runs import smoke
@@ -298,7 +298,8 @@ def test_each_step_has_its_seed_and_a_resumed_run_the_same(pack: Pack) -> None:
 
     def seeds(start: int, chunk: int = 0) -> list[list[int]]:
         rows = run.method.training_rows(pack)
-        made = load_chunks(replace(run, chunk=chunk), pack, rows, 1, torch.device("cpu"), World(), start, 4)
+        views = StepViews(replace(run, chunk=chunk), pack, 1, torch.device("cpu"))
+        made = views.each(Batches(run, pack, rows), start, 4)
         return [[int(view().seed) for view in chunks] for chunks in made]
 
     straight = seeds(0)

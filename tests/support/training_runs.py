@@ -7,16 +7,19 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
 
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
+from mvitac.methods.base import Views
 from mvitac.recipes import recipe
 from mvitac.run import Run
-from mvitac.training import views as batches
-from mvitac.training.views import make_views
+from mvitac.training.loader import Feed
+from mvitac.training.sampler import Batches
+from mvitac.training.views import StepViews
 
 
 def smoke(pack: Pack, **changes: object) -> Run:
@@ -28,14 +31,29 @@ def power_cut(after: int) -> Iterator[None]:
     """Training dies (RuntimeError "power cut") when it asks for its views after ``after`` batches."""
     left = iter(range(after))
 
-    def dying(*args: object) -> object:
+    make = StepViews.make
+
+    def dying(self: StepViews, rows: np.ndarray, seed: int) -> Views:
         if next(left, None) is None:
             raise RuntimeError("power cut")
-        return make_views(*args)  # type: ignore[arg-type]
+        return make(self, rows, seed)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batches, "make_views", dying)
+        patch.setattr(StepViews, "make", dying)
         yield
+
+
+def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) -> list[np.ndarray]:
+    """Pack rows of each step from ``start`` to ``num_steps``."""
+    order = Batches(run, pack, rows)
+    return [order[step] for step in range(start, num_steps)]
+
+
+def views_by(feed: type[Feed], run: Run, pack: Pack, rows: np.ndarray, num_views: int = 2) -> Views:
+    """Views of ``rows`` on the CPU, with images from ``feed``."""
+    made = StepViews(run, pack, num_views, torch.device("cpu"))
+    made.feed = feed(pack, made.device)
+    return made.make(rows, 0)
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.distributed as dist
 
@@ -12,9 +13,9 @@ from mvitac.datasets.mix import MixConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.methods.base import Method
 from mvitac.system.distributed import join
-from mvitac.training import views as batches
 from mvitac.training.loop import train as pretrain
 from mvitac.training.step import Step
+from mvitac.training.views import StepViews
 from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
 from support.small_steps import split, views
 
@@ -42,15 +43,15 @@ def train(place: str, out: Path, die_after: int, name: str) -> None:
     """
     mixed = "=" in place
     data = MixConfig(parts=tuple(place.split()), batches="one-part") if mixed else PackConfig(path=Path(place))
-    real, seen = batches.make_views, []
+    real, seen = StepViews.make, []
 
-    def watched(*args: object) -> object:
+    def watched(self: StepViews, rows: np.ndarray, seed: int) -> object:
         if len(seen) == die_after:
             raise RuntimeError("power cut")
-        seen.append(args[2].tolist())  # type: ignore[attr-defined]
-        return real(*args)  # type: ignore[arg-type]
+        seen.append(rows.tolist())
+        return real(self, rows, seed)
 
-    batches.make_views = watched  # type: ignore[assignment]
+    StepViews.make = watched  # type: ignore[assignment]
     pretrain(loop_run(data, name), out, resume=True, quiet=True)
     torch.save(seen, out.with_name(f"{out.name}-rows{join().rank}.pt"))
 

@@ -20,13 +20,12 @@ from mvitac.methods.base import Method
 from mvitac.recipes import recipe
 from mvitac.system.distributed import World
 from mvitac.training.loop import train
-from mvitac.training.sampler import batches
 from mvitac.training.step import Step
 from support.distributed_steps import METHODS, build, loop_run, run_of, third_step, three_steps
 from support.mixes import Gel, built
 from support.processes import begin
 from support.small_steps import assert_close, views
-from support.training_runs import power_cut
+from support.training_runs import batches, power_cut
 
 
 def together(folder: Path, *words: str, num: int = 2, fails: bool = False) -> None:

@@ -31,13 +31,12 @@ from mvitac.system import files
 from mvitac.training.checkpoint import CHECKPOINT, PREVIOUS
 from mvitac.training.loader import Feed
 from mvitac.training.loop import Diverged, train
-from mvitac.training.sampler import batches, epoch_order, mix, partners, spread_order
+from mvitac.training.sampler import epoch_order, mix, partners, spread_order
 from mvitac.training.validation import validate
-from mvitac.training.views import make_views
 from mvitac.transforms.random_views import Augment
 from support.processes import begin, finish
 from support.toy import toy_pack
-from support.training_runs import assert_equal_weights, power_cut, smoke, weights
+from support.training_runs import assert_equal_weights, batches, power_cut, smoke, views_by, weights
 
 
 @pytest.fixture(scope="module")
@@ -380,36 +379,6 @@ def test_the_spread_sampler_spreads(pack: Pack) -> None:
     assert np.array_equal(found, rows[order[: len(found)]])
 
 
-def test_partners_of_the_same_press(tmp_path: Path) -> None:
-    pack = build(MaterialsConfig(num=40, touches=2, moments=3, size=16).source(), tmp_path / "p", size=16, quiet=True)
-    rows = np.arange(pack.num)
-    found = partners(pack, rows, torch.Generator().manual_seed(0), "presses")
-    assert (found != rows).all() and np.array_equal(pack.presses[found], pack.presses[rows])
-    wide = partners(pack, rows, torch.Generator().manual_seed(0))
-    assert (pack.presses[wide] != pack.presses[rows]).mean() > 0.3
-    run = replace(recipe("smoke", PackConfig(path=pack.path)), positives="same-press")
-    assert np.array_equal(run.method.training_rows(pack), pack.rows("train"))
-    asked: list[np.ndarray] = []
-
-    class Spy(Feed):
-        def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
-            asked.append(rows)
-            return super().__call__(modality, rows)
-
-    cpu = torch.device("cpu")
-    make_views(
-        replace(run, augment=replace(run.augment, size=16)), pack, rows, 2, torch.Generator(), cpu, Spy(pack, cpu)
-    )
-    assert [bool((found == rows).all()) for found in asked] == [True, False, True, False]
-    assert all(np.array_equal(pack.presses[found], pack.presses[rows]) for found in asked)
-
-
-def test_same_press_needs_to_know_the_press(pack: Pack, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="same-press positives need a column 'press'"):
-        train(smoke(pack, positives="same-press"), tmp_path / "run", quiet=True)
-    assert not (tmp_path / "run" / "run.json").exists()
-
-
 def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, groups = np.arange(pack.num), pack.touch_groups
     found = partners(pack, rows, torch.Generator().manual_seed(0))
@@ -434,15 +403,13 @@ def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pyte
 def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> None:
     rows = pack.rows("train")[:16]
     asked: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
-    device = torch.device("cpu")
 
     class Spy(Feed):
         def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
             asked[modality].append(rows)
             return super().__call__(modality, rows)
 
-    run, generator = smoke(pack, positives=positives), torch.Generator().manual_seed(0)
-    made = make_views(run, pack, rows, num_views, generator, device, Spy(pack, device))
+    made = views_by(Spy, smoke(pack, positives=positives), pack, rows, num_views)
     assert {m: len(views) for m, views in made.images.items()} == {"vision": num_views, "touch": num_views}
     touch_groups = pack.touch_groups
     for found in (one for each in asked.values() for one in each):
@@ -502,8 +469,7 @@ def test_the_other_sensors_view_is_of_the_same_press(twice: Pack) -> None:
             return super().__call__(modality, rows)
 
     def made(run: Run) -> dict[str, list[torch.Tensor]]:
-        cpu = torch.device("cpu")
-        return make_views(run, twice, rows, 2, torch.Generator().manual_seed(0), cpu, Spy(twice, cpu)).images
+        return views_by(Spy, run, twice, rows).images
 
     plain = made(run)
     one_more = made(replace(run, method=MViTacConfig(hidden=32, out=16, lambda_sensor=0.5)))
@@ -511,8 +477,6 @@ def test_the_other_sensors_view_is_of_the_same_press(twice: Pack) -> None:
     found = asked["touch"][-1]
     assert np.array_equal(twice.presses[found], twice.presses[rows])
     assert (twice.sensors[found] != twice.sensors[rows]).all()
-    alone = partners(twice, rows, torch.Generator(), "presses")
-    assert np.array_equal(alone, found)  # two rows a press: the only other one
 
 
 def test_other_sensors_train_and_resume(twice: Pack, pack: Pack, tmp_path: Path) -> None:

@@ -23,11 +23,9 @@ from mvitac.recipes import with_method
 from mvitac.registry import default
 from mvitac.training.loader import Feed
 from mvitac.training.loop import train
-from mvitac.training.sampler import batches
-from mvitac.training.views import make_views
 from support.mixes import Gel, Slice, built, mix_run
 from support.small_methods import build, small
-from support.training_runs import assert_equal_weights, power_cut, smoke
+from support.training_runs import assert_equal_weights, batches, power_cut, smoke, views_by
 
 MISSING = sorted(name for name, config in MethodConfig.choices.items() if config.takes_missing)
 PAIRED = ("cmc", "mct", "ssvtp")
@@ -126,8 +124,7 @@ def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Pa
 
 
 def views_of(run: Any, pack: Pack, rows: np.ndarray, num_views: int = 2) -> Views:
-    cpu = torch.device("cpu")
-    return make_views(run, pack, rows, num_views, torch.Generator().manual_seed(0), cpu, Feed(pack, cpu))
+    return views_by(Feed, run, pack, rows, num_views)
 
 
 def test_views_are_of_the_rows_that_have_the_modality(parts: dict[str, str]) -> None:

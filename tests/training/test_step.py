@@ -112,30 +112,6 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
         torch.testing.assert_close(buffer, dict(cached.query.named_buffers())[name])
 
 
-def test_recomputing_changes_nothing_but_memory() -> None:
-    kept, recomputed = build(), build()
-    a, b = take(RUN, kept, [views]), take(replace(RUN, recompute=True), recomputed, [views])
-    assert_close(a, b, 1e-6)
-    assert_close(gradients(kept), gradients(recomputed), 1e-5)
-
-
-def test_recomputing_saves_memory() -> None:
-    saved = []
-    for recompute in (False, True):
-        method, total = build(), 0
-
-        def count(tensor: Tensor) -> Tensor:
-            nonlocal total
-            total += tensor.nbytes
-            return tensor
-
-        step = Step(replace(RUN, recompute=recompute), method, CPU)
-        with torch.autograd.graph.saved_tensors_hooks(count, lambda t: t):
-            step([views], lr=1e-3, seed=0, progress=0.5)
-        saved.append(total)
-    assert saved[1] < saved[0]
-
-
 def test_chunks_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
     from mvitac.datasets.pack import PackConfig
 

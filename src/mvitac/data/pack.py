@@ -220,10 +220,7 @@ class Pack:
             ValueError: If the pack has no such column.
         """
         if "press" not in self.table.column_names:
-            raise ValueError(
-                "same-press positives need a column 'press', which says which rows are moments of one press: simulate"
-                " with --data.moments 2, or use same-touch where a touch group is the frames of one press"
-            )
+            raise ValueError("the table has no column press: simulate with --data.sensors-per-press 2")
         return np.unique(self.column("press").astype(str), return_inverse=True)[1]
 
     @functools.cached_property

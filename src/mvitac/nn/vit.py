@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 from timm.layers import PatchEmbed  # pyright: ignore[reportPrivateImportUsage]
 from timm.models.vision_transformer import Block, VisionTransformer
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from mvitac.data.spec import DataSpec
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, PerFrame, build_trunk
@@ -149,21 +148,16 @@ def encode_visible(
     front = vit.num_prefix_tokens
     tokens = torch.cat([tokens[:, :front], take(tokens[:, front:], at)], dim=1)
     live = None if live is None else F.pad(live, (front, 0), value=True)
-    return Tokens(
-        vit.norm(_pass(vit.blocks, tokens, live, recompute=vit.grad_checkpointing)), at, grid_of(trunk, images), live
-    )
+    return Tokens(vit.norm(_pass(vit.blocks, tokens, live)), at, grid_of(trunk, images), live)
 
 
-def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None, *, recompute: bool = False) -> Tensor:
+def _pass(blocks: nn.Sequential, tokens: Tensor, live: Tensor | None) -> Tensor:
     """``tokens`` [B, L, D] through transformer blocks, in which no token attends to one that is not ``live`` [B, L]."""
     mask = None
     if live is not None:
         mask = torch.zeros(live.shape, device=live.device).masked_fill(~live, -torch.inf)[:, None, None]
     for block in blocks:
-        if recompute and torch.is_grad_enabled():
-            tokens = checkpoint(block, tokens, mask, use_reentrant=False)  # type: ignore[assignment]
-        else:
-            tokens = block(tokens, attn_mask=mask)
+        tokens = block(tokens, attn_mask=mask)
     return tokens
 
 

@@ -1,8 +1,7 @@
 """Rows of each step, in an order that is a function of (seed, epoch)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 import torch
@@ -131,13 +130,6 @@ def check_mix(run: Run, pack: Pack, rows: np.ndarray, world: World) -> None:
         raise ValueError(f"batch_size {run.batch_size}: parts that lack a modality need at least 3")
 
 
-def batches(run: Run, pack: Pack, rows: np.ndarray, start: int, num_steps: int) -> Iterator[np.ndarray]:
-    """Pack rows of each step from ``start`` to ``num_steps``, as ``Batches`` orders them."""
-    order = Batches(run, pack, rows)
-    for step in range(start, num_steps):
-        yield order[step]
-
-
 def epoch_order(num: int, groups: np.ndarray | None, seed: int) -> np.ndarray:
     """A random permutation of 0..num-1.
 
@@ -182,15 +174,16 @@ def partners(
     pack: Pack,
     rows: np.ndarray,
     generator: torch.Generator,
-    of: Literal["touch_groups", "presses"] = "touch_groups",
+    *,
     within: float = 0.0,
     other_sensor: bool = False,
 ) -> np.ndarray:
-    """For each of ``rows`` a random other row of the same touch group (or press) and split.
+    """For each of ``rows`` a random other row of the same touch group and split.
 
-    With ``within``, its distance in time is at most that; with ``other_sensor``, it is of another sensor. A row without
-    such others is its own partner.
+    With ``within``, its distance in time is at most that; with ``other_sensor``, it is of the same press and another sensor.
+    A row without such others is its own partner.
     """
+    of = "presses" if other_sensor else "touch_groups"
     groups: np.ndarray = getattr(pack, of)
     split = pack.column("split")
     place = places(pack, pack.spec.window)[1] if within else np.zeros(0)

@@ -30,11 +30,11 @@ from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
 from mvitac.system.provenance import provenance
 from mvitac.training import checkpoint
-from mvitac.training.sampler import check_mix
+from mvitac.training.sampler import Batches, check_mix
 from mvitac.training.start import Start, load_start, read_start, warning
 from mvitac.training.start import describe as describe_start
 from mvitac.training.step import Chunk, Step
-from mvitac.training.views import load_chunks, values_of
+from mvitac.training.views import StepViews, values_of
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class Setup:
     device: torch.device
     world: World
     method: Method
+    views: StepViews
     step: Step
     start: int  # number of steps that are already done
     num_steps: int
@@ -55,9 +56,8 @@ class Setup:
     spec: DataSpec  # that of ``pack``, with the sensors that the model met
 
     def chunks(self, start: int, num_steps: int) -> Iterator[list[Chunk]]:
-        """The chunks of each step from ``start`` to ``num_steps`` (``load_chunks``)."""
-        how = self.method.views, self.device, self.world, start, num_steps
-        return load_chunks(self.run, self.pack, self.rows, *how)
+        """The chunks of each step from ``start`` to ``num_steps``."""
+        return self.views.each(Batches(self.run, self.pack, self.rows), start, num_steps)
 
 
 def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | None) -> Setup | None:
@@ -66,53 +66,64 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     device = pick_device(local_device(asked.device))
     run = replace(asked, precision=_precision(asked, device, world))
     pack = open_pack(run.data, world, quiet) if pack is None else pack
-    if run.positives == "same-press":
-        _ = pack.presses  # the ValueError comes before anything is written
+    rows = check(run, pack, world)
+    resumed = (out / "run.json").exists()
+    if resumed and _is_finished(asked, run, pack, out, world):
+        return None
+
+    start = read_start(run.init)
+    method, taken = _build_method(run, pack, rows, device, world, start)
+    step = Step(run, method, device, world)
+    done, kept = checkpoint.restore(out, run, method, step.optimiser, world)
+    views = StepViews(run, pack, method.views, device, world)
+    before = start.sensors if start and "touch" in taken["taken"] else ()
+    spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
+    num_steps = run.num_steps(len(rows))
+    setup = Setup(asked, run, pack, rows, device, world, method, views, step, done, num_steps, kept, spec)
+    if done == 0:
+        _before_first_step(setup)
+    # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
+    world.same_everywhere([*method.parameters(), *method.buffers()])
+    if world.writes:
+        _record(setup, out, start, taken, quiet=quiet)
+    return setup
+
+
+def check(run: Run, pack: Pack, world: World) -> np.ndarray:
+    """The rows of ``pack`` to train on; ValueError if a setting does not fit them, before anything is written."""
     if run.positives_within:
-        places(pack, pack.spec.window)  # the same
+        places(pack, pack.spec.window)
     run.method.check_pack(pack)
     rows = run.method.training_rows(pack)
     run.check(pack.spec, len(rows), pack.size)
     check_divisible(run, world)
     check_mix(run, pack, rows, world)
-    resumed = (out / "run.json").exists()
-    if resumed:
-        begun = check_same(asked, pack, out)
-        if _is_finished(out, world):
-            return None
-        _check_precision(begun, asked, run, out)
+    return rows
 
-    start_weights = read_start(run.init)
-    method, taken = _build_method(run, pack, rows, device, world, start_weights)
-    step = Step(run, method, device, world)
-    num_steps = run.num_steps(len(rows))
-    start, kept = checkpoint.restore(out, run, method, step.optimiser, world)
-    before = start_weights.sensors if start_weights and "touch" in taken["taken"] else ()
-    spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
-    setup = Setup(asked, run, pack, rows, device, world, method, step, start, num_steps, kept, spec)
-    if start == 0:
-        _before_first_step(setup)
-    # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
-    world.same_everywhere([*method.parameters(), *method.buffers()])
-    if not resumed and world.writes:
-        record = {"run": to_json(asked), "pack": pack.digest, "num_pairs": pack.num, "data": to_json(spec)}
-        here = {"device": describe(device), "precision": run.precision}
+
+def _record(setup: Setup, out: Path, start: Start | None, taken: dict[str, Any], *, quiet: bool) -> None:
+    """Write run.json and the hashes of the rows that the run learns from, and say what it starts from."""
+    run, pack, method = setup.run, setup.pack, setup.method
+    if not (out / "run.json").exists():
+        data = {"pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
+        record = {"run": to_json(setup.asked), **data, "device": describe(setup.device), "precision": run.precision}
         used = {m: run.encoder[m] for m in method.encoders() if run.encoder[m].weights == IMAGENET}
+        said = []
         if imagenet := {m: source(config.trunk) for m, config in used.items()}:
-            record |= {"imagenet": imagenet}
-            for modality, found in {} if quiet else imagenet.items():
-                print(f"mvitac: {modality} starts from ImageNet weights of {found}", file=sys.stderr)
-        if start_weights:
-            record |= {"start": taken}
-            for line in [] if quiet else [describe_start(taken)]:
-                print(f"mvitac: {line}", file=sys.stderr)
-        if found := warning(run, start_weights, pack):
-            print(f"mvitac: warning: {found}", file=sys.stderr)
-        write_json(out / "run.json", {**record, **here, **provenance()}, sealed=True)
-    if world.writes and not (out / FILE).exists():
-        before = [*(start_weights.sources if start_weights else []), *weights_sources(run)]
-        write_sources(out, with_ancestors(source_of(pack, rows), before))
-    return setup
+            record["imagenet"] = imagenet
+            said += [f"{modality} starts from ImageNet weights of {found}" for modality, found in imagenet.items()]
+        if start:
+            record["start"] = taken
+            said.append(describe_start(taken))
+        said = [] if quiet else said
+        if found := warning(run, start, pack):
+            said.append(f"warning: {found}")
+        for line in said:
+            print(f"mvitac: {line}", file=sys.stderr)
+        write_json(out / "run.json", {**record, **provenance()}, sealed=True)
+    if not (out / FILE).exists():
+        before = [*(start.sources if start else []), *weights_sources(run)]
+        write_sources(out, with_ancestors(source_of(pack, setup.rows), before))
 
 
 def check_out(out: Path, resume: bool) -> None:
@@ -131,21 +142,29 @@ def check_still_there(out: Path) -> None:
         raise ValueError(f"{out / 'run.json'} is gone: {out} was deleted or moved during training, start again")
 
 
-def _is_finished(out: Path, world: World) -> bool:
-    """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint."""
-    if not (out / "model.safetensors").exists():
-        return False
-    try:
-        load(out)
-    except ValueError as error:
-        if not (out / checkpoint.CHECKPOINT).exists():
-            raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
-        if world.writes:
-            print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
-        return False
-    if world.writes:
-        (out / checkpoint.PREVIOUS).unlink(missing_ok=True)  # left by a process that was killed at the very end
-    return True
+def _is_finished(asked: Run, run: Run, pack: Pack, out: Path, world: World) -> bool:
+    """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint.
+
+    ValueError if ``out`` holds another run, or was begun in another precision: its weights would match neither.
+    """
+    begun = check_same(asked, pack, out)
+    if (out / "model.safetensors").exists():
+        try:
+            load(out)
+            if world.writes:
+                (out / checkpoint.PREVIOUS).unlink(missing_ok=True)  # left by a process that was killed at the very end
+            return True
+        except ValueError as error:
+            if not (out / checkpoint.CHECKPOINT).exists():
+                raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
+            if world.writes:
+                print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
+    if begun != run.precision:
+        raise ValueError(
+            f"{out} was begun in {begun}, and --precision {asked.precision} means {run.precision} on this machine:"
+            f" continue it with --precision {begun}, or delete it to start over in {run.precision}"
+        )
+    return False
 
 
 def check_divisible(run: Run, world: World) -> None:
@@ -176,15 +195,6 @@ def _precision(run: Run, device: torch.device, world: World) -> str:
     """Resolve ``run.precision`` on ``device``. auto is bf16 only if every process supports it."""
     precision = pick_precision(run.precision, device)
     return "fp32" if run.precision == "auto" and world.anyone(precision == "fp32") else precision
-
-
-def _check_precision(begun: str, asked: Run, run: Run, out: Path) -> None:
-    """Raise ValueError if the run in ``out`` was started in another precision: its weights would match neither."""
-    if begun != run.precision:
-        raise ValueError(
-            f"{out} was begun in {begun}, and --precision {asked.precision} means {run.precision} on this machine:"
-            f" continue it with --precision {begun}, or delete it to start over in {run.precision}"
-        )
 
 
 def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:

@@ -39,13 +39,6 @@ class Step:
             raise ValueError(
                 f"method {run.method.name!r} supports neither several processes nor --chunk: leave them out"
             )
-        if run.recompute:
-            for name, trunk in method.encoders().items():
-                if not hasattr(trunk, "set_grad_checkpointing"):
-                    raise ValueError(
-                        f"trunk {run.encoder[name].trunk} ({name}) cannot recompute: leave out --recompute"
-                    )
-                trunk.set_grad_checkpointing(True)  # pyright: ignore[reportCallIssue]
         set_precision(run.precision)
         self.forward = torch.compile(method, fullgraph=True) if run.compile else method
 

@@ -1,4 +1,4 @@
-"""The random views of each step, which are a function of (seed, step)."""
+"""From the rows of a step to random views on the device: a function of (seed, step)."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -13,91 +13,80 @@ from mvitac.methods.base import Views
 from mvitac.run import Run
 from mvitac.system.distributed import World
 from mvitac.training.loader import Feed, ahead, prefetch
-from mvitac.training.sampler import batches, mix, partners
+from mvitac.training.sampler import Batches, mix, partners
 from mvitac.training.step import Chunk
 from mvitac.transforms.random_views import random_view
 
 
-def load_chunks(
-    run: Run,
-    pack: Pack,
-    rows: np.ndarray,
-    num_views: int,
-    device: torch.device,
-    world: World,
-    start: int,
-    num_steps: int,
-) -> Iterator[list[Chunk]]:
-    """The chunks of each step's batch that this process embeds.
+class StepViews:
+    """Random views of the rows of a step, as the chunks that this process embeds.
 
-    Views depend on (seed, step, number of the chunk) only. Two processes thus see the same views as one process with chunks
-    of half the batch.
+    They depend on (seed, step, number of the chunk) only. Two processes thus see the same views as one process with chunks
+    of half the batch. ``num`` is the number of views of an image (``Method.views``).
     """
-    feed = Feed(pack, device)
-    share = run.batch_size // world.size
-    per_process = share // (run.chunk or share)
-    num_chunks = per_process * world.size
 
-    def make(step: int, batch: np.ndarray, number: int) -> Views:
-        seed = mix(run.seed, step) if num_chunks == 1 else mix(run.seed, step, number)
-        own = np.split(batch, num_chunks)[number]
-        return make_views(run, pack, own, num_views, torch.Generator().manual_seed(seed), device, feed)
+    def __init__(self, run: Run, pack: Pack, num: int, device: torch.device, world: World | None = None) -> None:
+        self.run, self.pack, self.num, self.device, self.world = run, pack, num, device, world or World()
+        self.feed = Feed(pack, device)
+        share = run.batch_size // self.world.size
+        self.per_process = share // (run.chunk or share)
 
-    numbers = range(per_process * world.rank, per_process * (world.rank + 1))
-    steps = enumerate(batches(run, pack, rows, start, num_steps), start=start)
-    if per_process == 1 and (device.type == "cuda" or any(isinstance(i, Lazy) for i in pack.images.values())):
-        # One chunk per step, and slow to make or needed on a GPU: make the next ones while this one is used.
-        views = (make(step, batch, numbers[0]) for step, batch in steps)
-        for made in ahead(views, device) if device.type == "cuda" else prefetch(views):
+    def each(self, batches: Batches, start: int, num_steps: int) -> Iterator[list[Chunk]]:
+        """The chunks of each step from ``start`` to ``num_steps``.
+
+        One chunk that is slow to make, or needed on a GPU, is made while the one before is used.
+        """
+        steps = (self(batches[step], step) for step in range(start, num_steps))
+        slow = self.device.type == "cuda" or any(isinstance(images, Lazy) for images in self.pack.images.values())
+        if self.per_process > 1 or not slow:
+            yield from steps
+            return
+        views = (chunk() for (chunk,) in steps)
+        for made in ahead(views, self.device) if self.device.type == "cuda" else prefetch(views):
             yield [lambda made=made: made]
-        return
-    for step, batch in steps:
-        yield [partial(make, step, batch, number) for number in numbers]
 
+    def __call__(self, rows: np.ndarray, step: int) -> list[Chunk]:
+        """The chunks of ``rows``, the whole batch of ``step``, that this process embeds."""
+        num = self.per_process * self.world.size
+        chunks = np.split(rows, num)
+        seeds = [mix(self.run.seed, step) if num == 1 else mix(self.run.seed, step, number) for number in range(num)]
+        mine = range(self.per_process * self.world.rank, self.per_process * (self.world.rank + 1))
+        return [partial(self.make, chunks[number], seeds[number]) for number in mine]
 
-def make_views(
-    run: Run,
-    pack: Pack,
-    rows: np.ndarray,
-    num_views: int,
-    generator: torch.Generator,
-    device: torch.device,
-    feed: Feed,
-) -> Views:
-    """Make random views of pack rows [B] on ``device``, in the precision that the networks read them in.
+    def make(self, rows: np.ndarray, seed: int) -> Views:
+        """Views of pack rows [B] on the device, in the precision that the networks read them in."""
+        run, pack, generator = self.run, self.pack, torch.Generator().manual_seed(seed)
+        sources = self._sources(rows, generator)
+        has, both = senses(pack, rows), {}
+        if not all(there.all() for there in has.values()):
+            pairs = np.logical_and.reduce(list(has.values()))
+            both = {m: torch.from_numpy(np.flatnonzero(pairs[there])).to(self.device) for m, there in has.items()}
+            sources = {m: _some(sources[m], there) for m, there in has.items()}
+        dtype = torch.bfloat16 if run.bf16 else torch.float32
+        images: dict[str, list[Tensor]] = {}
+        for m in has:
+            different = {id(source): source for source in sources[m]}  # an image of two views is loaded once
+            fed = {name: self.feed(m, source) for name, source in different.items()}
+            how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].levels
+            images[m] = [random_view(fed[id(source)], *how) for source in sources[m]]
+        splits = run.method.label_splits
+        labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(self.device) for t in pack.spec.tasks}
+        values = {task: value.to(self.device) for task, value in values_of(run, pack, rows).items()}
+        at, drawn = torch.from_numpy(rows).to(self.device), torch.tensor(seed).to(self.device)
+        return Views(images=images, labels=labels, rows=at, values=values, both=both, seed=drawn)
 
-    All randomness comes from ``generator``.
-    """
-    views = [rows] * num_views
-    if run.positives != "same-image":
-        of = "presses" if run.positives == "same-press" else "touch_groups"
-        views[1:] = [partners(pack, rows, generator, of, run.positives_within) for _ in range(num_views - 1)]
-    sources = dict.fromkeys(pack.spec.modalities, views)
-    if run.positives == "same-touch-pairs" and num_views == 1:
-        sources["touch"] = [partners(pack, rows, generator, within=run.positives_within)]
-    if run.method.sensor_view:
-        sources["touch"] = [*sources["touch"], partners(pack, rows, generator, "presses", other_sensor=True)]
-    dtype = torch.bfloat16 if run.bf16 else torch.float32
-    images: dict[str, list[Tensor]] = {}
-    has = senses(pack, rows)
-    both: dict[str, Tensor] = {}
-    if not all(there.all() for there in has.values()):
-        pairs = np.logical_and.reduce(list(has.values()))
-        both = {m: torch.from_numpy(np.flatnonzero(pairs[there])).to(device) for m, there in has.items()}
-        sources = {m: _some(sources[m], there) for m, there in has.items()}
-    for modality in has:
-        config, images[modality] = run.augment.of(modality), []
-        size, levels = run.augment.size_of(modality), run.encoder[modality].levels
-        fed: dict[int, Tensor] = {}  # load an image once for two views
-        for source in sources[modality]:
-            seen = fed[id(source)] if id(source) in fed else fed.setdefault(id(source), feed(modality, source))
-            view = random_view(seen, config, size, generator, dtype, levels)
-            images[modality].append(view)
-    splits = run.method.label_splits
-    labels = {t.name: torch.from_numpy(pack.labels(t.name, *splits)[rows]).to(device) for t in pack.spec.tasks}
-    values = {task: value.to(device) for task, value in values_of(run, pack, rows).items()}
-    at, seed = torch.from_numpy(rows).to(device), torch.tensor(generator.initial_seed()).to(device)
-    return Views(images=images, labels=labels, rows=at, values=values, both=both, seed=seed)
+    def _sources(self, rows: np.ndarray, generator: torch.Generator) -> dict[str, list[np.ndarray]]:
+        """Modality -> the rows that each of its views shows (``Run.positives``)."""
+        run, pack = self.run, self.pack
+        views = [rows] * self.num
+        if run.positives != "same-image":
+            views[1:] = [partners(pack, rows, generator, within=run.positives_within) for _ in views[1:]]
+        sources = dict.fromkeys(pack.spec.modalities, views)
+        if run.positives == "same-touch-pairs" and self.num == 1:
+            sources["touch"] = [partners(pack, rows, generator, within=run.positives_within)]
+        if run.method.sensor_view:
+            sources["touch"] = [*sources["touch"], partners(pack, rows, generator, other_sensor=True)]
+        return sources
 
 
 def _some(sources: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:
