@@ -260,7 +260,7 @@ def test_pretrain_warns_of_seen_test_rows(
 def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.safetensors").write_text("no tensors")
-    nan = build_trunk(smoke(pack).encoder, 3).state_dict()
+    nan = build_trunk(smoke(pack).encoder.touch, 3).state_dict()
     nan[min(nan)].fill_(float("nan"))
     save_file(nan, tmp_path / "nan.safetensors")
     with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
