@@ -10,6 +10,7 @@ A *kind* is a direct subclass of ``Registered``. Each further subclass that has 
 import dataclasses
 import difflib
 import importlib
+import math
 import pkgutil
 import types
 import typing
@@ -42,6 +43,13 @@ def unknown(what: str, given: str, allowed: typing.Iterable[str]) -> ValueError:
     near = difflib.get_close_matches(given, allowed, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return ValueError(f"unknown {what} {given!r}: choose from {', '.join(allowed)}{hint}")
+
+
+def check_range(config: object, low: float, high: float, *names: str) -> None:
+    """ValueError unless the numbers ``names`` of ``config`` are finite and from ``low`` to ``high``."""
+    for name in names:
+        if not (low <= (value := getattr(config, name)) <= high and math.isfinite(value)):
+            raise ValueError(f"{name} {value}: give {low} {'or more' if high == math.inf else f'to {high}'}")
 
 
 def find(kind: type[T], name: str) -> type[T]:

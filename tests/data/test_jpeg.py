@@ -24,9 +24,6 @@ from mvitac.data.jpeg import Jpegs, decode, encode
 from mvitac.data.pack import Pack
 from mvitac.data.source import Lost, Sample, Source
 from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.deploy import search
-from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
-from mvitac.evaluation.pack_features import pack_features
 from mvitac.recipes import recipe
 from mvitac.run import Run
 from mvitac.training.loop import train
@@ -34,7 +31,7 @@ from mvitac.training.sampler import Batches
 from mvitac.training.views import StepViews
 from support.forged_packs import described, seal
 from support.toy import Toy
-from support.training_runs import assert_equal_weights, power_cut, smoke
+from support.training_runs import assert_equal_weights, smoke
 
 FILES = ("pack.json", "samples.parquet", "vision.jpegs", "touch.jpegs")
 
@@ -338,29 +335,9 @@ def run_on(pack: Pack, **changes: Any) -> Run:
     return smoke(pack, **{"steps": 4, "eval_every": 4, **changes})
 
 
-@pytest.fixture(scope="module")
-def trained(small: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(run_on(small), tmp_path_factory.mktemp("trained") / "run", quiet=True)
-
-
-def test_trains_as_on_the_same_pixels_raw(trained: Path, small: Pack, decoded: Pack, tmp_path: Path) -> None:
-    assert_equal_weights(trained, train(run_on(decoded), tmp_path / "raw", quiet=True))
-    assert_equal_weights(trained, train(run_on(small), tmp_path / "again", quiet=True))
-
-
-def test_trains_in_chunks_with_partners_too(small: Pack, decoded: Pack, tmp_path: Path) -> None:
-    changes: dict[str, Any] = {"positives": "same-touch", "chunk": 8, "steps": 1, "eval_every": 0}
+def test_trains_as_on_the_same_pixels_raw(small: Pack, decoded: Pack, tmp_path: Path) -> None:
     packs = {"jpeg": small, "raw": decoded}
-    made = [train(run_on(pack, **changes), tmp_path / name, quiet=True) for name, pack in packs.items()]
-    assert_equal_weights(*made)
-
-
-def test_resumed_equals_straight(trained: Path, small: Pack, tmp_path: Path) -> None:
-    run = run_on(small, checkpoint_every=1)
-    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
-        train(run, tmp_path / "r", quiet=True)
-    train(run, tmp_path / "r", resume=True, quiet=True)
-    assert_equal_weights(trained, tmp_path / "r")
+    assert_equal_weights(*(train(run_on(pack), tmp_path / name, quiet=True) for name, pack in packs.items()))
 
 
 def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -377,19 +354,3 @@ def test_decoding_runs_ahead_of_the_step(small: Pack, decoded: Pack, monkeypatch
         for parts in views.each(Batches(run, pack, rows), 0, 3):
             assert len(parts[0]().rows) == run.batch_size
         assert len(makers) == 3 and all(maker.startswith(name) for maker in makers)
-
-
-def test_probed_and_searched_as_the_same_pixels(trained: Path, small: Pack, decoded: Pack, tmp_path: Path) -> None:
-    from mvitac.deploy.artifact import load
-
-    model, rows = load(trained), small.rows("test")
-    for modality in ("vision", "touch"):
-        pair = [pack_features(model, pack, modality, rows) for pack in (small, decoded)]
-        assert torch.equal(*pair)
-    records = [
-        probe_runs([trained], ProbeConfig(tasks=("pattern",), probes=("knn",)), pack)["records"]
-        for pack in (small, decoded)
-    ]
-    assert records[0] and records[0] == records[1]
-    index = search.build(model, small, tmp_path / "index", ("test",))
-    assert index.find(model, small.images["touch"][rows[3]], "touch", "touch", 1)[0].tolist() == [[3]]

@@ -789,12 +789,3 @@ def test_rows_that_share_something_are_told_where_no_group_is_given(tmp_path: Pa
     assert not FolderConfig(path=file, labels=("material",), group="press").source().spec().notes
     findings, _ = examine_source(FolderConfig(path=file, labels=("material",), size=16).source(), quiet=True)
     assert [(f.verdict, f.item) for f in findings if "vision files" in f.evidence] == [("look", "groups")]
-
-
-def test_a_home_folder_in_an_option(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """No shell expands it after =."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert main(["data", "pack", "--data", "folder", "--path=~/none.csv", "--out", str(tmp_path / "p")]) == 2
-    assert f"{tmp_path}/none.csv does not exist" in capsys.readouterr().err

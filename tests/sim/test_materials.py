@@ -345,7 +345,7 @@ def test_packs_say_which_sensor_pressed_and_old_ones_keep_their_digests():
         ({"makes": ("mimi",)}, "unknown sensor 'mimi'.*did you mean 'mini'"),
         ({"makes": ("mini",), "sensors": 3}, "give one of them"),
         ({"sensors": 5, "held_out_sensor": True}, "give one of them"),
-        ({"sensors": -1}, "at most 10000"),
+        ({"sensors": -1}, "sensors -1: give 0 to 10000"),
         ({"sensors_per_press": 5}, "give 1 to 4"),
         ({"held_out_sensor": True, "sensors_per_press": 2}, "give 1 to 1"),
         ({"sensors_per_press": 2, "moments": 2}, "leave moments at 1"),

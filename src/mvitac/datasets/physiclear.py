@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.table import RowsConfig
+from mvitac.registry import check_range
 from mvitac.system.files import brief
 
 LABELS = {
@@ -51,8 +52,7 @@ class PhysiclearConfig(RowsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.frames <= 1000:
-            raise ValueError(f"frames {self.frames}: give 1 to 1000 per video")
+        check_range(self, 1, 1000, "frames")
         if not 0 <= self.span[0] <= self.span[1] <= 1:
             raise ValueError(
                 f"span {self.span[0]} {self.span[1]}: give two fractions of the length, 0 <= first <= last <= 1"

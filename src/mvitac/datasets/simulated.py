@@ -3,6 +3,7 @@
 They are the default data: every experiment runs without a download. Results are not comparable with the paper's.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -15,7 +16,7 @@ from mvitac.data.images import difference
 from mvitac.data.source import Sample, Source
 from mvitac.data.spec import DataSpec, Target, Task, ValueTask
 from mvitac.datasets.base import KEEPING, DatasetConfig
-from mvitac.registry import to_json, unknown
+from mvitac.registry import check_range, to_json, unknown
 from mvitac.sim import grasps, materials
 from mvitac.sim.sensors import SENSORS, Sensor, random_sensors
 
@@ -49,10 +50,8 @@ class SimulatedConfig(DatasetConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.num <= 10_000_000:
-            raise ValueError(f"num {self.num}: give how many to simulate, at least 1 and at most 10000000")
-        if not 0 <= self.seed < 1 << 63:
-            raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
+        check_range(self, 1, 10_000_000, "num")
+        check_range(self, 0, (1 << 63) - 1, "seed")
 
     def _fingerprint(self, version: int) -> dict[str, Any]:
         own = {key: value for key, value in to_json(self).items() if key == "size" or key not in KEEPING}
@@ -81,8 +80,8 @@ class MaterialsConfig(SimulatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.touches < 1:
-            raise ValueError(f"touches {self.touches}: give touches per instance, at least 1")
+        check_range(self, 1, math.inf, "touches")
+        check_range(self, 0, 10_000, "sensors")
         if not 1 <= self.moments <= 1000:
             raise ValueError(f"moments {self.moments}: give moments per touch, 1 to 1000")
         for name in self.makes:
@@ -90,11 +89,7 @@ class MaterialsConfig(SimulatedConfig):
                 raise unknown("sensor", name, SENSORS)
         if bool(self.makes) + bool(self.sensors) + self.held_out_sensor > 1:
             raise ValueError("makes, sensors and held_out_sensor each say which sensors press: give one of them")
-        if not 0 <= self.sensors <= 10_000:
-            raise ValueError(f"sensors {self.sensors}: give how many to draw, at most 10000, or 0 for the known makes")
-        num = len(self.choice())
-        if not 1 <= self.sensors_per_press <= num:
-            raise ValueError(f"sensors_per_press {self.sensors_per_press}: give 1 to {num}, the number of sensors")
+        check_range(self, 1, len(self.choice()), "sensors_per_press")
         if self.sensors_per_press > 1 and self.moments > 1:
             raise ValueError("a press has either several moments or several sensors: leave moments at 1")
 

@@ -18,6 +18,7 @@ from mvitac.data.video import num_frames, spread
 from mvitac.datasets.table.manifest import Manifest, in_clone
 from mvitac.datasets.table.splits import add_folds
 from mvitac.datasets.table.table import RowsConfig
+from mvitac.registry import check_range
 from mvitac.system.files import digest_file
 
 FINGERS = {"left": "camera_0.avi", "right": "camera_2.avi"}
@@ -46,8 +47,7 @@ class SlipGSMiniConfig(RowsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.frames <= 1000:
-            raise ValueError(f"frames {self.frames}: give 1 to 1000 per recording")
+        check_range(self, 1, 1000, "frames")
 
     def manifest(self) -> Manifest:
         root = in_clone(self.path, "docs", "**/exp_num_*/camera_0.avi", self.source_url)

@@ -51,31 +51,6 @@ def most_attempted(counts: Counter[str]) -> list[str]:
     return sorted(counts, key=lambda name: (-counts[name], name))[:40]
 
 
-def doubtful(counts: Counter[str]) -> list[tuple[str, str]]:
-    """Return pairs (name, likely correct name): the first is a prefix of the second or differs by one letter.
-
-    Names in the authors' lists are considered correct, then frequent ones, then longer ones.
-    """
-    listed = {*AUTHORS_TRAIN, *AUTHORS_TEST}
-    names = sorted(counts, key=lambda name: (name not in listed, -counts[name], -len(name), name))
-    pairs = []
-    for i, name in enumerate(names):
-        for likely in names[:i]:
-            cut = len(name) >= 8 and likely.startswith(name)
-            slip = len(name) >= 5 and abs(len(name) - len(likely)) <= 1 and _one_edit(name, likely)
-            if cut or slip:
-                pairs.append((name, likely))
-                break
-    return pairs
-
-
-def _one_edit(a: str, b: str) -> bool:
-    """Return whether ``a`` and ``b`` differ by one letter added, removed or changed."""
-    a, b = sorted((a, b), key=len)
-    same = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
-    return a[same:] == b[same + 1 :] or a[same + 1 :] == b[same + 1 :]
-
-
 def owners_shuffle(names: Sequence[str], seed: int) -> list[str]:
     """Shuffle sorted ``names`` like the owners' script: Python 2's random.shuffle after random.seed(seed)."""
     shuffled, generator = sorted(names), random.Random(seed)

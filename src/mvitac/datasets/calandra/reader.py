@@ -15,6 +15,7 @@ Sources: the owners' scripts (github.com/robertocalandra/the-feeling-of-success)
 split by object; the authors' notebook (github.com/ligerfotis/mvitac, create_dataset.ipynb) for their 32 and 8 objects.
 """
 
+import math
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ from mvitac.data.spec import PHASES, DataSpec, Task
 from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.calandra import objects
 from mvitac.datasets.calandra.objects import AUTHORS_TEST, AUTHORS_TRAIN
-from mvitac.registry import to_json, unknown
+from mvitac.registry import check_range, to_json, unknown
 from mvitac.system.files import brief, digest
 
 VERSION = 1  # version of this reader. Increase it when the same shards would give another pack.
@@ -85,16 +86,12 @@ class CalandraConfig(DatasetConfig):
         for name, values in (("shards", self.shards), ("ask", self.ask), ("phases", self.phases)):
             if len(set(values)) < len(values):
                 raise ValueError(f"{name} {' '.join(map(str, values))}: name each once")
-        if not all(0 <= shard < NUM_SHARDS for shard in self.shards):
-            raise ValueError(f"shards {' '.join(map(str, self.shards))}: give numbers from 0 to {NUM_SHARDS - 1}")
         if not self.phases:
             raise ValueError(f"phases: give at least one of {', '.join(PHASES)}")
         if not self.split.startswith("fold:") and self.split not in ("authors", "object"):
             raise unknown("split", self.split, ("authors", "object", "fold:K", "fold:NAME"))
-        if self.split_seed < 0:
-            raise ValueError(f"split_seed {self.split_seed}: give a number >= 0")
-        if not 0 <= self.val_share < 1:
-            raise ValueError(f"val_share {self.val_share}: give a fraction of the training objects in [0, 1)")
+        check_range(self, 0, 0.9, "val_share")
+        check_range(self, 0, math.inf, "split_seed")
         for asked in self.ask:
             if (needed := "during" if asked == "authors" else asked) not in self.phases:
                 raise ValueError(f"ask {asked}: phases leaves {needed!r} out, add it")
@@ -211,14 +208,10 @@ class Calandra(Source):
         top, listed = objects.most_attempted(self.counts), {*AUTHORS_TRAIN, *AUTHORS_TEST}
         lacking, others = sorted(listed - set(top)), sorted(set(top) - listed)
         swaps = f"listed but not among them: {', '.join(lacking)}; among them: {', '.join(others)}" if lacking else ""
-        doubtful = objects.doubtful(self.counts)
-        pairs = [f"{wrong} ({self.counts[wrong]}) for {right} ({self.counts[right]})?" for wrong, right in doubtful]
-        hint = f"{'; '.join(pairs)} repair with --data.repairs wrong=right" if pairs else ""
         return [
             Count("shards", NUM_SHARDS, len(have), f"missing {' '.join(f'{n:03d}' for n in absent)}" if absent else ""),
             Count("grasps that can be read", NUM_GRASPS, sum(self.counts.values())),
             Count("objects of the authors' list among the 40 most attempted", 40, len(listed & set(top)), swaps),
-            Count("object names that look cut or misspelt", 0, len(pairs), hint),
         ]
 
 

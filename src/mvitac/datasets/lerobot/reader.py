@@ -11,6 +11,7 @@ A sample is a pair: both cameras at the time of a table row. From a video, the f
 used, so cameras may have different rates. If it is farther away than ``tolerance``, the image is missing.
 """
 
+import math
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from mvitac.data.video import frame_times
 from mvitac.datasets.table.image_refs import Frame, ImageRef, ParquetCell
 from mvitac.datasets.table.manifest import Manifest, text_of
 from mvitac.datasets.table.table import RowsConfig
-from mvitac.registry import unknown
+from mvitac.registry import check_range, unknown
 from mvitac.system.files import brief, digest, read_json
 
 VERSION = "v3.0"
@@ -55,10 +56,8 @@ class LeRobotConfig(RowsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.tolerance >= 0:
-            raise ValueError(f"tolerance {self.tolerance}: give seconds, 0 or more")
-        if self.every < 1:
-            raise ValueError(f"every {self.every}: give 1 (every row) or more")
+        check_range(self, 0, math.inf, "tolerance")
+        check_range(self, 1, math.inf, "every")
 
     def manifest(self) -> Manifest:
         info = _info(self.path)

@@ -3,6 +3,7 @@
 The table is checked completely before the first image is decoded.
 """
 
+import math
 import os
 import re
 from abc import ABC, abstractmethod
@@ -23,7 +24,7 @@ from mvitac.datasets.table.image_columns import Background, Refs, Selection
 from mvitac.datasets.table.manifest import Condition, Manifest
 from mvitac.datasets.table.read_rows import Row, bundles, read_rows
 from mvitac.datasets.table.splits import BY_GROUP, group_by_video
-from mvitac.registry import to_json
+from mvitac.registry import check_range, to_json
 from mvitac.system.files import digest
 
 VERSION = 3  # version of this reader. Increase it when the same table would give another pack.
@@ -94,13 +95,10 @@ class RowsConfig(DatasetConfig, ABC):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, share in (("test_share", self.test_share), ("val_share", self.val_share)):
-            if not 0 <= share < 1:
-                raise ValueError(f"{name} {share}: give a share of the groups in [0, 1)")
+        check_range(self, 0, 1, "test_share", "val_share")
+        check_range(self, 0, math.inf, "split_seed")
         if self.test_share + self.val_share >= 1:
             raise ValueError(f"test_share {self.test_share} and val_share {self.val_share} leave nothing to train on")
-        if self.split_seed < 0:
-            raise ValueError(f"split_seed {self.split_seed}: give a number >= 0")
         if self.background and self.no_contact:
             raise ValueError("background and no_contact: give only one of them, a touch has one background")
         if (self.background or self.no_contact) and not self.difference:

@@ -10,6 +10,7 @@ are in the owners' repository (see ``lists.py``). One pack has all three tasks; 
 label -1.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from mvitac.datasets.base import KEEPING, DatasetConfig
 from mvitac.datasets.touch_and_go import lists, recordings
 from mvitac.datasets.touch_and_go.lists import Frame
 from mvitac.datasets.touch_and_go.recordings import HOMEPAGE, Recording, missing_report
-from mvitac.registry import to_json
+from mvitac.registry import check_range, to_json
 from mvitac.system.files import digest, digest_file
 
 VERSION = 1  # version of this reader. Increase it when the same files would give another pack.
@@ -68,16 +69,13 @@ class TouchAndGoConfig(DatasetConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.unlabelled < 0:
-            raise ValueError(f"unlabelled {self.unlabelled}: give n for every n-th frame, or 0 for none")
+        check_range(self, 0, math.inf, "unlabelled", "split_seed")
         if not 0 < self.test_share < 1:
             raise ValueError(f"test_share {self.test_share}: give a share of the recordings in (0, 1)")
         if not 0 <= self.val_part < 1:
             raise ValueError(f"val_share {self.val_share}: give a share of the recordings in [0, 1)")
         if self.split == "by-recording" and self.test_share + self.val_part >= 1:
             raise ValueError(f"test_share {self.test_share} and val_share {self.val_part} leave nothing to train on")
-        if self.split_seed < 0:
-            raise ValueError(f"split_seed {self.split_seed}: give a number >= 0")
 
     @property
     def val_part(self) -> float:
