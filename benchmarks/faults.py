@@ -76,6 +76,7 @@ title = "Made images"
 probes = ["linear"]
 seed = 0
 untrained = ["external:timm/test_resnet,weights=random,size={SIDE},seed=0"]
+imagenet = "external:timm/tf_efficientnet_lite0,size={SIDE}"
 [[sets]]
 name = "table"
 tasks = [{{ name = "kind", modalities = ["touch"] }}]

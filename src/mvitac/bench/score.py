@@ -5,6 +5,7 @@ the controls stay: they are the same for every encoder of the folder.
 """
 
 import copy
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -162,7 +163,8 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
     encoder.
     """
     here = provenance()
-    random = [open_model(text) for text in suite.untrained]
+    trunks = _trunks(suite)
+    weights = [model.weights_digest() for _, model in trunks]
     with work(f"{entry.name} on {suite.name}", sum(len(one.tasks) for one in suite.sets), "tasks") as advance:
         for one in suite.sets:
             opened = open_set(one, root)
@@ -171,15 +173,25 @@ def score_suite(entry: Entry, suite: Suite, root: Path | None, parts: Path, key:
                 advance(len(one.tasks))
                 continue
             own = [Reader(model, opened, entry.name) for model in entry.models]
-            beside = [Reader(model, opened, "untrained") for model in random]
+            beside = [Reader(model, opened, name) for name, model in trunks]
             for ask, task in opened.tasks:
                 about = [suite.digest(), one.name, ask.name, opened.digests, here["versions"], here["commit"]]
                 about_all = (opened, suite, ask, task)
-                controls = _kept(parts, "controls", about, lambda r=beside, a=about_all: _controls(r, *a))
+                controls = _kept(parts, "controls", [*about, weights], lambda r=beside, a=about_all: _controls(r, *a))
                 scored = _kept(parts, key, about, lambda r=own, a=about_all: _scores(r, *a))
                 block = _block(entry, one, opened, ask, task, scored, controls)
                 yield {**block, "notes": own[0].notes} if scored else block
                 advance()
+
+
+def _trunks(suite: Suite) -> list[tuple[str, ExternalModel]]:
+    """The controls that are networks, by name; that of ImageNet only where its weights can be had."""
+    found = [("untrained", open_model(text)) for text in suite.untrained]
+    try:
+        return [*found, ("imagenet", open_model(suite.imagenet))]
+    except ValueError as error:
+        print(f"mvitac: without the control imagenet: {error}", file=sys.stderr)
+        return found
 
 
 def _scores(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
@@ -187,9 +199,10 @@ def _scores(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteT
 
 
 def _controls(readers: Sequence[Reader], opened: Opened, suite: Suite, ask: SuiteTask, task: AnyTask) -> Records:
-    """Majority or mean, the data's own columns, pixels, border, and the untrained trunks that ``readers`` are."""
+    """Majority or mean, the data's own columns, pixels, border, and the untrained and ImageNet trunks of ``readers``."""
     each = [label_controls(view, [task]) + pixel_controls(view, [task], ask.modalities) for view in opened.packs]
-    trunks = [r for reader in readers for r in reader.score(suite, ask, task, "untrained", ["linear"])]
+    trunks = [r for reader in readers for r in reader.score(suite, ask, task, reader.name, ["linear"])]
+    trunks = [{**r, "seed": None} if r["source"] == "imagenet" else r for r in trunks]
     return [*(pool(each) if len(each) > 1 else each[0]), *trunks]
 
 

@@ -90,6 +90,7 @@ class Suite:
     probes: tuple[Probe, ...]  # probes of encoders; the page shows the first. Controls have the linear one.
     seed: int  # seed of the probes, and of which labels are kept
     untrained: tuple[str, ...]  # the seeds of the control "untrained": external encoders with random weights
+    imagenet: str  # the control "imagenet", a frozen external encoder; left out where its weights cannot be had
     sets: tuple[SuiteSet, ...]
 
     def __post_init__(self) -> None:
@@ -131,6 +132,8 @@ def find_suite(name: str) -> Suite:
         for text in suite.untrained:
             if getattr(parse(text), "weights", "") != "random":
                 raise ValueError(f"untrained {text!r}: give external:timm/NAME,weights=random")
+        if getattr(parse(suite.imagenet), "weights", "") != "pretrained":
+            raise ValueError(f"imagenet {suite.imagenet!r}: give external:timm/NAME")
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{file} is not a suite ({brief(error)})") from None
     return suite
