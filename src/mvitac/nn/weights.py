@@ -93,12 +93,6 @@ def _flat(value: Any, start: str = "") -> State:
     return {n: t for key, each in inner for n, t in _flat(each, f"{start}.{key}" if start else str(key)).items()}
 
 
-def check_finite(tensors: State, file: Path | str) -> None:
-    """ValueError if a tensor of ``file`` holds NaN or infinite numbers."""
-    if bad := [name for name, value in tensors.items() if value.is_floating_point() and not value.isfinite().all()]:
-        raise ValueError(f"{file} holds NaN or infinite numbers: {_some(bad)}")
-
-
 def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
     """Load other people's weights into a timm model without its classifier: all of them, or none.
 
@@ -121,7 +115,8 @@ def load_weights(network: nn.Module, tensors: State, file: Path | str) -> None:
         name = _cfg(network).get("architecture", type(network).__name__)
         raise ValueError(f"{file} does not fit {name}: {why}")
     ((start, state),) = fitting.items()
-    check_finite(state, file)
+    if bad := [name for name, value in state.items() if value.is_floating_point() and not value.isfinite().all()]:
+        raise ValueError(f"{file} holds NaN or infinite numbers: {_some(bad)}")
     network.load_state_dict(state)
     if start:
         beside = [name for name in tensors if not name.startswith(start)]

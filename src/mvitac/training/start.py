@@ -13,7 +13,7 @@ from mvitac.methods.base import Method
 from mvitac.model_files import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
 from mvitac.nn.momentum import Momentum
-from mvitac.nn.weights import FORMAT, check_finite, read_safetensors
+from mvitac.nn.weights import FORMAT, read_safetensors
 from mvitac.run import Run
 
 State = dict[str, Tensor]
@@ -37,7 +37,6 @@ def read_start(init: Init) -> Start | None:
     if not init:
         return None
     header, tensors = read_safetensors(init.file)
-    check_finite(tensors, init.file)
     if header.get("format") == FORMAT:
         model = load(init.file)
         trunks = {m: trunk.state_dict() for m, trunk in model.encoders.items()}
