@@ -57,9 +57,9 @@ class Recordings(Source):
             force *= 1000
         if fault == "degrees":
             tilt = np.rad2deg(tilt) * 5
-        if (fault == "outlier" and item == 100) or (fault == "spike" and k == 2 and i in (20, 21)):
-            force = {"outlier": 60.0, "spike": 0.2}[fault]
-        if fault == "negative" and k == 1 and 10 <= i < 16:  # too slow for a glitch
+        if fault == "outlier" and item == 100:
+            force = 60.0
+        if fault == "negative" and k == 1 and 10 <= i < 16:
             force = -0.12 * min(i - 9, 16 - i)
         if fault == "stuck" and k == 4 and 10 <= i < 24:
             force = 2.0
@@ -103,7 +103,6 @@ def test_healthy_values_and_windows(healthy: Pack) -> None:
         ("group of another unit", "values of force", "values of 5 are about", []),
         ("degrees", "values of pose", "more likely degrees than rad", []),
         ("outlier", "values of force", "1 outliers, e.g. 60 in row 100", [100]),
-        ("spike", "values of force", "2 frames jump away and back, first row 100 (0.2)", [100, 101]),
         (
             "negative",
             "values of force",
@@ -118,10 +117,6 @@ def test_each_fault_of_values_is_found_and_no_other(
     tmp_path: Path, fault: str, item: str, says: str, rows: list[int]
 ) -> None:
     pack = packed(tmp_path / "pack", fault)
-    if fault == "outlier":  # an outlier of one frame is a glitch as well
-        pack.table = pack.table.drop_columns("seq")
-    if fault == "group of another unit":  # and so are its steps
-        pack.table = pack.table.drop_columns("seq")
     found = {finding.item: finding for finding in value_checks.values(pack)}
     assert found[item].verdict == "look" and says in found[item].evidence, found[item]
     assert set(rows) <= set(found[item].rows)

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from mvitac.data.checks.finding import Finding, share
+from mvitac.data.checks.finding import Finding, judged, share
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.checks.table_checks import sides_of
 from mvitac.data.pack import Pack
@@ -30,10 +30,9 @@ def exact_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             notes.append(f"{name}: {share(len(across), pack.num)} rows have a copy in another split")
             rows += across.tolist()
     item = "identical images across splits"
-    if notes:
-        advice = "remove the copies, or put them in one group so that they stay in one split"
-        return Finding(item, "broken", "; ".join(notes), advice, rows)
-    return Finding(item, "ok", "none" + (f" (inside one split: {'; '.join(inside)})" if inside else ""))
+    evidence = "; ".join(notes) or "none" + (f" (inside one split: {'; '.join(inside)})" if inside else "")
+    advice = "remove the copies, or put them in one group so that they stay in one split"
+    return judged(item, evidence, advice, rows, look=False, broken=bool(notes))
 
 
 def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -68,10 +67,10 @@ def near_copies(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
         suspicious |= rate > 0.01 or (len(pairs) >= 3 and rate > 3 * base)
         rows += pairs.ravel().tolist()
     item, evidence = "near-copies across splits", "; ".join(notes)
-    if not suspicious:
-        return Finding(item, "ok" if compared else "not checkable", evidence)
+    if not compared:
+        return Finding(item, "not checkable", evidence)
     advice = "look at the sheet (pairs side by side); if they are one contact or one scene, group them"
-    return Finding(item, "look", evidence, advice, rows)
+    return judged(item, evidence, advice, rows, look=suspicious)
 
 
 def _near_pairs(

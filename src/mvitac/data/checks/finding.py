@@ -22,6 +22,16 @@ class Finding:
         object.__setattr__(self, "rows", tuple(int(row) for row in self.rows[:MAX_ROWS]))
 
 
+def judged(
+    item: str, evidence: str, advice: str, rows: Sequence[int] = (), *, look: bool = True, broken: bool = False
+) -> Finding:
+    """A finding that is broken, worth a ``look``, or ok, and then without ``advice``."""
+    wrong = look or broken
+    return Finding(
+        item, "broken" if broken else "look" if look else "ok", evidence, advice * wrong, rows if wrong else ()
+    )
+
+
 def exit_code(findings: Iterable[Finding]) -> int:
     """Return 0 if all is well, 1 if someone should look, 2 if something is broken."""
     return max(({"broken": 2, "look": 1}.get(finding.verdict, 0) for finding in findings), default=0)

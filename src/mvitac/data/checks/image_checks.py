@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, Verdict, share, some
+from mvitac.data.checks.finding import Finding, judged, share, some
 from mvitac.data.checks.image_stats import ImageStats
 from mvitac.data.pack import Pack
 
@@ -17,12 +17,13 @@ def constant_frames(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     """Find constant images: a closed shutter, a failed decode, floats 0 to 1 stored as bytes."""
     found = {name: np.flatnonzero(one.has & ~one.seen) for name, one in looks.items()}
     rows = np.unique(np.concatenate(list(found.values()))).tolist()
-    if not rows:
-        return Finding("constant frames", "ok", f"none among {pack.num} rows")
-    what = "; ".join(f"{name}: {share(len(r), pack.num)}" for name, r in found.items() if len(r))
-    verdict: Verdict = "broken" if len(rows) > 0.05 * pack.num else "look"
+    notes = [
+        f"{name}: {share(len(r), pack.num)}, first {pack.column('id')[r[0]]}" for name, r in found.items() if len(r)
+    ]
+    evidence = "; ".join(notes) or f"none among {pack.num} rows"
     advice = "look whether the sensor or the decoder failed, and leave these rows out"
-    return Finding("constant frames", verdict, f"{what}, first {pack.column('id')[rows[0]]}", advice, rows)
+    broken = len(rows) > 0.05 * pack.num
+    return judged("constant frames", evidence, advice, rows, look=bool(rows), broken=broken)
 
 
 def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -37,10 +38,9 @@ def grayscale_mix(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             notes.append(f"{name}: {share(int(gray.sum()), int(seen.sum()))} have no colour")
         elif gray.any():
             notes.append(f"{name}: all without colour")
-    verdict = "look" if rows else "ok"
     evidence = "; ".join(notes) or "all in colour"
-    advice = "different cameras or converters: convert all alike, or mark them as different sensors" if rows else ""
-    return Finding("grayscale among colour", verdict, evidence, advice, rows)
+    advice = "different cameras or converters: convert all alike, or mark them as different sensors"
+    return judged("grayscale among colour", evidence, advice, rows, look=bool(rows))
 
 
 def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
@@ -63,10 +63,10 @@ def red_and_blue(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
             rows += (mine := usable[swapped]).tolist()
             note = f"{share(len(mine), len(usable))} have red and blue mirrored{_where(pack, mine)}"
         notes.append(f"{name}: {note}")
-    if not rows:
-        return Finding("red and blue swapped", "ok" if compared else "not checkable", "; ".join(notes))
+    if not compared:
+        return Finding("red and blue swapped", "not checkable", "; ".join(notes))
     advice = "look at the sheet; if they are BGR (OpenCV's order), reverse their channels when reading"
-    return Finding("red and blue swapped", "look", "; ".join(notes), advice, rows)
+    return judged("red and blue swapped", "; ".join(notes), advice, rows, look=bool(rows))
 
 
 def _mirrored(thumbs: np.ndarray) -> tuple[np.ndarray, bool, str]:
@@ -126,13 +126,10 @@ def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     bad = seen[(as_touch > 0) & (as_vision > 0)]
     # Both images of a row resemble the other modality: always if swapped, sometimes by chance.
     chance = float((as_touch > 0).mean() * (as_vision > 0).mean() * len(seen))
-    if len(bad) <= 2 * chance + 3 * chance**0.5:
-        told = f"{len(bad)} of {len(seen)} pairs, {chance:.1f} by chance" if len(bad) else f"none of {len(seen)} pairs"
-        evidence = f"{told} ({100 * right:.0f} % of images can be told apart; a swap of all cannot)"
-        return Finding(item, "ok", evidence)
-    evidence = f"{share(len(bad), len(seen))} look swapped, first {pack.column('id')[bad[0]]}{_where(pack, bad)}"
+    look = len(bad) > 2 * chance + 3 * chance**0.5
+    evidence = f"{share(len(bad), len(seen))} look swapped, {chance:.1f} by chance{_where(pack, bad) if look else ''}"
     advice = "look at the sheet (vision left, touch right); exchange the two paths or keys of these rows"
-    return Finding(item, "look", evidence, advice, bad.tolist())
+    return judged(item, evidence, advice, bad.tolist(), look=look)
 
 
 def _log_likelihood(values: np.ndarray, middle: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -171,11 +168,9 @@ def time_offset(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     gain = curves[:, best] - curves[:, MAX_LAG]
     certain = lag != 0 and gain.mean() > 3 * gain.std(ddof=1) / len(gain) ** 0.5 and gain.mean() > 0.05
     evidence = f"r = {mean[MAX_LAG]:.2f} at lag 0, best {mean[best]:.2f} at lag {lag} over {len(curves)} sequences"
-    if not certain:
-        return Finding(item, "ok", evidence)
-    evidence += f": {'touch' if lag > 0 else 'vision'} comes {abs(lag)} row{'s' * (abs(lag) > 1)} late"
+    evidence += f": {'touch' if lag > 0 else 'vision'} comes {abs(lag)} rows late" * bool(certain)
     advice = "pair by timestamps if there are any, or shift one stream; motion that precedes contact can also do this"
-    return Finding(item, "look", evidence, advice)
+    return judged(item, evidence, advice, look=bool(certain))
 
 
 def motion_correlations(pack: Pack, looks: dict[str, ImageStats], when: np.ndarray) -> np.ndarray:

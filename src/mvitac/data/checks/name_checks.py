@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, some
+from mvitac.data.checks.finding import Finding, judged, some
 from mvitac.data.checks.table_checks import KEYS, sides_of
 from mvitac.data.pack import Pack
 
@@ -33,11 +33,9 @@ def similar_names(pack: Pack) -> Finding:
     for task in pack.spec.tasks:
         if alike := _alike(task.classes):
             notes.append(f"classes of {task.name}: {_shown(alike)}")
-    item = "names that differ in spelling only"
-    if not notes:
-        return Finding(item, "ok", "no two groups or classes differ only in case, blanks or zeros")
+    evidence = "; ".join(dict.fromkeys(notes)) or "no two groups or classes differ only in case, blanks or zeros"
     advice = "if they mean the same, write them alike and pack again"
-    return Finding(item, "look", "; ".join(dict.fromkeys(notes)), advice, list(dict.fromkeys(rows)))
+    return judged("names that differ in spelling only", evidence, advice, list(dict.fromkeys(rows)), look=bool(notes))
 
 
 def _alike(names: list[str] | tuple[str, ...], *, across_parts: bool = False) -> list[list[str]]:

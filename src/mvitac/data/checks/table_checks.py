@@ -1,10 +1,11 @@
 """Checks of the table: damaged items, labels, classes, leaks between splits, sensors, numbers, published counts."""
 
+import contextlib
 from collections.abc import Iterator
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, Verdict, share, some
+from mvitac.data.checks.finding import Finding, judged, share, some
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.data.source import Count
@@ -18,85 +19,65 @@ MIX = ("sensor", "vision_size", "touch_size")  # columns that describe how an im
 def unreadable(pack: Pack) -> Finding:
     """List items that packing could not read."""
     damaged = pack.meta.get("damaged", [])
-    if not damaged:
-        return Finding("unreadable items", "ok", f"none; {pack.num} rows were read")
-    verdict: Verdict = "broken" if len(damaged) > 0.01 * pack.num else "look"
-    evidence = f"{len(damaged)}; {pack.num} rows were read; first {': '.join(damaged[0])}"
+    evidence = f"{len(damaged)}; {pack.num} rows were read" + (f"; first {': '.join(damaged[0])}" if damaged else "")
     advice = "repair them or download them again; the pack does not contain them"
-    return Finding("unreadable items", verdict, evidence, advice)
+    return judged("unreadable items", evidence, advice, look=bool(damaged), broken=len(damaged) > 0.01 * pack.num)
 
 
 def missing_images(pack: Pack) -> Finding:
     """Count rows without an image of a modality that the dataset has."""
-    notes = []
-    verdict: Verdict = "ok"
-    for modality in pack.spec.modalities:
-        lacking = ~pack.has(modality)
-        if lacking.any():
-            notes.append(f"{share(int(lacking.sum()), pack.num)} rows have no {modality}")
-        for split in ("train", "test"):
-            if len(rows := pack.rows(split)) and lacking[rows].all():
-                verdict = "look"
-                notes.append(f"no row of {split} has {modality}")
-    evidence = "; ".join(notes) or f"every row has {' and '.join(pack.spec.modalities)}"
-    advice = "assign splits so that both have both modalities, or leave the modality out" if verdict != "ok" else ""
-    return Finding("missing images", verdict, evidence, advice)
+    has = {modality: pack.has(modality) for modality in pack.spec.modalities}
+    notes = [f"{share(int((~h).sum()), pack.num)} rows have no {m}" for m, h in has.items() if not h.all()]
+    empty = [(split, m) for m, h in has.items() for split in ("train", "test") if not h[pack.rows(split)].any()]
+    notes += [f"no row of {split} has {m}" for split, m in empty if len(pack.rows(split))]
+    evidence = "; ".join(notes) or f"every row has {' and '.join(has)}"
+    advice = "assign splits so that both have both modalities, or leave the modality out"
+    return judged("missing images", evidence, advice, look=any(note.startswith("no row") for note in notes))
 
 
 def missing_labels(pack: Pack) -> Finding:
     """Find rows of train, val and test without a label of their task."""
-    item, notes, rows = "missing labels", [], []
-    verdict: Verdict = "ok"
-    if not pack.spec.tasks:
-        return Finding(item, "ok", "no tasks: nothing to label")
+    notes, rows, broken = [], [], False
     for task in pack.spec.tasks:
         labels = pack.column(f"label_{task.name}")
         for split in ("train", "val", "test"):
             asked = pack.rows(split, only=task.only, by=task.split)
             empty = asked[labels[asked] < 0]
-            if len(asked) == len(empty) and split != "val":
-                verdict = "broken"
-                notes.append(f"{task.name}: no labelled rows in {split}")
-            elif len(empty):
-                verdict = "look" if verdict == "ok" else verdict
-                notes.append(
-                    f"{task.name}: {share(len(empty), len(asked))} in {split}, first {pack.column('id')[empty[0]]}"
-                )
-                rows += empty.tolist()
+            broken |= len(asked) == len(empty) and split != "val"
+            if len(empty) or (not len(asked) and split != "val"):
+                first = f", first {pack.column('id')[empty[0]]}" if len(empty) else ""
+                notes.append(f"{task.name}: {share(len(empty), len(asked))} in {split}{first}")
+            rows += empty.tolist()
     advice = "fill them in, or move the rows to split unlabelled; fine if they are meant for pre-training only"
     evidence = "; ".join(notes) or "none in train, val and test"
-    return Finding(item, verdict, evidence, advice if notes else "", rows)
+    return judged("missing labels", evidence, advice, rows, look=bool(notes), broken=broken)
 
 
 def class_balance(pack: Pack) -> list[Finding]:
     """Find classes that are missing in train or test, and the accuracy of a constant answer, per task."""
     findings = []
     for task in pack.spec.tasks:
-        counts = {}
-        for side, splits in (("train", ("train", "val")), ("test", ("test",))):
+        item, counts = f"classes of {task.name}", []
+        for splits in (("train", "val"), ("test",)):
             found = pack.labels(task.name, *splits)
-            counts[side] = np.bincount(found[found >= 0], minlength=len(task.classes))
-        item = f"classes of {task.name}"
-        if not counts["train"].sum() or not counts["test"].sum():
+            counts.append(np.bincount(found[found >= 0], minlength=len(task.classes)))
+        train, test = counts
+        if not train.sum() or not test.sum():
             findings.append(Finding(item, "not checkable", "no labels in train or test"))
             continue
-        majority = counts["test"][counts["train"].argmax()] / counts["test"].sum()
-        unseen = [c for i, c in enumerate(task.classes) if counts["test"][i] and not counts["train"][i]]
-        unasked = [c for i, c in enumerate(task.classes) if not counts["test"][i]]
-        name = task.classes[counts["train"].argmax()]
-        evidence = f"{len(task.classes)} classes; always saying {name!r} scores {100 * majority:.1f} % on test"
-        verdict: Verdict = "ok"
-        advice = ""
-        if unasked:
-            verdict, advice = "look", "name the tested classes in every result, or assign the groups to splits again"
-            evidence += f"; never tested: {some(unasked)}"
-        if majority > 0.9 or (majority > 0.75 and len(task.classes) > 2):
-            verdict, advice = "look", "report balanced accuracy as well"
-        if unseen:
-            verdict = "broken"
-            advice = "these cannot be learned: assign the groups to splits again, or drop the classes"
-            evidence += f"; tested but never seen in training: {some(unseen)}"
-        findings.append(Finding(item, verdict, evidence, advice))
+        majority, names = test[train.argmax()] / test.sum(), np.array(task.classes)
+        unseen, unasked = names[(test > 0) & (train == 0)].tolist(), names[test == 0].tolist()
+        always = task.classes[train.argmax()]
+        evidence = f"{len(names)} classes; always saying {always!r} scores {100 * majority:.1f} % on test"
+        evidence += f"; never tested: {some(unasked)}" if unasked else ""
+        evidence += f"; tested but never seen in training: {some(unseen)}" if unseen else ""
+        skewed = majority > 0.9 or (majority > 0.75 and len(names) > 2)
+        advice = (
+            "assign the groups to splits again, or drop the classes"
+            if unseen or unasked
+            else "report balanced accuracy"
+        )
+        findings.append(judged(item, evidence, advice, look=bool(unasked) or skewed, broken=bool(unseen)))
     return findings
 
 
@@ -124,20 +105,20 @@ def leaks(pack: Pack) -> list[Finding]:
     """Find groups, touch groups and other keys in more than one split, per split column. Correct folds are one finding."""
     findings, sound = [], []
     names = [n for n in ("group", "touch_group", *KEYS) if n in pack.table.column_names]
+    none = f"none of {', '.join(names)} is in more than one split"
     for split, counted, sides in split_columns(pack):
-        verdict: Verdict = "ok"
-        notes, rows = [], []
+        notes: dict[str, str] = {}
+        rows = []
         for name in names:
             values = pack.column(name).astype(str)[counted]
             on = {side: set(values[sides == side].tolist()) for side in np.unique(sides)}
             both = sorted({v for a in on for b in on if a < b for v in on[a] & on[b]})
             if both:
-                verdict = "broken" if name in ("group", "touch_group") else "look" if verdict == "ok" else verdict
                 kind = f" ({pack.spec.group_by})" if name == "group" else ""
                 test = on.get("test", set())
                 of = f"; {len(test & on.get('train', set()))} of {len(test)} in test are also in train" if test else ""
                 num = f"{len(both)} of {len(set(values))}"
-                notes.append(f"{name}{kind}: {num} in more than one split, e.g. {both[0]!r}{of}")
+                notes[name] = f"{name}{kind}: {num} in more than one split, e.g. {both[0]!r}{of}"
                 for one in both[:4]:  # a row of each split, side by side on the sheet
                     mine = np.flatnonzero(values == one)
                     rows += [int(counted[mine[sides[mine] == side][0]]) for side in np.unique(sides[mine])]
@@ -145,51 +126,42 @@ def leaks(pack: Pack) -> list[Finding]:
             sound.append(split)
             continue
         item = "groups across splits" if split == "split" else f"groups across column {split}"
-        evidence = "; ".join(notes) or f"none of {', '.join(names)} is in more than one split"
-        advice = bool(notes) * "split by the largest of these keys, or report what test shares with train"
-        findings.append(Finding(item, verdict, evidence, advice, rows))
+        advice = "split by the largest of these keys, or report what test shares with train"
+        broken = not notes.keys().isdisjoint(("group", "touch_group"))
+        findings.append(judged(item, "; ".join(notes.values()) or none, advice, rows, look=bool(notes), broken=broken))
     if sound:
-        evidence = f"{some(sound, 8)}: none of {', '.join(names)} is in more than one split"
-        findings.append(Finding("groups across split columns", "ok", evidence))
+        findings.append(Finding("groups across split columns", "ok", f"{some(sound, 8)}: {none}"))
     return findings
 
 
 def ungrouped(pack: Pack) -> list[Finding]:
     """Repeat the note of a table that was packed without groups; [] with groups."""
     notes = [note for note in pack.spec.notes if UNGROUPED in note]
-    return [Finding("groups", "look", "; ".join(notes), "pack again with --group COLUMN")] if notes else []
+    return [judged("groups", "; ".join(notes), "pack again with --group COLUMN")] if notes else []
 
 
 def mixture(pack: Pack) -> Finding:
     """Find several sensors or resolutions, and whether they alone predict a label."""
-    columns = [name for name in MIX if name in pack.table.column_names]
-    verdict: Verdict = "ok"
-    notes = []
-    for column in columns:
+    item, notes, wrong = "sensors and resolutions", [], []
+    for column in (name for name in MIX if name in pack.table.column_names):
         values = pack.column(column).astype(str)
         names, counts = np.unique(values[values != "None"], return_counts=True)  # None: rows without this image
-        if len(names) == 1:
-            notes.append(f"{column}: {names[0]}")
-            continue
         order = np.argsort(-counts)
         notes.append(f"{column}: {some([f'{names[i]} {100 * counts[i] / pack.num:.0f} %' for i in order], 4)}")
-        if column.endswith("_size"):
-            verdict = "look"
-        on = {split: set(values[pack.rows(split)].tolist()) for split in ("train", "test")}
-        if alone := sorted(on["test"] - on["train"]):
-            verdict = "look"
-            notes.append(f"{column} {some(alone)} only in test")
+        if len(names) == 1:
+            continue
+        wrong += [f"several of {column}"] if column.endswith("_size") else []
+        train, test = (set(values[pack.rows(split)].tolist()) for split in ("train", "test"))
+        wrong += [f"{column} {some(sorted(test - train))} only in test"] if test - train else []
         for task in pack.spec.tasks:
             labels = pack.labels(task.name, "train", "val", "test")
             counted = (labels >= 0) & (values != "None")
-            if told := _predicts(f"{column} alone", task.name, values[counted], labels[counted]):
-                verdict = "look"
-                notes += told
-    if not columns:
+            wrong += _predicts(f"{column} alone", task.name, values[counted], labels[counted])
+    if not notes:
         lacking = "no column sensor, and a pack holds one size: check the source with --data instead"
-        return Finding("sensors and resolutions", "not checkable", lacking)
-    advice = "probe each kind separately, or use the same kinds in train and test" if verdict != "ok" else ""
-    return Finding("sensors and resolutions", verdict, "; ".join(notes), advice)
+        return Finding(item, "not checkable", lacking)
+    advice = "probe each kind separately, or use the same kinds in train and test"
+    return judged(item, "; ".join(notes + wrong), advice, look=bool(wrong))
 
 
 def _predicts(what: str, task: str, values: np.ndarray, labels: np.ndarray) -> list[str]:
@@ -207,27 +179,20 @@ def numbers(pack: Pack) -> Finding:
     """Find numeric columns with gaps, infinities or extreme outliers."""
     notes, rows, seen = [], [], 0
     targets = {target.name for task in pack.spec.values for target in task.targets}  # these have a check of their own
-    for name, values in numeric_columns(pack):
-        if name in targets:
-            continue
+    for name, values in ((name, values) for name, values in numeric_columns(pack) if name not in targets):
         seen += 1
-        bad = ~np.isfinite(values)
-        if bad.any() and not bad.all():
-            notes.append(
-                f"{name} is not a number in {share(int(bad.sum()), len(values))}, first row {np.flatnonzero(bad)[0]}"
-            )
-            rows += np.flatnonzero(bad).tolist()
-        good = values[~bad]
-        if len(good) >= 8:
-            low, middle, high = np.percentile(good, [5, 50, 95])
-            values_far = np.abs(np.where(bad, middle, values) - middle) > 100 * (high - low)
-            far = np.flatnonzero(values_far) if high > low else []
-            if len(far):
-                notes.append(f"{name} is {values[far[0]]:g} in row {far[0]}, others {low:g} to {high:g}")
-                rows += list(far)
-    if not notes:
-        return Finding("numbers", "ok", f"{seen} columns, all finite and in range")
-    return Finding("numbers", "look", "; ".join(notes), "repair the cells, or leave the rows out", rows)
+        good = np.isfinite(values)
+        if good.any() and not good.all():
+            bad = np.flatnonzero(~good)
+            notes.append(f"{name} is not a number in {share(len(bad), len(values))}, first row {bad[0]}")
+            rows += bad.tolist()
+        if good.sum() >= 8:
+            low, middle, high = np.percentile(values[good], [5, 50, 95])
+            far = np.flatnonzero(good & (np.abs(values - middle) > 100 * (high - low)) & (high > low))
+            notes += [f"{name} is {values[row]:g} in row {row}, others {low:g} to {high:g}" for row in far[:1]]
+            rows += far.tolist()
+    evidence = "; ".join(notes) or f"{seen} columns, all finite and in range"
+    return judged("numbers", evidence, "repair the cells, or leave the rows out", rows, look=bool(notes))
 
 
 def give_aways(pack: Pack) -> Finding:
@@ -241,19 +206,15 @@ def give_aways(pack: Pack) -> Finding:
     for task in pack.spec.tasks:
         labels = pack.labels(task.name, "train", "val")
         rows, labels = np.flatnonzero(labels >= 0), labels[labels >= 0]
-        if len(rows) < 64:
-            continue
-        for name, values in numeric_columns(pack):
-            if name in known:
-                continue
+        for name, values in numeric_columns(pack) if len(rows) >= 64 else ():
             mine = values[rows]
-            if not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
+            if name in known or not np.isfinite(mine).all() or len(np.unique(mine)) < 2 or _is_label(mine, labels):
                 continue
             part = np.searchsorted(np.unique(np.quantile(mine, np.arange(1, 8) / 8)), mine)
             notes += _predicts(name, task.name, part, labels)
-    advice = "report them with every score as a control (--data.controls name=column)" if notes else ""
+    advice = "report them with every score as a control (--data.controls name=column)"
     evidence = "; ".join(notes) or "no column of numbers does"
-    return Finding("columns that give a label away", "look" if notes else "ok", evidence, advice)
+    return judged("columns that give a label away", evidence, advice, look=bool(notes))
 
 
 def _is_label(values: np.ndarray, labels: np.ndarray) -> bool:
@@ -283,11 +244,9 @@ def _parsed(values: np.ndarray) -> np.ndarray | None:
     out = np.full(len(values), np.nan)
     known = 0
     for i, cell in enumerate(values):
-        try:
+        with contextlib.suppress(TypeError, ValueError):
             out[i] = float("" if "_" in str(cell) else cell)  # 20220319_002026 is a name
             known += 1
-        except (TypeError, ValueError):
-            continue
     return out if known >= 0.9 * len(values) else None
 
 
@@ -295,9 +254,7 @@ def published(counts: list[Count]) -> list[Finding]:
     """Compare counts of the source with the published ones."""
     findings = []
     for count in counts:
-        same = count.published == count.found
-        detail = f"; {count.detail}" if count.detail else ""
-        evidence = f"{count.found} found, {count.published} published{detail}"
-        advice = "" if same else "fine for a part of the data; mention it with every result"
-        findings.append(Finding(f"published: {count.what}", "ok" if same else "look", evidence, advice))
+        evidence = f"{count.found} found, {count.published} published" + (f"; {count.detail}" if count.detail else "")
+        advice = "fine for a part of the data; mention it with every result"
+        findings.append(judged(f"published: {count.what}", evidence, advice, look=count.published != count.found))
     return findings

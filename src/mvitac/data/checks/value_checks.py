@@ -1,18 +1,16 @@
-"""Checks of tasks with values (units, outliers, glitches, stuck sensors, test outside train), and of windows of frames."""
+"""Checks of tasks with values (units, outliers, stuck sensors, test outside train), and of windows of frames."""
 
 import re
 
 import numpy as np
 
-from mvitac.data.checks.finding import Finding, share, some
+from mvitac.data.checks.finding import Finding, judged, share, some
 from mvitac.data.pack import Pack
 from mvitac.data.spec import Target, ValueTask, Window
 from mvitac.data.windows import frames_of, places, recordings
 
 UNITS = ("N", "mN", "kN", "m", "cm", "mm", "um", "deg", "rad", "s", "ms", "kg", "g", "Nm", "Pa", "kPa")
 """Units whose name at the end of a column's name, as in depth_mm, is taken for the unit of the column."""
-SPIKE_FRAMES, OUTLYING_FRAMES = 3, 15
-"""Longest glitch, a value that leaves and comes back: within the usual range, and beyond it."""
 STUCK_FRAMES = 10  # shortest constant stretch that is reported
 
 
@@ -32,7 +30,7 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
     measured = {side: rows[np.isfinite(found[rows])] for side, rows in sides.items()}
     if lacking := [side for side, rows in measured.items() if not len(rows)]:
         evidence = f"no row of {' and '.join(lacking)} has a value"
-        return Finding(item, "broken", evidence, "measure some or assign the splits again")
+        return judged(item, evidence, "measure some or assign the splits again", broken=True)
     rows = np.sort(np.concatenate(list(measured.values())))
     known = found[rows]
     low, middle, high = np.percentile(known, [0, 50, 100])
@@ -42,14 +40,13 @@ def _finding(pack: Pack, task: ValueTask, target: Target, found: np.ndarray, tou
     checks = {
         "check the unit": _unit(target, known, pack.column("group")[rows].astype(str)),
         "repair these cells, or leave them empty": _outliers(rows, known),
-        "glitches of the sensor: repair these cells, or leave them empty": _spikes(found, touches),
         "a stuck or saturated sensor: leave these cells empty": _stuck(found, touches),
         "expect larger errors there, or split so that train covers test": _outside(found, measured, target),
     }
     wrong = {advice: note for advice, note in checks.items() if note[0]}
     evidence += [text for text, _ in wrong.values()]
     suspects = [row for _, suspicious in wrong.values() for row in suspicious]
-    return Finding(item, "look" if wrong else "ok", "; ".join(evidence), "; ".join(wrong), suspects)
+    return judged(item, "; ".join(evidence), "; ".join(wrong), suspects, look=bool(wrong))
 
 
 _SIDES = {"train": ("train", "val"), "test": ("test",)}
@@ -77,13 +74,10 @@ def _unit(target: Target, known: np.ndarray, groups: np.ndarray) -> Note:
     names = names[counts >= 20]
     sizes = np.array([np.median(abs(known[groups == name])) for name in names])
     usual = np.median(sizes) if len(sizes) else 0
-    if (
-        len(names) >= 4
-        and usual > 0
-        and len(odd := names[(sizes > 300 * usual) | ((sizes > 0) & (sizes < usual / 300))])
-    ):
-        times = sizes[np.isin(names, odd)][0] / usual
-        notes.append(f"values of {some(odd.tolist())} are about {times:.2g} times those of other groups")
+    odd = (sizes > 300 * usual) | ((sizes > 0) & (sizes < usual / 300))
+    if len(names) >= 4 and usual > 0 and odd.any():
+        times = sizes[odd][0] / usual
+        notes.append(f"values of {some(names[odd].tolist())} are about {times:.2g} times those of other groups")
     return "; ".join(notes), []
 
 
@@ -100,39 +94,6 @@ def _outliers(rows: np.ndarray, known: np.ndarray) -> Note:
         text = f"{int(negative.sum())} rows are below {-0.04 * high:.3g}, down to {known.min():.4g}, although 99 % are above"
         notes.append(f"{text}; the first is row {rows[negative][0]}")
     return "; ".join(notes), rows[(far & (high > low)) | (negative & (high > 0))].tolist()
-
-
-def _spikes(found: np.ndarray, touches: list[np.ndarray]) -> Note:
-    """Values that jump away for a few frames of a recording and come back to where they were."""
-    spikes: list[int] = []
-    usual = np.percentile(found[np.isfinite(found)], [1, 99])
-    usual += np.array([-0.1, 0.1]) * (usual[1] - usual[0])
-    for rows in (rows[np.isfinite(found[rows])] for rows in touches):
-        if len(rows) < 8:
-            continue
-        y = found[rows]
-        low, high = np.percentile(y, [5, 95])
-        least = max(8 * float(np.median(abs(np.diff(y)))), 0.2 * (high - low))
-        first = 1
-        while least > 0 and first < len(y) - 1:
-            last = _back(y, first, least, usual)
-            spikes += rows[first:last].tolist()
-            first = max(first + 1, last)
-    if not spikes:
-        return "", []
-    text = f"{len(spikes)} frames jump away and back, first row {spikes[0]} ({found[spikes[0]]:.4g})"
-    return text, spikes
-
-
-def _back(y: np.ndarray, first: int, least: float, usual: np.ndarray) -> int:
-    """The frame at which values that jumped at frame ``first`` are back; 0 if they did not jump, or stay away."""
-    longest = SPIKE_FRAMES if usual[0] <= y[first] <= usual[1] else OUTLYING_FRAMES
-    for last in range(first + 1, min(first + longest + 1, len(y))):
-        before, after, away = y[first - 1], y[last], y[first:last]
-        beyond = away - max(before, after), min(before, after) - away
-        if abs(after - before) < least / 2 and any((side > least).all() for side in beyond):
-            return last
-    return 0
 
 
 def _stuck(found: np.ndarray, touches: list[np.ndarray]) -> Note:
@@ -169,7 +130,7 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
         name, place = places(pack, window)
         index, whole, _ = frames_of(pack, window)
     except ValueError as error:
-        return Finding(item, "broken", str(error), "training refuses these windows, too")
+        return judged(item, str(error), "training refuses these windows, too", broken=True)
     steps = [np.diff(place[rows]) for rows in recordings(pack, place) if len(rows) > 2]
     rates = np.array([np.median(step) for step in steps])
     gaps = sum(int((step > 2.5 * rate).sum()) for step, rate in zip(steps, rates, strict=True))
@@ -191,4 +152,4 @@ def windows(pack: Pack, window: Window, *, part: bool = False) -> Finding:
     if too_short := set(pack.touch_groups.tolist()) - set(pack.touch_groups[whole].tolist()):
         evidence.append(f"{share(len(too_short), int(pack.touch_groups.max()) + 1)} touches are shorter than a window")
         advice.append("their first frame repeats in every row: give fewer frames or a smaller stride")
-    return Finding(item, "look" if advice else "ok", "; ".join(evidence), "; ".join(advice))
+    return judged(item, "; ".join(evidence), "; ".join(advice), look=bool(advice))
