@@ -100,12 +100,3 @@ def test_demo_leaves_its_summary_and_goes_on_where_it_stopped(
     assert main(command) == 0
     assert weights.stat().st_mtime_ns == before
     assert json.loads((tmp_path / "demo" / "summary.json").read_text()) == summary
-
-
-def test_data_check_of_simulated_data_has_options(capsys: pytest.CaptureFixture[str]) -> None:
-    """Where --num is the size of the data, the items to read are --items; elsewhere the old name --num is the same."""
-    with pytest.raises(SystemExit, match="0"):
-        main(["data", "check", "--data", "materials", "--help"])
-    assert "--num INT" in (shown := capsys.readouterr().out) and "--items INT" in shown
-    assert main(["data", "check", "--data", "folder", "--num", "-1"]) == 2
-    assert "--items -1" in capsys.readouterr().err

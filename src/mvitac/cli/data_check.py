@@ -1,6 +1,5 @@
 """``mvitac data check``: what is wrong with a dataset."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,8 +20,7 @@ from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
 from mvitac.system.files import check_place, write_atomic
 
-_MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step;
-    values with glitches or outside train.
+_MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step, outside train.
 
     Exit code: 0 all is well, 1 a person should look, 2 something is broken (or the command could not be run).
     Heuristics only report "look", with their figures; "broken" is a fact. Nothing is changed.
@@ -54,7 +52,7 @@ class _PackOptions(_Options):
 class _SourceOptions(_Options):
     data: Annotated[DatasetConfig, tyro.conf.arg(name="")]
     items: int = 0
-    """Number of items to read, evenly spread over the source; 0 = all. (0.1.0 called it --num, which still works.)"""
+    """Number of items to read, evenly spread over the source; 0 = all."""
     thumbnail: int = 64
     """Side in pixels to which images are reduced for the examination."""
     quiet: bool = False
@@ -73,10 +71,7 @@ def check(argv: list[str]) -> int:
         return _report(" + ".join(options.pack), *found, options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
-    rest = short(rest)
-    if not hasattr(usual.data, "num"):  # of a simulator --num is the size of the data
-        rest = [re.sub(r"^--num(?==|$)", "--items", word) for word in rest]
-    options = parse(_SourceOptions, rest, f"data check {name}", default=usual, description=_MANUAL)
+    options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
     _check_places(options)
     if options.items < 0:
         raise ValueError(f"--items {options.items}: give the number of items to read, 0 for all")
@@ -90,8 +85,6 @@ def check(argv: list[str]) -> int:
 def _check_places(options: _Options) -> None:
     check_json(options.json)
     if options.sheet:
-        if options.sheet.suffix.lower() != ".png":
-            raise ValueError(f"--sheet {options.sheet}: the sheet is a PNG, give a name that ends in .png")
         check_place(options.sheet)
 
 
