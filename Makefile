@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench difficulty docs notebooks pictures pins clean
+.PHONY: demo test check bench difficulty docs notebooks pins clean
 
 # torch's default build includes CUDA, 5 GB of 7 GB. A torch that .venv can import is kept: one installed there
 # beforehand (e.g. the CPU build), or that of the system (make VENV_ARGS=--system-site-packages). A torch installed by
@@ -46,12 +46,6 @@ docs: .venv/ready  ## build the documentation in site/ (open site/index.html); w
 
 notebooks: .venv/ready  ## the tutorials as notebooks beside their pages (not kept in the repository)
 	$(BIN)/jupytext --quiet --to ipynb docs/tutorials/[!i]*.md
-
-pictures: .venv/ready  ## draw the pictures of the simulators in the documentation
-	$(BIN)/mvitac data sheet materials --side 56 --out docs/materials.png
-	$(BIN)/mvitac data sheet grasps --side 56 --out docs/grasps.png
-	$(BIN)/python -c 'from PIL import Image; [Image.open(f).quantize(256, kmeans=2).save(f, optimize=True) \
-	  for f in ("docs/materials.png", "docs/grasps.png")]'
 
 clean:
 	rm -rf .venv build dist site .pytest_cache .ruff_cache

@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     run = replace(
-        recipe("demo", replace(default(SimulatedConfig, options.data), seed=options.world)),
+        recipe("quick", replace(default(SimulatedConfig, options.data), seed=options.world)),
         method=SupervisedConfig(),
         optim=Optim(name="adamw", lr=1e-3, eps=1e-8, weight_decay=0.05, schedule="cosine", warmup=0.05),
         batch_size=128,

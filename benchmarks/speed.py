@@ -14,7 +14,6 @@ For several GPUs: torchrun --nproc-per-node N -m benchmarks.scaling
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import subprocess
@@ -30,8 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from rich.console import Console
-from rich.table import Table
+from tabulate import tabulate
 
 from benchmarks import lightly_parts
 from benchmarks.floor import Floor, clock, peak
@@ -340,20 +338,14 @@ def measure_probe(scale: Scale, pack: Pack, device: torch.device, num: int = 500
     }
 
 
-def show(console: Console, title: str, rows: dict[str, dict[str, float]]) -> None:
+def show(title: str, rows: dict[str, dict[str, float]]) -> None:
     """Print ``rows`` as a table."""
-    table = Table(title=title, title_justify="left")
-    names = list(dict.fromkeys(itertools.chain.from_iterable(rows.values())))
-    for column in ("", *names):
-        table.add_column(column.replace("_", " "), justify="right" if column else "left")
-    for name, row in rows.items():
-        table.add_row(name, *(f"{row[c]:.3g}" if c in row else "" for c in names))
-    console.print(table)
+    print(title, tabulate([{"": name, **row} for name, row in rows.items()], "keys", floatfmt=".3g"), "", sep="\n")
 
 
 def measure(options: argparse.Namespace, scale: Scale, batches: list[int], save: Callable[[dict], object]) -> dict:
     """Run the sections that were asked for. ``save`` is called with all results after each."""
-    device, console, workers = torch.device(options.device), Console(), options.workers
+    device, workers = torch.device(options.device), options.workers
     result: dict[str, Any] = {
         "date": datetime.now(UTC).isoformat(timespec="minutes"),
         "device": describe(device),
@@ -364,7 +356,7 @@ def measure(options: argparse.Namespace, scale: Scale, batches: list[int], save:
 
     def keep(place: dict[str, Any], name: str, title: str, found: dict[str, Any]) -> None:
         place[name] = found
-        show(console, title, found.get("variants", found))
+        show(title, found.get("variants", found))
         save(result)
 
     with tempfile.TemporaryDirectory() as temporary:
@@ -387,14 +379,14 @@ def measure(options: argparse.Namespace, scale: Scale, batches: list[int], save:
             if "whole" in options.sections:
                 keep(part, "whole", "end to end", measure_whole(at, *given))
                 hours = part["whole"]["hours_for_the_papers_pretraining"]
-                console.print(f"the paper's pre-training (92k pairs x 240 epochs) at this speed: {hours:.1f} h")
+                print(f"the paper's pre-training (92k pairs x 240 epochs) at this speed: {hours:.1f} h")
         if "probe" in options.sections:
             found = measure_probe(scale, pack, device, 500 if options.quick else 5000)
             keep(result, "probe", "the paper's probe: 5 seeds x 3 tasks x 3 modalities", found)
     if "caching" in options.sections:
         sizes = (16, 64, 8) if options.quick else (256, 4096, 256) if device.type == "cuda" else (64, 256, 32)
         keep(result, "caching", "gradient caching, bf16", measure_caching(scale, device, *sizes))
-    console.print(f"{result['device']}, load {result['load']:.1f}, commit {result['commit']}", highlight=False)
+    print(f"{result['device']}, load {result['load']:.1f}, commit {result['commit']}")
     return result
 
 

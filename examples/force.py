@@ -71,7 +71,7 @@ def main(manifest: Path) -> None:
         left_out(pack, f"pixels, {shown}", thumbnails(pack, "touch", every))
         left_out(pack, f"border, {shown}", borders(pack, "touch", every))
         for trunk in ("resnet10t", "resnet18"):
-            run = recipe("demo", config, phased=False)
+            run = recipe("quick", config, phased=False)
             augment = replace(run.augment, size=96, whole=128)
             run = replace(run, encoder=Encoders.both(trunk=trunk, weights="scratch"), augment=augment)
             z = pack_features(fresh(run, pack.spec, pack.size), pack, "touch", every).numpy()

@@ -16,8 +16,8 @@ methods() {
   local name=$1 plan=$2 batch=$3
   shift 3
   [[ " ${SETS:-$name} " == *" $name "* ]] || return 0
-  python -m mvitac compare --plan "$plan" --data folder --recipe demo --out "$out/$name" \
-    --set steps="${STEPS:-300}" batch_size="$batch" eval_every=0 \
+  python -m mvitac compare --plan "$plan" --data folder --recipe quick --out "$out/$name" \
+    --set steps="${STEPS:-300}" batch_size="$batch" eval_every=0 optim.lr=2e-3 augment.touch.flip=0.5 \
     --data.title "$name" --data.group object --data.size 72 "$@" "${options[@]}"
 }
 

@@ -25,8 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
+from tabulate import tabulate
 
 import mvitac
 from mvitac.data.pack import Pack
@@ -194,27 +193,26 @@ def _summary(records: list[dict[str, Any]]) -> dict[str, float]:
     return {"mean": mean, "low": low, "high": high, "tried": float(np.mean([r["tried"] for r in records]))}
 
 
-def show(found: dict[str, Any], console: Console) -> None:
+def show(found: dict[str, Any]) -> None:
     """Print the results of ``experiment`` as a table."""
     title = "{objects} test objects, {episodes} episodes per seed, {seeds} seeds, {candidates} candidates".format(
         **found
     )
-    table = Table(title=f"{title}: success in %", title_justify="left")
-    for column in ("policy", "re-grasp", "95 %", "tried", "best of all", "95 %"):
-        table.add_column(column, justify="left" if column == "policy" else "right")
+    rows = []
     for name, rules in found["success"].items():
         again, best = rules["again"], rules["best"]
         cells = [f"{100 * again['mean']:.1f}", _range(again), f"{again['tried']:.2f}", f"{100 * best['mean']:.1f}"]
-        table.add_row(name, *cells, _range(best))
-    console.print(table)
+        rows.append([name, *cells, _range(best)])
+    heads = ["policy", "re-grasp", "95 %", "tried", "best of all", "95 %"]
+    print(f"{title}: success in %", tabulate(rows, heads, disable_numparse=True), sep="\n")
     for name, gain in found["gain"].items():
         p = gain["p"]  # None with one seed
         p = "" if p is None else f", p {p:.3f}" if p >= 0.0005 else ", p < .001"
-        console.print(f"re-grasp, {name}: {100 * gain['mean']:+.1f} points {_range(gain)}{p}", highlight=False)
+        print(f"re-grasp, {name}: {100 * gain['mean']:+.1f} points {_range(gain)}{p}")
 
 
 def _range(cell: dict[str, float]) -> str:
-    return rf"\[{100 * cell['low']:.1f}, {100 * cell['high']:.1f}]"
+    return f"[{100 * cell['low']:.1f}, {100 * cell['high']:.1f}]"
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -231,7 +229,7 @@ def main(argv: list[str] | None = None) -> None:
         found = experiment(model, model.run.data.open(), options.seeds, options.candidates)
     except ValueError as error:
         parser.error(str(error))
-    show(found, Console())
+    show(found)
     if options.json:
         write_json(options.json, found)
 

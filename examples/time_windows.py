@@ -108,8 +108,8 @@ def motion(pack: Pack) -> np.ndarray:
 
 
 def untrained(config: FolderConfig, pack: Pack, temporal: str, seed: int) -> np.ndarray:
-    """Features [rows, D] of recipe `demo`'s trunk before training."""
-    run = recipe("demo", config, phased=False)
+    """Features [rows, D] of recipe `quick`'s trunk before training."""
+    run = recipe("quick", config, phased=False)
     run = replace(run, seed=seed, encoder=run.encoder.changed(temporal=temporal))
     return pack_features(fresh(run, pack.spec, pack.size), pack, "touch", np.arange(pack.num)).numpy()
 

@@ -75,7 +75,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     from mvitac.report import figures, galleries
 
     monkeypatch.setattr(figures, "to_png", lambda figure: b"")
-    monkeypatch.setattr(figures, "to_svg", lambda figure, name, alt: f"<svg><title>{figures.escape(alt)}</title></svg>")
+    monkeypatch.setattr(figures, "to_svg", lambda figure: "data:image/svg+xml;base64,")
     monkeypatch.setattr(galleries, "embed_2d", lambda values: values[:, :2])
 
 

@@ -78,7 +78,7 @@ def test_data_is_chosen_by_a_recipe_never_by_the_run_itself() -> None:
 
 
 def test_digest_is_of_the_outcome() -> None:
-    run = recipe("demo")
+    run = recipe("quick")
     assert replace(run, log_every=3, device="cpu").digest() == run.digest()
     assert replace(run, data=replace(run.data, workers=7)).digest() == run.digest()
     assert replace(run, data=replace(run.data, quality=50)).digest() == run.digest()  # raw pixels have no quality
@@ -111,13 +111,13 @@ def test_spec_survives_its_record() -> None:
 def test_unknown_names_are_hinted() -> None:
     with pytest.raises(ValueError, match="did you mean 'modern'"):
         recipe("modren")
-    value = to_json(recipe("demo"))
+    value = to_json(recipe("quick"))
     value["optim"]["learning_rate"] = 1
     with pytest.raises(ValueError, match=r"field in run\.optim 'learning_rate'"):
         Run.load(value)
 
 
-@pytest.mark.parametrize("name", ["modern", "demo"])
+@pytest.mark.parametrize("name", ["modern", "quick"])
 def test_a_grasps_phases_are_not_each_others_positives(name: str) -> None:
     """Alike before, during and after the grip would mean blind to the contact."""
     assert recipe(name, GraspsConfig()).positives == "same-image"

@@ -80,7 +80,7 @@ class Run:
     Examples:
         >>> from dataclasses import replace
         >>> import mvitac
-        >>> run = replace(mvitac.recipe("demo"), steps=100, seed=1)
+        >>> run = replace(mvitac.recipe("quick"), steps=100, seed=1)
         >>> run.method.name, run.batch_size
         ('mvitac', 64)
     """

@@ -171,7 +171,6 @@ WORDS: list[tuple[str, str, str]] = [
     ("probe ", "{tmp}/nowhere", "no trained model at {tmp}/nowhere"),
     ("probe ", "{pack}", "no trained model"),
     ("export {run} --out {out} ", "--min-cosine nan", "nan"),
-    ("explore {run} ", "--port 0", "--port 0"),
     (PACKED, "--values text:N", "'hard'"),
     (PACKED, "--values united:N", "'3.2 mN'"),
     (PACKED, "--values endless:N", "'inf'"),

@@ -43,7 +43,7 @@ def test_data_commands_explain_themselves(command: str, capsys: pytest.CaptureFi
 def test_pretrain_starts_nothing_without_data(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["pretrain", *options]) == 2
     said = capsys.readouterr().err
-    commands = ("mvitac demo", "mvitac pretrain --data materials --recipe demo")
+    commands = ("mvitac demo", "mvitac pretrain --data materials --recipe quick")
     for word in ("--data", "folder", "--from RUN.JSON", *commands):
         assert word in said
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 import mvitac
 from mvitac.data.build import build
@@ -116,7 +115,7 @@ def test_touch_that_knows_the_outcome_lifts_like_the_oracle(
     shown = capsys.readouterr().out
     assert "10 test objects" in shown and f"{100 * success['vision']:.1f}" in shown
     found["gain"]["both - vision"]["p"] = 0.0002
-    regrasp.show(found, Console())
+    regrasp.show(found)
     assert "p < .001" in capsys.readouterr().out
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +22,6 @@ from mvitac.evaluation.events import choose_threshold, group_folds, lead_of, poo
 from mvitac.evaluation.probe import ProbeSplit, probe_features, split_rows
 from mvitac.evaluation.scores import event_of, pool, summarise
 from mvitac.recipes import recipe
-from mvitac.report.report import write_report
-from mvitac.report.tables import print_summary
 from mvitac.training.loop import train
 
 LENGTH = 8
@@ -228,10 +224,6 @@ def test_a_probe_scores_the_event_of_runs_and_controls(grips: Pack, scored: tupl
     event = cells["pixels"]["event"]
     assert event["detected"]["num"] == event["false_alarms"]["num"] == 3
     assert event["detected"]["mean"] == 1.0 and event["lead"]["median"] == 480.0  # bright from 640 ms on, of 1120
-    file = io.StringIO()
-    print_summary(result, file)
-    assert "slip: slips as an event (3 recordings with it, 3 without)" in file.getvalue()
-    assert re.search(r"pixels +touch +100\.0 .* +480 ms", file.getvalue())
     assert stored_result([out], grips) == result  # the report reads it back
     plain = probe_runs([out], ProbeConfig(controls=False))
     assert "event" not in plain["records"][0] and "event" not in plain["summary"]["slip"]["touch"]["mvitac"]
@@ -239,15 +231,6 @@ def test_a_probe_scores_the_event_of_runs_and_controls(grips: Pack, scored: tupl
     assert plain["records"][0] == {key: value for key, value in asked.items() if key != "event"}
     folds = pool([[asked], [asked]])
     assert len(folds[0]["event"]["recordings"]) == 12 and "event" in summarise(folds)["slip"]["touch"]["mvitac"]
-
-
-def test_the_report_draws_scores_over_time(grips: Pack, scored: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    out, _ = scored
-    probe_runs([out], ProbeConfig(event=("slip=slips",), fps=25, controls=False))  # so the report probes again
-    page = write_report([out], tmp_path, quiet=True).read_text()
-    assert "Events over time" in page and "slip: slips as an event (3 recordings with it, 3 without)" in page
-    assert (tmp_path / "figures" / "event-slip.png").stat().st_size > 5000
-    assert ">threshold<" in page and ">onset or end<" in page
 
 
 @pytest.mark.parametrize(

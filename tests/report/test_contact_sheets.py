@@ -15,8 +15,6 @@ from mvitac.data.image_grid import Block, Tile, draw, font, pair, wrap
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
-from mvitac.report.simulated_sheet import materials_sheet
-from mvitac.sim.materials import touch
 from support.toy import Toy
 
 
@@ -82,21 +80,17 @@ def test_a_gap_is_crossed_out(tmp_path: Path) -> None:
     assert (whole == pack.images["touch"][5]).all()
 
 
-def test_the_command_writes_png_and_html(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_a_picture(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["data", "show", str(pack.path), "--num", "2"]) == 0
     with Image.open(tmp_path / f"{pack.path.name}.png") as picture:
         assert picture.width >= 480
-    assert main(["data", "show", str(pack.path), "--by", "bright", "--num", "2", "--out", "s.html"]) == 0
-    text = (tmp_path / "s.html").read_text()
-    assert text.count("<img ") == 4 and "dark: " in text and "bright: light" in text
-    assert "<script" not in text
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--out", "s.gif"], "ends in .png or .html"),
+        (["--out", "s.gif"], "ends in .png"),
         (["--side", "4"], "give 16 to 1024 pixels"),
         (["--num", "0"], "give at least 1"),
         (["--by", "nothing"], "unknown task or column 'nothing'"),
@@ -131,11 +125,3 @@ def test_a_grid_wraps_its_pictures_and_keeps_captions_below_them() -> None:
     assert picture.shape[1] <= 640 and sorted(set(tops)) == sorted(tops)[::4] and len(set(lefts)) == 4
     for top, left in corners[4:]:  # the lower row
         assert picture[top + 40 :, left : left + 100].min() < 100  # text
-
-
-def test_the_sheet_of_the_simulator_shows_every_class() -> None:
-    picture = np.asarray(materials_sheet(0, 16))
-    for category in (0, 7, 19):
-        made = touch(0, category, 2, 0, size=16)
-        expected = np.concatenate([made["vision"], made["touch"]], axis=1)
-        assert places(picture, expected)

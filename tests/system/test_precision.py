@@ -61,7 +61,6 @@ def test_recipes_ask_for_auto_but_those_that_are_fixed() -> None:
         "paper": "fp32",
         "authors": "fp32",
         "modern": "auto",
-        "demo": "auto",
         "quick": "auto",
         "smoke": "fp32",
     }
@@ -276,8 +275,8 @@ from mvitac.cli import live
 pack, out = sys.argv[1:]
 common = ["--data", "pack", "--data.path", pack, "--encoder.trunk", "mvitac_tiny", "--steps", "1", "--batch-size", "4"]
 common += ["--augment.size", "32", "--augment.whole", "None", "--eval-every", "0"]
-for name, chosen in {"demo": [], "modern": ["--encoder.weights", "scratch"], "bf16": ["--precision", "bf16"]}.items():
-    recipe = "modern" if name == "modern" else "demo"
+for name, chosen in {"quick": [], "modern": ["--encoder.weights", "scratch"], "bf16": ["--precision", "bf16"]}.items():
+    recipe = "modern" if name == "modern" else "quick"
     assert main(["pretrain", "--recipe", recipe, *common, *chosen, "--out", f"{out}/{name}"]) == 0
 """
 
@@ -287,7 +286,7 @@ def test_recipes_train_in_fp32_on_a_cpu_without_bf16(pack: Pack, tmp_path: Path)
     done = subprocess.run(command, env={**os.environ, **OLD_CPU}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     became = {path.name: load_run(path)[1]["precision"] for path in tmp_path.iterdir()}
-    assert became == {"demo": "fp32", "modern": "fp32", "bf16": "bf16"}
+    assert became == {"quick": "fp32", "modern": "fp32", "bf16": "bf16"}
     text = " ".join(done.stdout.split())
     assert text.count("precision: fp32 (auto, as this CPU does not compute bf16 itself)") == 2
     assert re.search(r"bf16, which is emulated on this CPU: a 256x256 product takes \d+ times as long as in fp32", text)

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+from markupsafe import Markup
 
 from mvitac.bench.result import GUESS, pinned_of, problems, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
@@ -14,8 +15,8 @@ from mvitac.evaluation.intervals import paired_difference
 from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
 from mvitac.evaluation.scores import by_cell, summarise
-from mvitac.report import html as page
 from mvitac.report.figures import bars, to_svg
+from mvitac.report.html import blocks as page
 from mvitac.report.tables import probe_name
 from mvitac.system.files import fields_of, write_atomic
 
@@ -157,35 +158,32 @@ LEAKS = """Leaks compare the rows and groups that an encoder was trained on with
 with the encoder. LEAK? stands where there is none, and no list of its training data is given either."""
 DATA = """Rows with another digest are never compared. 'same': the images, too, are those that the suite was measured on.
 'other pixels', 'other rows': made or decoded on another machine. 'not pinned': the suite has no digest of this form."""
-FOOT = "<p>Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it.</p>"
+FOOT = "Made by mvitac bench board. The digest of a result shows changes; it does not prove who measured it."
 
 
 def _page(board: Board) -> str:
     suite = suite_of(next(iter(board.results.values())))
     probes = dict.fromkeys(probe_name(suite.probes[0], row.score) for row in board.rows)
-    chips = [("definition", suite.digest()[:12]), ("encoders", str(len(board.results))), ("probe", " or ".join(probes))]
-    head = (
-        f"<p class='eyebrow'>mvitac bench</p><h1>{escape(suite.name)}</h1><p class='verdict'>{escape(suite.title)}</p>"
-        f"<ul class='chips'>{''.join(f'<li>{escape(k)} <b>{escape(v)}</b></li>' for k, v in chips)}</ul>"
-    )
+    chips = {"definition": suite.digest()[:12], "encoders": len(board.results), "probe": " or ".join(probes)}
+    head = page.head(suite.name, "mvitac bench", chips, suite.title)
     orders = [[f"{row.task}, {row.modality}", order_of(row, board.encoders)] for row in board.rows]
     few = [row for row in board.rows if row.few]
     sections = [
         ("scores", "Scores", _scores(board)),
-        ("bars", "Bars", page.grid(page.figure(_bars(board, row)) for row in board.rows)),
+        ("bars", "Bars", [page.grid([_bars(board, row) for row in board.rows])]),
         *([("labels", "Few labels", _few(board, few))] if few else []),
         ("order", "Order", _text_table(ORDER, ["", "from best to worst"], orders)),
         ("encoders", "Encoders and leaks", _encoders(board)),
         ("data", "Data", _data(board)),
     ]
-    return page.html_page(f"mvitac bench: {suite.name}", head, sections, FOOT)
+    return str(page.page(f"mvitac bench: {suite.name}", head, sections, FOOT))
 
 
-def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return page.paragraph(" ".join(intro.split())) + page.table(columns, rows, words=True, label=columns[1])
+def _text_table(intro: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Markup]:
+    return [page.paragraph(" ".join(intro.split())), page.table(columns, rows, words=True, label=columns[1])]
 
 
-def _scores(board: Board) -> str:
+def _scores(board: Board) -> list[Markup]:
     """A table of all scores, and folded below it one of the errors of values in their units."""
     columns, rows, errors, above = [*board.controls, *board.encoders], [], [], ""
     for row in board.rows:
@@ -197,12 +195,12 @@ def _scores(board: Board) -> str:
         for t, target in enumerate(next(filter(None, cells)).get("targets", ())):
             what = f"{row.task}, {row.modality}: {target['name']} ({target['unit']})"
             errors.append([what, *(f"{c['targets'][t]['mae']:.3g}" if c else "" for c in cells)])
-    found = page.paragraph(" ".join(SCORES.split())) + page.table(["", *columns], rows, label="scores")
+    found = [page.paragraph(" ".join(SCORES.split())), page.table(["", *columns], rows, label="scores")]
     table = page.table(["", *columns], errors, label="errors")
-    return found + (page.fold("Mean absolute errors in their units", table) if errors else "")
+    return [*found, page.fold("Mean absolute errors in their units", table)] if errors else found
 
 
-def _encoders(board: Board) -> str:
+def _encoders(board: Board) -> list[Markup]:
     columns = ["", "leak", "parameters", "images seen", "licence", "trained on", "notes"]
     columns += ["seeds, input", "weights", "versions"]
     rows = []
@@ -229,13 +227,13 @@ def _leaks(result: dict[str, Any]) -> str:
     return ". ".join([*found, *(["LEAK? not known"] if UNKNOWN in marks else [])]) or "none found"
 
 
-def _bars(board: Board, row: Row) -> str:
+def _bars(board: Board, row: Row) -> Markup:
     cells = {name: row.cells[name] for name in (*board.encoders, *board.controls[::-1]) if name in row.cells}
     drawn = bars(row.task, {row.modality: cells}, {}, f"{row.score} %")
-    return to_svg(drawn, f"{row.task} {row.modality}", f"{row.task}, {row.modality}; the numbers are in the table")
+    return page.figure(page.image(to_svg(drawn), f"{row.task}, {row.modality}; the numbers are in the table"))
 
 
-def _few(board: Board, rows: Sequence[Row]) -> str:
+def _few(board: Board, rows: Sequence[Row]) -> list[Markup]:
     """A table of scores of linear probes fitted with some of the labels."""
     names = [*board.controls, *board.encoders]
     found = []
@@ -244,10 +242,10 @@ def _few(board: Board, rows: Sequence[Row]) -> str:
         for share in dict.fromkeys(share for line in row.few.values() for share in line):
             cells = [row.few.get(name, {}).get(share) for name in names]
             found.append([f"{100 * share:g} % of labels", *(percent(c["mean"]) if c else "" for c in cells)])
-    return page.table(["", *names], found, label="few labels")
+    return [page.table(["", *names], found, label="few labels")]
 
 
-def _data(board: Board) -> str:
+def _data(board: Board) -> list[Markup]:
     rows: dict[tuple[str, str, str], dict[str, None]] = {}
     for name, result in board.results.items():
         for block in (block for block in result["blocks"] if "not_run" not in block):
@@ -255,4 +253,4 @@ def _data(board: Board) -> str:
             rows.setdefault(key, {})[f"{name} ({pinned_of(suite_of(result), block)})"] = None
     table = _text_table(DATA, ["", "form", "digest of rows", "results"], [[*k, ", ".join(v)] for k, v in rows.items()])
     lost = page.fold(f"{len(board.not_run)} tasks that were not run", page.code("\n".join(board.not_run)))
-    return table + (lost if board.not_run else "")
+    return [*table, lost] if board.not_run else table

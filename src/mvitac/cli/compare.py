@@ -63,7 +63,7 @@ _MANUAL = """Many runs into one table: methods x settings x seeds, next to contr
       --recipe {recipes}  (default: the plan's, {recipe})
 
     A plan of your own, in TOML (in JSON the same fields):
-      recipe = "demo"
+      recipe = "quick"
       seeds = 3
       reference = "MViTac"            # the row the others are tested against
       set = {{ steps = 300 }}           # fields of every run

@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -90,36 +90,6 @@ def _groups(pack: Pack) -> str:
         f"groups: {len(sizes)}, one per {by}, of {rows} each. A split takes whole groups, and intervals resample them"
     )
     return f"{text}."
-
-
-@dataclass(frozen=True)
-class _SheetOptions:
-    """A picture of everything a simulator makes, to check by eye."""
-
-    kind: Positional[Literal["materials", "grasps"]]
-    """Which simulator."""
-    out: Path | None = None
-    """The picture (default: KIND.png here)."""
-    seed: int = 0
-    """World seed."""
-    side: int = 72
-    """Height of a picture in pixels."""
-
-
-def sheet(argv: list[str]) -> None:
-    """mvitac data sheet materials|grasps [--out FILE.png]"""
-    options = parse(_SheetOptions, argv, "data sheet")
-    from mvitac.report.simulated_sheet import grasps_sheet, materials_sheet
-
-    draw = {"materials": materials_sheet, "grasps": grasps_sheet}[options.kind]
-    out = options.out or Path(f"{options.kind}.png")
-    if out.suffix.lower() != ".png":
-        raise ValueError(f"--out {out}: the sheet is a PNG, give a name that ends in .png")
-    if options.seed < 0:
-        raise ValueError(f"--seed {options.seed}: give a number >= 0")
-    picture = draw(options.seed, options.side)
-    write_atomic(out, lambda file: picture.save(file, "PNG"))
-    print(out)
 
 
 @dataclass(frozen=True)
@@ -230,15 +200,15 @@ class _ShowOptions:
     seed: int = 0
     """Seed of the draw."""
     out: Path | None = None
-    """A .png or an .html (default: NAME-OF-THE-PACK.png here)."""
+    """The picture (default: NAME-OF-THE-PACK.png here)."""
 
 
 def show(argv: list[str]) -> None:
-    """mvitac data show PACK [PACK ...] [--by TASK|COLUMN] [--out FILE.png|FILE.html]"""
+    """mvitac data show PACK [PACK ...] [--by TASK|COLUMN] [--out FILE.png]"""
     options = parse(_ShowOptions, argv, "data show")
     out = options.out or Path(f"{'-'.join(Path(one).resolve().name for one in options.pack) or 'pack'}.png")
-    if out.suffix.lower() not in (".png", ".html"):
-        raise ValueError(f"--out {out}: give a name that ends in .png or .html")
+    if out.suffix.lower() != ".png":
+        raise ValueError(f"--out {out}: the sheet is a PNG, give a name that ends in .png")
     if not 16 <= options.side <= 1024:
         raise ValueError(f"--side {options.side}: give 16 to 1024 pixels")
     if options.seed < 0:
@@ -249,10 +219,6 @@ def show(argv: list[str]) -> None:
     pack = open_packs(options.pack)
     drawn = {"num": options.num, "limit": options.limit, "seed": options.seed}
     found, num_all = contact_sheet.strips(pack, options.by, split=options.split, **drawn)
-    if out.suffix.lower() == ".html":
-        text = contact_sheet.to_html(pack, found, num_all, side=options.side)
-        write_atomic(out, lambda file: file.write(text.encode()))
-    else:
-        picture = contact_sheet.to_image(pack, found, num_all, side=options.side)
-        write_atomic(out, lambda file: picture.save(file, "PNG"))
+    picture = contact_sheet.to_image(pack, found, num_all, side=options.side)
+    write_atomic(out, lambda file: picture.save(file, "PNG"))
     print(f"{out}: {len(found)} of {num_all} strips")

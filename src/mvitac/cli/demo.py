@@ -26,7 +26,7 @@ def demo(argv: list[str]) -> None:
     chosen, rest = selectors(argv, ("--recipe",))
     about = f"""Simulate materials, pre-train, probe and write a report. A second call resumes the first.
 
-      --recipe {"|".join(RECIPES)}  (default quick; demo: the paper's momentum keys)
+      --recipe {"|".join(RECIPES)}  (default quick)
     """
     usual = _Options(run=recipe(chosen.get("--recipe", "quick")))
     options = parse(_Options, rest, "demo", default=usual, description=about)

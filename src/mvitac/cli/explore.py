@@ -1,6 +1,5 @@
 """``mvitac explore``: a local page that shows what a run has learned."""
 
-import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _Options:
-    """Open a local page: the map of features, the nearest neighbours of any point or picture, and mistakes; two runs side
+    """Open a local page: the map of features, the nearest neighbours of any point, and mistakes; two runs side
     by side."""
 
     runs: Positional[tuple[str, ...]]
@@ -37,10 +36,6 @@ def explore(argv: list[str]) -> None:
     options = parse(_Options, argv, "explore")
     if not 1 <= len(options.runs) <= 2:
         raise ValueError(f"{len(options.runs)} runs given: give one, or two to compare")
-    if options.rows < 3:
-        raise ValueError(f"--rows {options.rows}: give at least 3")
-    if options.port is not None and not 1 <= options.port <= 65535:
-        raise ValueError(f"--port {options.port}: give 1 to 65535, or leave it out for a free one")
     try:
         from mvitac.report.explorer import serve
 
@@ -50,7 +45,6 @@ def explore(argv: list[str]) -> None:
             raise
         raise ValueError("the explorer needs gradio: pip install -e '.[explore]' in mvitac's clone") from None
     print(f"explorer: http://{options.host}:{options.port or 7860} (or the next free port; Ctrl-C ends it)", flush=True)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C, which deletes uploaded pictures
     serve(blocks, host=options.host, port=options.port)
 
 

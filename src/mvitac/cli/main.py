@@ -17,7 +17,6 @@ COMMANDS = {
     "data pack": "data:pack",
     "data info": "data:info",
     "data check": "data_check:check",
-    "data sheet": "data:sheet",
     "data show": "data:show",
     "pretrain": "pretrain:pretrain",
     "finetune": "finetune:finetune",

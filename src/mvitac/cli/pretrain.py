@@ -38,12 +38,12 @@ def pretrain(argv: list[str]) -> None:
     if not asks_help(rest) and not {"--data", "--from"} & chosen.keys():
         raise ValueError(
             f"name the data to learn from: --data {'|'.join(DatasetConfig.choices)} (or --from RUN.JSON); without data of"
-            " your own: mvitac demo, or mvitac pretrain --data materials --recipe demo, which simulates"
+            " your own: mvitac demo, or mvitac pretrain --data materials --recipe quick, which simulates"
         )
     description = f"""Pre-train encoders without labels.
 
     First choose, then change single fields below (defaults are those of the chosen recipe):
-      --recipe {"|".join(RECIPES)}  (default demo)
+      --recipe {"|".join(RECIPES)}  (default quick)
       --data {"|".join(DatasetConfig.choices)}  (required)
       --method {"|".join(MethodConfig.choices)}  (default mvitac)
       --from RUN.JSON   repeat a recorded run instead
@@ -72,5 +72,5 @@ def _chosen_run(chosen: dict[str, str], phased: bool) -> Run:
                 raise ValueError(f"--from already decides {name}: leave it out, or change single fields")
         return read_record(Path(chosen["--from"]))[0]
     data = default(DatasetConfig, chosen.get("--data", "materials"))
-    base = recipe(chosen.get("--recipe", "demo"), data, phased if data.phased is None else data.phased)
+    base = recipe(chosen.get("--recipe", "quick"), data, phased if data.phased is None else data.phased)
     return with_method(base, chosen.get("--method", base.method.name))

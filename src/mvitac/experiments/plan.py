@@ -51,7 +51,7 @@ class Plan:
     """Heading of the table."""
     reference: str = "MViTac"
     """Label of the row that all others are compared with."""
-    recipe: str = "demo"
+    recipe: str = "quick"
     """The recipe of all rows that name none."""
     seeds: int = 3
     """Seeds 0 .. seeds - 1."""
@@ -74,25 +74,13 @@ class Plan:
     """task -> majority rate as printed in the paper."""
 
     def __post_init__(self) -> None:
-        if not self.rows:
-            raise ValueError(f"plan {self.name!r} has no rows: give at least one")
-        if not 1 <= self.seeds <= 1000:
-            raise ValueError(f"seeds {self.seeds}: give 1 to 1000")
         labels = [row.label for row in self.rows]
-        for label in labels:
-            if label in CONTROLS:
-                raise ValueError(f"row {label!r} has the name of a control: give it another label")
-            if labels.count(label) > 1:
-                raise ValueError(f"row {label!r} is given twice: give each row its own label")
+        if self.seeds < 1:
+            raise ValueError(f"seeds {self.seeds}: give at least 1")
+        if taken := sorted(set(labels) & set(CONTROLS)):
+            raise ValueError(f"row {taken[0]!r} has the name of a control: give it another label")
         if len({slug(label) for label in labels}) < len(labels):
-            raise ValueError(
-                f"plan {self.name!r}: some labels differ only in case or punctuation, which folder names drop: rename one"
-            )
-        for fold in self.folds:
-            if self.folds.count(fold) > 1:
-                raise ValueError(f"fold {fold!r} is given twice: give it once")
-            for pair in fold.split(","):
-                setting(pair, "fold")
+            raise ValueError(f"plan {self.name!r}: two labels are one, but for case and punctuation: rename one")
         if self.reference not in labels:
             raise unknown("reference row", self.reference, labels)
         if self.rows[labels.index(self.reference)].encoder:
@@ -113,18 +101,15 @@ class Plan:
             return [("", self)]
         assert self.data is not None
         whole = recipe(self.recipe, self.data, phased=False)  # for its data alone
-        pairs = [dict(setting(pair, "fold") for pair in fold.split(",")) for fold in self.folds]
-        parts = [{f"data.{name}": value for name, value in pair.items()} for pair in pairs]
-        names = [slug(" ".join(str(value) for value in part.values())) for part in parts]
-        if len(set(names)) < len(names):
-            names = [slug(fold) for fold in self.folds]
-        if "" in names or len(set(names)) < len(names):
-            raise ValueError(
-                f"folds {', '.join(self.folds)}: each needs a folder of its own, but letters and digits do not tell them"
-                " apart: give them other names"
-            )
-        datas = [changed(whole, part).data for part in parts]
-        return [(name, replace(self, data=data, folds=())) for name, data in zip(names, datas, strict=True)]
+        found: dict[str, Plan] = {}
+        for fold in self.folds:
+            pairs = dict(setting(pair, "fold") for pair in fold.split(","))
+            data = changed(whole, {f"data.{name}": value for name, value in pairs.items()}).data
+            name = slug(" ".join(map(str, pairs.values())))
+            if not name or name in found:
+                raise ValueError(f"folds {', '.join(self.folds)}: letters and digits do not tell them apart")
+            found[name] = replace(self, data=data, folds=())
+        return list(found.items())
 
     def run(self, row: Row, data: DatasetConfig, seed: int, phased: bool | None = None) -> Run:
         """The run of one row and seed; ValueError if a field does not exist or its value does not fit.

@@ -5,7 +5,6 @@ Check that camera and touch belong together, labels are right, colours look natu
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 from PIL import Image
@@ -13,7 +12,6 @@ from PIL import Image
 from mvitac.data.image_grid import Block, Tile, contents, draw, pair
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
-from mvitac.data.spec import task_title
 from mvitac.registry import unknown
 
 TASK = "label_"
@@ -90,30 +88,3 @@ def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96
     title = f"{pack.spec.name}, {pack.num} rows at {pack.size} px; each pair: {contents(pack)}{left_out}"
     blocks = [Block(heading(strip, pack), [Tile(pair(pack, int(row), side)) for row in strip.rows]) for strip in found]
     return draw(title, blocks)
-
-
-def to_html(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 128) -> str:
-    """All strips as one HTML page, each pair with its id, group, split, labels and values."""
-    from mvitac.report import html
-
-    tasks = {task.name: (task.classes, pack.column(f"{TASK}{task.name}")) for task in pack.spec.tasks}
-    names = {name: pack.column(name).astype(str) for name in ("id", "group", "split")}
-
-    values = [pair for task in pack.spec.values for pair in zip(task.targets, pack.values(task).T, strict=True)]
-
-    def caption(row: int) -> str:
-        labels = [f"{task_title(t, classes)}: {classes[v[row]]}" for t, (classes, v) in tasks.items() if v[row] >= 0]
-        numbers = [f"{t.name}: {v[row]:.3g} {t.unit}" for t, v in values if np.isfinite(v[row])]
-        return "; ".join([*(found[row] for found in names.values()), *labels, *numbers])
-
-    sections = []
-    for number, strip in enumerate(found):
-        said = [(int(row), caption(int(row))) for row in strip.rows]
-        cards = [html.figure(html.picture(pair(pack, row, side), text, side), text) for row, text in said]
-        sections.append((f"s{number}", heading(strip, pack), html.grid(cards)))
-    left_out = f" {num_all - len(found)} more are not shown." * (num_all > len(found))
-    head = f"<h1>{escape(pack.spec.name)}</h1>" + html.paragraph(
-        f"{pack.num} rows at {pack.size} px, drawn at random; each pair: {contents(pack)}.{left_out}"
-    )
-    foot = escape(f"source {pack.spec.source}; licence {pack.spec.licence}; pack {pack.digest[:16]}")
-    return html.html_page(f"{pack.spec.name}: contact sheet", head, sections, foot)

@@ -8,23 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import gradio as gr
-import numpy as np
 from gradio.themes import Base
-from PIL import Image
 from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from mvitac.data.images import to_rgb
 from mvitac.data.spec import task_title
-from mvitac.report import html
 from mvitac.report.explorer_data import ExplorerData
-from mvitac.report.guard import MAX_BODY, Guard, as_text
+from mvitac.report.html import blocks as html
+from mvitac.report.html import picture
 from mvitac.report.palette import colour
 
 os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # no telemetry from a local page; read on import
 
 K = 6
 KEYS = "Arrow keys go from point to point, Enter shows its neighbours, + and - zoom, 0 resets."
-KEPT = (60, 600)  # seconds between two deletions of uploaded pictures, and the age of those that are deleted
 MAP = (
     f'<div class="map"><canvas tabindex="0" role="application" aria-label="Map of features. {KEYS}"></canvas>'
     '<div class="tip" aria-live="polite"></div></div>'
@@ -61,26 +58,25 @@ h4 {{ margin: 0 0 6px; font-size: 14px; font-weight: 600; }}
 
 def tip(land: ExplorerData, i: int) -> str:
     """The tooltip of a point as HTML: the pair's two images and a line of text."""
-    pictures = [html.picture(land.picture(i, m), m) for m in land.x]
+    pictures = [picture(land.picture(i, m), m) for m in land.x]
     return "".join(pictures) + f"<div>{escape(land.describe(i))}</div>"
 
 
 def page(lands: dict[str, ExplorerData]) -> gr.Blocks:
     """Build the page of one run, or of several runs side by side (name -> its data). All must show the same pack."""
     first = next(iter(lands.values()))
-    with gr.Blocks(title="mvitac explorer", delete_cache=KEPT) as blocks:
-        gr.Markdown(f"### {as_text(' | '.join(lands))} on {as_text(first.pack.spec.name)}")
+    with gr.Blocks(title="mvitac explorer") as blocks:
+        gr.HTML(f"<h3>{escape(' | '.join(lands))} on {escape(first.pack.spec.name)}</h3>")
         controls = _controls(first)
         draw = partial(_maps, list(lands.values()))
         start = draw(*(c.value for c in controls))
         with gr.Row():
             views = [_map(name, land, s, len(lands) > 1) for (name, land), s in zip(lands.items(), start, strict=True)]
-        chosen = gr.Markdown(
+        chosen = gr.HTML(
             "Click a point for its nearest neighbours; scroll or pinch to zoom, drag to pan, double-click to reset. "
             f"Choose in the legend what is shown in colour. With the map in focus: {KEYS[0].lower()}{KEYS[1:]}"
         )
         galleries = [gr.HTML(css_template=FOUND) for _ in first.x]
-        _query_form(first, f" by {next(iter(lands))}" if len(lands) > 1 else "")
         for control in controls:
             control.change(draw, controls, views)
         for view, land in zip(views, lands.values(), strict=True):
@@ -117,7 +113,7 @@ def _map(name: str, land: ExplorerData, value: str, several: bool) -> Any:
     hover.__name__ = "tip"  # scatter.js calls server.tip
     with gr.Column(min_width=300):
         if several:
-            gr.Markdown(f"**{as_text(name)}**")
+            gr.HTML(f"<b>{escape(name)}</b>")
         return gr.HTML(
             value,
             html_template=MAP,
@@ -139,68 +135,34 @@ def _on_click(land: ExplorerData) -> Callable[[str | None, gr.EventData], list[A
             _found(land, f"nearest by {m}" + legend, land.neighbours(x[i : i + 1], m, K, without=i), m, i, task)
             for m, x in land.x.items()
         ]
-        return [f"**{as_text(land.describe(i))}**", *lists]
+        return [f"<b>{escape(land.describe(i))}</b>", *lists]
 
     return click
 
 
 def _found(
-    land: ExplorerData,
-    title: str,
-    pairs: Sequence[tuple[int, float]],
-    modality: str,
-    asked: int | None = None,
-    task: str | None = None,
+    land: ExplorerData, title: str, pairs: Sequence[tuple[int, float]], modality: str, asked: int, task: str | None
 ) -> str:
     """Similar rows as HTML. Each is marked by its class in ``task``, and whether that is the class of row ``asked``."""
     cells = []
     for i, score in pairs:
-        same = None if asked is None else land.same_class(asked, i, task)
+        same = land.same_class(asked, i, task)
         css, mark = {None: ("", ""), True: ("right", "✓"), False: ("wrong", "✕")}[same]
         if task and mark:
             mark += f" {land.classes[task][land.labels[task][i]]}"
-        image = html.picture(land.picture(i, modality), f"{modality} of {land.name(i)}", 224)
+        image = picture(land.picture(i, modality), f"{modality} of {land.name(i)}", 224)
         cells.append(html.cell(css, image, mark, f"{land.name(i, task)} · {score:.2f}"))
     return f'<h4>{escape(title)}</h4><div class="found">{"".join(cells)}</div>'
-
-
-def _query_form(land: ExplorerData, by: str) -> None:
-    """The form for an image of one's own."""
-    wants = "your picture (of touch: minus its background)" if land.model.spec.difference else "your picture"
-    with gr.Row():
-        with gr.Column(min_width=240):
-            given = gr.Image(label=wants, type="pil", image_mode=None, sources=["upload", "clipboard"])
-            kind = gr.Radio(list(land.x), value=next(iter(land.x)), label="it is a picture of")
-            ask = gr.Button(f"Query and classify{by}")
-        with gr.Column(min_width=240):
-            answer = gr.Markdown()
-            alike = gr.HTML(css_template=FOUND)
-    ask.click(partial(_query, land), [given, kind], [answer, alike])
-
-
-def _query(land: ExplorerData, image: Image.Image | None, modality: str) -> tuple[str, str]:
-    """Classify an image and find the rows most similar to it."""
-    if image is None:
-        return "Give a picture first.", ""
-    try:
-        answers, pairs = land.query(np.asarray(to_rgb(image)), modality, K)
-    except ValueError as error:
-        return as_text(f"This picture cannot be used: {error}"), ""
-    lines = []
-    for name, probabilities in answers.items():
-        best = sorted(probabilities.items(), key=lambda item: -item[1])[:3]
-        title = as_text(task_title(name, tuple(probabilities)))
-        lines.append(f"- **{title}**: " + ", ".join(f"{as_text(c)} {100 * p:.0f} %" for c, p in best))
-    found = _found(land, "most similar", pairs, modality)
-    return "\n".join(lines) or "This run has no labels to classify by.", found
 
 
 def serve(blocks: gr.Blocks, *, host: str = "127.0.0.1", port: int | None = None, wait: bool = True) -> str:
     """Serve the page and return its address. Fonts come from the machine, nothing from the network.
 
-    Only names of this machine and the page's own origin are answered (``guard.Guard``).
+    Only requests to names of this machine are answered: a site that lets its own name point to 127.0.0.1 (DNS rebinding)
+    is not. On 0.0.0.0, which is open to the network, all are.
     """
+    names = ["*"] if host in ("0.0.0.0", "::") else ["localhost", "127.0.0.1", host]
     theme = Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])
     options: dict[str, Any] = {"share": False, "quiet": True, "theme": theme}
-    options |= {"max_file_size": MAX_BODY, "app_kwargs": {"middleware": [Middleware(Guard, host=host)]}}
+    options["app_kwargs"] = {"middleware": [Middleware(TrustedHostMiddleware, allowed_hosts=names)]}
     return blocks.launch(server_name=host, server_port=port, prevent_thread_lock=not wait, **options)[1]

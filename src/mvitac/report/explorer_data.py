@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import colormaps, colors
 
 from mvitac.data.image_grid import side_by_side
 from mvitac.data.pack import Pack
@@ -19,7 +20,7 @@ from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ProbeInfo
 from mvitac.registry import unknown
-from mvitac.report.palette import COLOURS, MAP_HUES, ramp
+from mvitac.report.palette import COLOURS, MAP_HUES
 
 LEVELS = 32  # number of colours between the lowest and the highest value
 
@@ -120,7 +121,7 @@ class ExplorerData:
         share = np.clip((values[index] - low) / max(high - low, 1e-12), 0, 1)
         levels = [str(level) for level in range(LEVELS)]
         group = np.where(np.isnan(share), LEVELS, np.nan_to_num(share) * (LEVELS - 1)).round()
-        legend = {"legend": [*levels, "not measured"], "coloured": levels, "hues": ramp(LEVELS), "by": target}
+        legend = {"legend": [*levels, "not measured"], "coloured": levels, "hues": _ramp(LEVELS), "by": target}
         return self._json(modality, index, group, **legend, bar=[f"{low:.3g}", f"{high:.3g}", target])
 
     def _json(self, modality: str, index: np.ndarray, group: np.ndarray, **legend: Any) -> str:
@@ -172,18 +173,10 @@ class ExplorerData:
         """uint8 [S, S, 3], or [S, 2 S, 3] for two sensors."""
         return side_by_side(self.pack.images[modality][int(self.rows[i])])
 
-    def query(self, image: np.ndarray, modality: str, k: int) -> tuple[dict[str, Any], list[tuple[int, float]]]:
-        """Task -> class -> probability, and the neighbours, of a new uint8 image [H, W, 3]."""
-        num = self.pack.spec.channels(modality) // 3
-        given = np.concatenate([image] * num, axis=2)
-        pictures: dict[str, Any] = {modality: given}
-        said = {}
-        if any(r.info.modality == modality for r in self.model.probes.values()):
-            found = self.model.predict(**pictures)
-            for task, names in self.model.classes.items():
-                said[task] = dict(zip(names, found[task][0].tolist(), strict=True))
-        x = _unit(self.model.embed(**pictures)[modality].cpu().numpy())
-        return said, self.neighbours(x, modality, k)
+
+def _ramp(num: int) -> list[str]:
+    """``num`` colours from low to high (viridis), without the end that vanishes on a light page."""
+    return [colors.to_hex(found) for found in colormaps["viridis"](np.linspace(0.0, 0.92, num))]
 
 
 def _unit(x: np.ndarray) -> np.ndarray:

@@ -1,17 +1,14 @@
-"""Figures of the report and of ``mvitac compare``, drawn with matplotlib as PNG, or as SVG with the page's colours.
+"""Figures of the report and of ``mvitac compare``, drawn with matplotlib as PNG or SVG in the page's colours.
 
-Every colour is one of ``COLOURS``. ``to_svg`` replaces it by the CSS variable of that name, so one drawing suits a light
-and a dark page. No pyplot: no global state, nothing to close.
+No pyplot: no global state, nothing to close.
 """
 
 import io
 import math
-import re
 import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import matplotlib
@@ -26,7 +23,8 @@ from matplotlib.ticker import MaxNLocator
 
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import percent
-from mvitac.report.palette import COLOURS, CONTROL_GREYS, HUES, MODALITY_HUES, colour
+from mvitac.report.html import data_uri
+from mvitac.report.palette import CONTROL_GREYS, HUES, MODALITY_HUES, colour
 
 MARKERS = ("o", "^", "s", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", ":", "-.")
@@ -38,7 +36,7 @@ STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # class names may contain a dollar sign
     "text.color": colour("ink"),
     "font.size": 9,
-    "svg.fonttype": "none",  # keep text as text, in the page's font
+    "svg.fonttype": "none",  # keep text as text
     "figure.constrained_layout.use": True,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -324,22 +322,8 @@ def to_png(figure: Figure, dpi: int = 200) -> bytes:
     return _print(figure, FigureCanvasAgg, "white", metadata={"Software": None})
 
 
-_VARIABLES = {light: f"var(--{name})" for name, (light, _) in COLOURS.items()}
-
-
-def to_svg(figure: Figure, name: str, alt: str) -> str:
-    """The figure as an <svg> for HTML: self-contained, scalable, with the page's colours and font."""
+def to_svg(figure: Figure) -> str:
+    """The figure as the address of an image for HTML."""
     metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    # The salt makes ids unique within a page and the output reproducible.
-    with matplotlib.rc_context({"svg.hashsalt": name}):
-        text = _print(figure, FigureCanvasSVG, "none", metadata=metadata).decode()
-    box = re.search(r'viewBox="[^"]*"', text)
-    assert box is not None
-    body = text[text.index(">", box.end()) + 1 :]
-    body = re.sub(r"<style.*?</style>", "", body, count=1, flags=re.DOTALL)  # it would apply to the whole page
-    body = re.sub(r'<g id="[^"]*"', "<g", body)  # figure_1, axes_1, ...: unused, and not unique in a page
-    body = re.sub(r"font-family: [^;\"]*", "font-family: var(--font)", body)
-    body = re.sub(r"(font: [^;\"]*?[0-9.]+px) [^;\"]*", r"\1 var(--font)", body)
-    body = re.sub(r"#[0-9a-f]{6}", lambda found: _VARIABLES.get(found[0], found[0]), body)
-    body = re.sub(r"\s+", " ", body)
-    return f'<svg class="figure" role="img" aria-label="{escape(alt)}" {box[0]}>{body}'
+    with matplotlib.rc_context({"svg.hashsalt": "mvitac"}):  # the same figure is the same file
+        return data_uri(_print(figure, FigureCanvasSVG, "none", metadata=metadata), "svg+xml")

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from markupsafe import Markup
 from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 from torch import Tensor
@@ -17,7 +18,9 @@ from torch import Tensor
 from mvitac.evaluation import diagnostics
 from mvitac.evaluation.features import features, sample
 from mvitac.evaluation.retrieval import shared_space
-from mvitac.report import figures, html
+from mvitac.report import figures
+from mvitac.report.html import blocks as html
+from mvitac.report.html import picture
 from mvitac.report.sections import Study
 
 NUM_MAP, NUM_QUERIES, NUM_FOUND = 1500, 8, 5
@@ -74,12 +77,12 @@ def embed_2d(values: np.ndarray) -> np.ndarray:
     return TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(reduced)
 
 
-def feature_maps(study: Study) -> str:
+def feature_maps(study: Study) -> list[Markup]:
     """A map per modality, of the first run's features."""
     split, rows = study.rows()
     rows = sample(rows, NUM_MAP)
     if len(rows) < 8:
-        return ""
+        return []
     labels, names, by = _labels(study, rows)
     drawn = []
     for modality in study.pack.spec.modalities:
@@ -91,7 +94,7 @@ def feature_maps(study: Study) -> str:
         f"{len(rows)} {split} rows{by}; features of {study.runs[0].path.name}, by PCA to 50 dimensions and t-SNE."
         " Near points are similar; distances between far clusters mean nothing."
     )
-    return html.paragraph(intro) + html.grid(drawn, "grid large")
+    return [html.paragraph(intro), html.grid(drawn, "grid large")]
 
 
 def _labels(study: Study, rows: np.ndarray) -> tuple[np.ndarray, Sequence[str], str]:
@@ -114,12 +117,12 @@ _SHOWN = {
 }
 
 
-def gallery(study: Study) -> str:
+def gallery(study: Study) -> list[Markup]:
     """Random queries in both directions with the five groups found first, each marked by a word and a colour."""
     run = next((run for run in study.runs if len(run.model.projectors) == 2), None)
     split, rows = study.rows()
     if run is None or split != "test" or not study.result["retrieval"]:
-        return ""  # without a score, as of a single test group, a gallery proves nothing
+        return []  # without a score, as of a single test group, a gallery proves nothing
     z = shared_space(run.model, study.pack, rows)
     names = study.pack.column("group")[rows].astype(str)
     groups = torch.from_numpy(np.unique(names, return_inverse=True)[1])
@@ -128,18 +131,18 @@ def gallery(study: Study) -> str:
     halves = []
     for asked, searched in (("touch", "vision"), ("vision", "touch")):
         found = nearest_groups(z[asked], z[searched], groups, labels, queries.tolist())
-        blocks = "".join(_query(study, rows, asked, searched, query, int(groups.max()) + 1) for query in found)
-        halves.append(f'<div class="card"><h3>{asked} → {searched}</h3>{blocks}</div>')
+        shown = [_query(study, rows, asked, searched, query, int(groups.max()) + 1) for query in found]
+        halves.append(html.card(f"{asked} → {searched}", shown))
     by, tasks = study.pack.spec.group_by, study.pack.spec.tasks
     intro = (
         f"{len(queries)} test rows drawn at random (seed 0). Left: the query. Then, best first, the five {by}s whose mean"
         f" embedding in the other modality is nearest ({run.source}, {run.path.name})."
         + (f" Right: the same {by}. Same class: another {by} with the same {tasks[0].name}." if tasks else "")
     )
-    return html.paragraph(intro) + f'<div class="queries">{"".join(halves)}</div>'
+    return [html.paragraph(intro), html.grid(halves, "queries")]
 
 
-def _query(study: Study, rows: np.ndarray, asked: str, searched: str, query: Query, num_groups: int) -> str:
+def _query(study: Study, rows: np.ndarray, asked: str, searched: str, query: Query, num_groups: int) -> Markup:
     """One query and what it found."""
     image, name = _picture(study, asked, rows[query.row])
     rank = f"its {study.pack.spec.group_by} has rank {query.rank} of {num_groups}"
@@ -148,13 +151,13 @@ def _query(study: Study, rows: np.ndarray, asked: str, searched: str, query: Que
         css, mark = _SHOWN[found.mark]
         image, name = _picture(study, searched, rows[found.row])
         cells.append(html.cell(css, image, mark, name))
-    return f'<div class="query">{"".join(cells)}</div>'
+    return html.grid(cells, "query")
 
 
-def _picture(study: Study, modality: str, row: int) -> tuple[str, str]:
+def _picture(study: Study, modality: str, row: int) -> tuple[Markup, str]:
     """A pack row's image, and its class in the first task or its group."""
     pack, label = study.pack, study.labels(np.array([row]))[0]
     group = str(pack.column("group")[row])
     name = pack.spec.tasks[0].classes[label] if label >= 0 else group
     alt = f"{modality} of {pack.spec.group_by} {group} ({name})"
-    return html.picture(pack.images[modality][row], alt), figures.shorten(name, 24)
+    return picture(pack.images[modality][row], alt), figures.shorten(name, 24)

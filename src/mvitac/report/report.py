@@ -4,29 +4,28 @@ import json
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
-from html import escape
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from markupsafe import Markup
+
 from mvitac import __version__
 from mvitac.data.pack import Pack
-from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, probe_runs, stored_result
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs, stored_result
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.probe import scorable
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import names_of
 from mvitac.evaluation.score_text import covered, percent, score_name, with_interval
-from mvitac.evaluation.scores import summarise
 from mvitac.model_files import load
-from mvitac.registry import from_json, to_json
+from mvitac.registry import to_json
 from mvitac.report import galleries, score_sections, tables
-from mvitac.report import html as page
 from mvitac.report import sections as evidence
+from mvitac.report.html import blocks as page
 from mvitac.report.sections import WORDS, Finished, Study
 from mvitac.run import load_run, precision_of
-from mvitac.system.files import read_json, write_atomic
+from mvitac.system.files import write_atomic
 from mvitac.system.progress import duration, shown, work
 from mvitac.training.log import read_log, seconds_of
 
@@ -64,9 +63,6 @@ def write_report(
             "the probe result is about other data than these runs: make it again with `mvitac probe --json`"
         )
     _check_scored(runs, result)
-    if result["records"]:  # a file's own summary may be of another version, with other intervals
-        result = {**result, "summary": summarise(result["records"], result["records"][0]["probe"])}
-    runs = _as_scored(runs, result)
     with shown(quiet=quiet):
         html = _page(Study(runs, pack, result, Path(out)))
     write_atomic(Path(out) / "report.html", lambda file: file.write(html.encode()))
@@ -74,34 +70,17 @@ def write_report(
 
 
 def open_runs(paths: Sequence[Path]) -> list[Finished]:
-    """Load finished runs; ValueError names a folder that is none."""
+    """Load finished runs; ValueError if a folder holds none."""
     if not paths:
         raise ValueError("give at least one run's folder")
-    for path in paths:
-        if not (path / "run.json").is_file():
-            raise ValueError(f"no run at {path}: give the folder that `mvitac pretrain --out` wrote")
-        if not (path / "model.safetensors").exists():
-            again = shlex.join(["mvitac", "pretrain", "--from", str(path / "run.json"), "--resume", "--out", str(path)])
-            raise ValueError(f"the run in {path} is not finished: continue it with `{again}`")
     opened = [(path, *load_run(path), read_log(path), load(path)) for path in paths]
     names = names_of([path for path, *_ in opened], [model for *_, model in opened])
     return [Finished(*each, name) for each, name in zip(opened, names, strict=True)]
 
 
-def _events(run: Path, tasks: Sequence[str]) -> ProbeConfig:
-    """The usual probe, with the events of ``tasks`` that the last `mvitac probe` of this run was asked for."""
-    try:
-        asked = from_json(ProbeConfig, read_json(run / "probe.json", "a probe result")["asked"], "asked")
-    except (ValueError, KeyError, TypeError):
-        return ProbeConfig()
-    event = tuple(name for name in asked.event if name.partition("=")[0] in tasks)
-    given = {"fps": asked.fps, "clock": asked.clock, "false_alarms": asked.false_alarms}
-    return ProbeConfig(event=event, **given) if event else ProbeConfig()
-
-
 def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
     if usable := tuple(task.name for task in scorable(pack, "none" if pack.parts else "both")):
-        return probe_runs([r.path for r in runs], replace(_events(runs[0].path, usable), tasks=usable), pack)
+        return probe_runs([r.path for r in runs], ProbeConfig(tasks=usable), pack)
     own = [{"source": r.source, "seed": r.run.seed, "run": str(r.path)} for r in runs]
     found = [{**o, **f} for o, r in zip(own, runs, strict=True) for f in cross_modal(r.model, pack)]
     shared: dict[str, Any] = {"records": [], "retrieval": found, "summary": {}, "classes": {}}
@@ -109,21 +88,11 @@ def _probe(runs: Sequence[Finished], pack: Pack) -> dict[str, Any]:
 
 
 def _check_scored(runs: Sequence[Finished], result: dict[str, Any]) -> None:
-    """Check that the result is about exactly these runs."""
+    """Check that the result is about exactly these runs: its means and names cover all of its runs."""
     scored = {Path(r["run"]).resolve() for r in [*result["records"], *result["retrieval"]] if "run" in r}
-    shown = {run.path.resolve(): run.path for run in runs}
-    again = "make it again with `mvitac probe --json`"
-    for path in shown.keys() - scored if scored else ():
-        raise ValueError(f"the probe result does not score {shown[path]}: {again}")
-    for path in scored - shown.keys():  # its means and names cover all of its runs
-        raise ValueError(f"the probe result scores {path} too: show that run as well, or {again}")
-
-
-def _as_scored(runs: Sequence[Finished], result: dict[str, Any]) -> list[Finished]:
-    """``runs`` with the names that ``result``, which may be older, has for them."""
-    records = [*result["retrieval"], *result["records"]]
-    names = {Path(r["run"]).resolve(): r["source"].removesuffix(END_TO_END) for r in records if "run" in r}
-    return [replace(run, source=names.get(run.path.resolve(), run.source)) for run in runs]
+    if scored and (other := scored ^ {run.path.resolve() for run in runs}):
+        names = ", ".join(map(str, sorted(other)))
+        raise ValueError(f"the probe result and the report differ in {names}: make it again with `mvitac probe --json`")
 
 
 def _page(study: Study) -> str:
@@ -136,7 +105,6 @@ def _page(study: Study) -> str:
         "collapse": ("Learning or collapsing?", evidence.collapse),
         "confusion": ("Confusion", evidence.confusions),
         "values": ("Predicted and true values", score_sections.values),
-        "events": ("Events over time", score_sections.events),
         "map": ("A map of the features", galleries.feature_maps),
         "gallery": ("Retrieval gallery", galleries.gallery),
         "settings": ("Settings", _settings),
@@ -150,15 +118,15 @@ def _page(study: Study) -> str:
             advance()
     spec = study.pack.spec
     notes = "".join(f" Note: {note}." for note in spec.notes)
-    foot = page.paragraph(
+    foot = (
         f"Data: {spec.name}, from {spec.source}; licence {spec.licence}.{notes}"
         f" 95 % intervals: {covered(spec.group_by, study.result['records'])}."
         f" Written by mvitac {__version__}; this page makes no network request."
     )
-    return page.html_page(title, _head(study, title), [section for section in drawn if section[2]], foot)
+    return str(page.page(title, _head(study, title), [section for section in drawn if section[2]], foot))
 
 
-def _head(study: Study, title: str) -> str:
+def _head(study: Study, title: str) -> Markup:
     runs, modalities = study.runs, study.pack.spec.modalities
     seeds = sorted({r.run.seed for r in runs})
     chips = {
@@ -169,13 +137,10 @@ def _head(study: Study, title: str) -> str:
         "trunk": ", ".join(dict.fromkeys(r.run.encoder.named(modalities) for r in runs)),
         "input": ", ".join(dict.fromkeys(f"{r.run.augment.whole_of(m)} px" for r in runs for m in modalities)),
     }
-    items = "".join(f"<li>{escape(name)} <b>{escape(value)}</b></li>" for name, value in chips.items())
     text = "; ".join(verdicts(study)) or "nothing is scored on this data"
     text = f"{text[0].upper()}{text[1:]}."
-    verdict = page.paragraph(text, "verdict")
-    tiles = "".join(_tile(study, task) for task in study.result["summary"])
-    top = f'<p class="eyebrow">Pre-training report</p><h1>{escape(title)}</h1><ul class="chips">{items}</ul>'
-    return f'{top}{verdict}<div class="tiles">{tiles}</div>'
+    tiles = [_tile(study, task) for task in study.result["summary"]]
+    return page.head(title, "Pre-training report", chips, text, tiles)
 
 
 def verdicts(study: Study) -> list[str]:
@@ -206,19 +171,16 @@ def _worded(task: dict[str, Any], cell: dict[str, float]) -> str:
     return f"{'R2 ' * (score_name({'': task}) == 'R2')}{percent(cell['mean'])} %"
 
 
-def _tile(study: Study, task: str) -> str:
+def _tile(study: Study, task: str) -> Markup:
     modality, own, controls = evidence.headline(study, task)
     below = [name for name, cell in controls.items() if _low(cell) > own["high"]]
     level = [name for name, cell in controls.items() if cell["high"] >= _low(own) and name not in below]
     found = [f"{word} {', '.join(names)}" for word, names in (("below", below), ("overlaps", level)) if names]
-    verdict = page.paragraph(f"interval {' and '.join(found) or 'above every control'}", "no" if found else "yes")
-    verdict = verdict if controls else ""
+    verdict = f"interval {' and '.join(found) or 'above every control'}" if controls else ""
     number, _, ends = with_interval(own["mean"], own["low"], own["high"], own.get("leak", "")).partition(" ")
-    numbers = f"{number}<small> % {ends}</small>"
     by = f", {study.sources[0]}" if len(study.sources) > 1 else ""
     about = ", ".join(["R2"] * (score_name(study.result["summary"][task]) == "R2") + [WORDS[modality] + by])
-    what = f"<h3>{escape(task)} <small>{escape(about)}</small></h3>"
-    return f'<div class="card tile">{what}<div class="big">{numbers}</div>{verdict}</div>'
+    return page.tile(task, about, number, ends, verdict, "no" if found else "yes")
 
 
 def _low(cell: dict[str, float]) -> float:
@@ -234,7 +196,7 @@ def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _settings(study: Study) -> str:
+def _settings(study: Study) -> list[Markup]:
     each = [flatten(to_json(r.run)) for r in study.runs]
     groups: dict[str, list[list[str]]] = {}
     for key in dict.fromkeys(key for flat in each for key in flat):
@@ -244,9 +206,9 @@ def _settings(study: Study) -> str:
     order = ["run", *(group for group in groups if group != "run")]
     shown = [page.table([group, ""], groups[group], words=True, label=group) for group in order]
     records = [(f"{r.path / 'run.json'} in full", json.dumps(r.record, indent=1)) for r in study.runs]
-    folded = "".join(page.fold(name, page.code(text)) for name, text in records)
-    differ = page.paragraph("Where runs differ, all values are shown.") if len(study.runs) > 1 else ""
-    return f"{differ}{page.grid(shown, 'pillars')}{folded}"
+    folded = [page.fold(name, page.code(text)) for name, text in records]
+    differ = [page.paragraph("Where runs differ, all values are shown.")] * (len(study.runs) > 1)
+    return [*differ, page.grid(shown, "pillars"), *folded]
 
 
 def _plain(value: Any) -> str:
@@ -255,7 +217,7 @@ def _plain(value: Any) -> str:
     return ", ".join(_plain(v) for v in value) if isinstance(value, list) else str(value)
 
 
-def _cost(study: Study) -> str:
+def _cost(study: Study) -> list[Markup]:
     rows: dict[str, list[str]] = {}
     for r in study.runs:
         lines = [entry for entry in r.log if "loss" in entry]
@@ -270,20 +232,17 @@ def _cost(study: Study) -> str:
             "parameters kept": f"{trunks / 1e6:.2f} M in trunks" + (f", {heads / 1e6:.2f} M in heads" if heads else ""),
             "machine": f"{r.record.get('machine', '')}; device {r.run.device}",
             "precision": precision_of(r.run, r.record) + " (auto)" * (r.run.precision == "auto"),
-            "versions": ", ".join(f"{k} {v}" for k, v in r.record.get("versions", {}).items()),
-            "python": str(r.record.get("python", "")),
             "commit": str(r.record.get("commit") or "not a git checkout"),
-            "data digest": str(r.record.get("pack", "")),
             "folder": str(r.path),
         }
         for name, value in known.items():
             rows.setdefault(name, []).append(value)
     names = [f"{r.source}, seed {r.run.seed}" for r in study.runs]
     shown = page.table(["", *names], [[name, *values] for name, values in rows.items()], words=True, label="cost")
-    return page.paragraph("Wall time is estimated from the logged speeds and excludes the final scoring.") + shown
+    return [page.paragraph("Wall time is estimated from the logged speeds and excludes the final scoring."), shown]
 
 
-def _again(study: Study) -> str:
+def _again(study: Study) -> list[Markup]:
     folders = [str(r.path) for r in study.runs]
     again = [f"{folder}-again" for folder in folders]
     pairs = zip(folders, again, strict=True)
@@ -291,5 +250,5 @@ def _again(study: Study) -> str:
     lines += [shlex.join(["mvitac", "probe", *again]), shlex.join(["mvitac", "report", *again])]
     commits = {str(r.record.get("commit") or "")[:12] for r in study.runs}
     commit = f" at commit {commits.pop()}" if len(commits) == 1 and "" not in commits else ""
-    intro = f"With the versions above{commit}, on data of the same digest:"
-    return page.paragraph(intro) + page.code("\n".join(lines))
+    intro = f"With the versions in run.json{commit}, on data of the same digest:"
+    return [page.paragraph(intro), page.code("\n".join(lines))]

@@ -36,7 +36,7 @@ function load() {
 function bar(given) {  // the colours from the lowest to the highest value, instead of a button for each group
   const [low, high, target] = given.bar, box = document.createElement("div"), strip = document.createElement("i");
   box.className = "bar";
-  strip.style.background = `linear-gradient(to right, ${given.hues.map(colour).join(", ")})`;
+  strip.style.background = `linear-gradient(to right, ${given.hues.join(", ")})`;
   box.append(`${target}: ${low}`, strip, high);
   return box;
 }
@@ -54,8 +54,6 @@ function choose(name) {  // in colour or in gray; if all colours are taken, in t
   paint();
 }
 
-function colour(pair) { return pair[document.body.classList.contains("dark") ? 1 : 0]; }
-
 function paint() {  // the legend
   if (data.bar) {
     count.textContent = data.row.length ? `${data.row.length} pairs; gray: not measured`
@@ -66,7 +64,7 @@ function paint() {  // the legend
   data.legend.forEach((name, g) => {
     const item = legend.children[g], k = slots.indexOf(name);
     item.setAttribute("aria-pressed", k >= 0);
-    item.firstChild.style.background = colour(k >= 0 ? data.hues[k] : data.gray);
+    item.firstChild.style.background = k >= 0 ? data.hues[k] : data.gray;
   });
   count.textContent = !data.row.length ? "nothing to show: choose another split or filter"
     : `${data.row.length} pairs; ${shown} of ${data.legend.length} in colour, at most ${slots.length}`;
@@ -92,7 +90,7 @@ function draw() {
   const size = data.row.length > 20000 ? 2 : data.row.length > 3000 ? 4 : 6;
   const slot = data.legend.map((name) => slots.indexOf(name));
   for (let k = -1; k < slots.length; k++) {
-    context.fillStyle = colour(k < 0 ? data.gray : data.hues[k]);
+    context.fillStyle = k < 0 ? data.gray : data.hues[k];
     for (let i = 0; i < data.row.length; i++) {
       if (slot[data.group[i]] !== k) continue;
       const [x, y] = place(i);

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+from markupsafe import Markup
+
 from mvitac.evaluation.leaks import leak_mark
 from mvitac.evaluation.score_text import (
     MODALITY_ORDER,
-    cell_text,
     clipped_text,
     columns_of,
     error_text,
@@ -17,16 +18,17 @@ from mvitac.evaluation.score_text import (
     with_interval,
 )
 from mvitac.evaluation.scores import by_cell, summarise_again
-from mvitac.report import event_figures, figures, html, tables, value_figures
+from mvitac.report import figures, tables, value_figures
+from mvitac.report.html import blocks as html
 from mvitac.report.palette import MODALITY_HUES
 from mvitac.report.sections import WORDS, Study, headline
 
 
-def probe(study: Study) -> str:
-    """Bars per task, then every number; '' if nothing is labelled."""
+def probe(study: Study) -> list[Markup]:
+    """Bars per task, then every number; none if nothing is labelled."""
     summary, records = study.result["summary"], study.result["records"]
     if not summary:
-        return ""
+        return []
     kinds: list[str] = list(dict.fromkeys(r["probe"] for r in records))  # the first one is that of the summary
     drawn = []
     for task, found in summary.items():
@@ -36,11 +38,11 @@ def probe(study: Study) -> str:
         drawing = figures.bars(task, groups, lines, f"{score_name(found)} %, mean and 95 % interval")
         alt = f"Probe scores on {task}; the numbers are in the table below"
         drawn.append(study.figure(f"probe {task}", drawing, alt))
-    numbers = [_scores(study, summary)]
+    numbers = _scores(study, summary)
     for kind in kinds[1:]:
         again = summarise_again(records, kind)
         names = " and ".join(dict.fromkeys(tables.probe_name(kind, score_name(cells)) for cells in again.values()))
-        numbers.append(html.fold(f"The same by {names}", _scores(study, again)))
+        numbers.append(html.fold(f"The same by {names}", html.grid(_scores(study, again), "")))
     numbers += _every_probe(records)
     names = " or ".join(dict.fromkeys(tables.probe_name(kinds[0], score_name(found)) for found in summary.values()))
     by = study.pack.spec.group_by
@@ -54,14 +56,14 @@ def probe(study: Study) -> str:
         )
     if {r["source"] for r in records} - set(study.sources):
         intro += " Grey bars are controls: the same probe on an untrained trunk, raw pixels, and the image border."
-    return html.paragraph(intro) + html.grid(drawn) + "".join(numbers)
+    return [html.paragraph(intro), html.grid(drawn), *numbers]
 
 
-def new_sensor(study: Study) -> str:
-    """Scores on a sensor that was not trained on, of a demo; else ''."""
+def new_sensor(study: Study) -> list[Markup]:
+    """Scores on a sensor that was not trained on, of a demo."""
     found = study.result.get("new sensor", {"summary": {}})
     if not found["summary"]:
-        return ""
+        return []
     cells = [cell for task in found["summary"].values() for cell in task["touch"].values()]
     intro = (
         f"Touches of {min(cell['groups'] for cell in cells)} unseen {found['group_by']}s with another gel, lights and"
@@ -69,11 +71,11 @@ def new_sensor(study: Study) -> str:
         " it colours slope, so that its touches can be shown as the known sensors would show them, as mvitac probe"
         " --standardise colours features does."
     )
-    notes = "".join(html.paragraph(f"{note}.") for note in found["notes"])
-    return html.paragraph(intro) + _scores(study, found["summary"]) + notes
+    notes = [html.paragraph(f"{note}.") for note in found["notes"]]
+    return [html.paragraph(intro), *_scores(study, found["summary"]), *notes]
 
 
-def _scores(study: Study, summary: dict[str, Any]) -> str:
+def _scores(study: Study, summary: dict[str, Any]) -> list[Markup]:
     """A table of accuracies, one of R2, and one of each target."""
     parts = []
     for score in ("accuracy", "R2"):
@@ -84,16 +86,16 @@ def _scores(study: Study, summary: dict[str, Any]) -> str:
             order = sources_of(found)
             rows += [
                 [f"{task} ({tested_on(found, study.pack.spec.group_by)})"],
-                *([s, *(cell_text(found, s, m) for m in columns)] for s in order),
+                *tables.score_rows(found, columns),
             ]
             muted |= set(order) - set(study.sources)
         if rows:
             parts.append(html.table([f"{score} %", *columns], rows, muted=muted, label=score))
         parts += [_target_table(study, task, found) for task, found in tasks.items() if score == "R2"]
-    return "".join(parts)
+    return parts
 
 
-def _target_table(study: Study, task: str, found: dict[str, Any]) -> str:
+def _target_table(study: Study, task: str, found: dict[str, Any]) -> Markup:
     """R2 and mean absolute error of each target of one task."""
     rows: list[list[str]] = []
     for target, source, cells in tables.target_rows(found):
@@ -109,7 +111,7 @@ def _target_table(study: Study, task: str, found: dict[str, Any]) -> str:
     return table + (html.paragraph(f"{clipped}.") if (clipped := clipped_text(found)) else "")
 
 
-def _every_probe(records: Sequence[dict[str, Any]]) -> list[str]:
+def _every_probe(records: Sequence[dict[str, Any]]) -> list[Markup]:
     """Every score of every record, folded: one table of classes, one of values."""
     classes, values = [], []
     for r in records:
@@ -133,7 +135,7 @@ def _every_probe(records: Sequence[dict[str, Any]]) -> list[str]:
     return found
 
 
-def values(study: Study) -> str:
+def values(study: Study) -> list[Markup]:
     """Predicted against true values of the first method and the error by range beside the controls, for each target."""
     records = study.result["records"]
     cells = by_cell(records, records[0]["probe"]) if records else {}
@@ -157,42 +159,11 @@ def values(study: Study) -> str:
             alt = f"Mean absolute error of {name} by range of the true value"
             drawn.append(study.figure(f"error {name}", drawing, alt, "Ranges hold equally many test rows."))
     if not drawn:
-        return ""
+        return []
     intro = (
         f"A point is a test row ({study.sources[0]}). A flat cloud means that the probe answers about the same for all."
     )
-    return html.paragraph(intro) + html.grid(drawn)
-
-
-def events(study: Study) -> str:
-    """How early each source raises an alarm, and the first method's scores over time for some recordings."""
-    records, drawn = study.result["records"], []
-    cells = by_cell(records, records[0]["probe"]) if records else {}
-    for task, found in study.result["summary"].items():
-        rows = tables.event_rows(found)
-        if not rows:
-            continue
-        muted = {row[0] for row in rows} - set(study.sources)
-        drawn.append(html.paragraph(tables.event_title(task, found) + "."))
-        drawn.append(html.table(list(tables.EVENT), rows, muted=muted, label=f"{task} as an event"))
-        modality, _, _ = headline(study, task)
-        event = cells[task, modality, study.sources[0]][0]["event"]
-        if event["traces"]:
-            name = f"{task}: score of {event['class']}, {WORDS[modality]}"
-            drawing = event_figures.traces(name, event, MODALITY_HUES[modality])
-            alt = f"Score of {event['class']} over time in test recordings with the event and without it"
-            drawn.append(
-                study.figure(f"event {task}", drawing, alt, f"{study.sources[0]}, recordings drawn at random.")
-            )
-    if not drawn:
-        return ""
-    intro = (
-        "A frame above the threshold raises an alarm. The threshold is chosen on other recordings than these, for a stated"
-        " share of false alarms. Detected: recordings with the event that raise an alarm. Before onset: from the first alarm"
-        " to the first frame of the event, or to the last frame of the recording if its onset is not labelled; median over"
-        " recordings with an alarm and its interval over recordings."
-    )
-    return html.paragraph(intro) + "".join(drawn)
+    return [html.paragraph(intro), html.grid(drawn)]
 
 
 def _mean_ranges(records: Sequence[dict[str, Any]], t: int) -> list[dict[str, float]]:

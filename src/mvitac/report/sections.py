@@ -1,4 +1,5 @@
-"""Sections of the report: retrieval, training curves, confusion matrices."""
+"""Sections of the report: retrieval, training curves, confusion matrices. Each is a list of blocks, empty if there is
+nothing to show."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from mvitac.data.pack import Pack
@@ -14,8 +16,9 @@ from mvitac.evaluation.intervals import interval
 from mvitac.evaluation.retrieval import MIN_GALLERY, retrieved_rows
 from mvitac.evaluation.score_text import columns_of, sources_of
 from mvitac.model import Model
-from mvitac.report import figures, html, tables
+from mvitac.report import figures, tables
 from mvitac.report.figures import Line
+from mvitac.report.html import blocks as html
 from mvitac.report.palette import HUES, MODALITY_HUES
 from mvitac.run import Run
 from mvitac.system.files import write_atomic
@@ -66,18 +69,18 @@ class Study:
             return np.full(len(rows), -1)
         return self.pack.column(f"label_{self.pack.spec.tasks[0].name}")[rows].astype(int)
 
-    def figure(self, name: str, drawing: Figure, alt: str, caption: str = "") -> str:
-        """Save ``drawing`` as a PNG in figures/ and return it as HTML."""
+    def figure(self, name: str, drawing: Figure, alt: str, caption: str = "") -> Markup:
+        """Save ``drawing`` as a PNG in figures/ and return it as a block."""
         safe = "".join(c if c.isalnum() else "-" for c in name.lower())
         write_atomic(self.out / "figures" / f"{safe}.png", lambda file: file.write(figures.to_png(drawing)))
-        return html.figure(figures.to_svg(drawing, safe, alt), caption)
+        return html.figure(html.image(figures.to_svg(drawing), alt), caption)
 
 
-def retrieval(study: Study) -> str:
+def retrieval(study: Study) -> list[Markup]:
     """R@5 as bars with chance level, and the whole table."""
     found = study.result["retrieval"]
     if not found:
-        return html.paragraph(f"Not scored: {_why_no_retrieval(study)}.")
+        return [html.paragraph(f"Not scored: {_why_no_retrieval(study)}.")]
     groups: dict[str, dict[str, dict[str, float]]] = {}
     for (source, direction), records in tables.by_direction(found).items():
         mean, low, high = interval(records)
@@ -91,7 +94,7 @@ def retrieval(study: Study) -> str:
     columns = ["", "query → found", *(f"{k} %" for k in tables.RETRIEVAL)]
     shown = html.table(columns, rows, muted=muted, label="retrieval")
     intro = f"Given one image, find its {by} among {num}, each represented by its mean embedding in the other modality."
-    return html.paragraph(intro) + html.grid([drawn, shown], "beside")
+    return [html.paragraph(intro), html.grid([drawn, shown], "beside")]
 
 
 def _why_no_retrieval(study: Study) -> str:
@@ -105,12 +108,12 @@ def _why_no_retrieval(study: Study) -> str:
 _NOT_LOSS = ("step", "lr", "pairs_per_s", "loss", "eval")
 
 
-def loss(study: Study) -> str:
+def loss(study: Study) -> list[Markup]:
     """The total loss of every run, the parts of each method's loss, and the learning rate."""
     series = [(r, [entry for entry in r.log if "loss" in entry]) for r in study.runs]
     series = [(r, entries) for r, entries in series if entries]
     if not series:
-        return html.paragraph("The runs left no log lines.")
+        return [html.paragraph("The runs left no log lines.")]
     total = [Line(r.source, *_column(entries, "loss"), study.hue(r)) for r, entries in series]
     rates = [Line(r.source, *_column(entries, "lr"), study.hue(r)) for r, entries in series]
     drawn = [study.figure("loss", figures.curves("loss", total), "Total loss over the steps")]
@@ -119,10 +122,10 @@ def loss(study: Study) -> str:
     drawn.append(study.figure("learning rate", figures.curves("learning rate", rates), "Learning rate over the steps"))
     seeds = " One line per seed." if len(study.runs) > len(study.sources) else ""
     intro = f"A falling loss alone proves nothing: read it with the next section.{seeds}"
-    return html.paragraph(intro) + html.grid(drawn)
+    return [html.paragraph(intro), html.grid(drawn)]
 
 
-def _loss_parts(study: Study, source: str, series: Sequence[tuple[Finished, list[dict[str, Any]]]]) -> list[str]:
+def _loss_parts(study: Study, source: str, series: Sequence[tuple[Finished, list[dict[str, Any]]]]) -> list[Markup]:
     """A figure of the parts of one method's loss, if it logged several."""
     names = [name for name in series[0][1][0] if name not in _NOT_LOSS] if series else []
     if len(names) < 2:
@@ -145,7 +148,7 @@ def _column(entries: list[dict[str, Any]], key: str) -> tuple[list[float], list[
     return [entry["step"] for entry in have], [float(f"{entry[key]:.5g}") for entry in have]
 
 
-def collapse(study: Study) -> str:
+def collapse(study: Study) -> list[Markup]:
     """What training measured on held-out groups: std, rank, alignment, uniformity, gap, kNN, R@5."""
     drawn = []
     for title, keys, caption in _panels(study):
@@ -153,13 +156,13 @@ def collapse(study: Study) -> str:
             drawing = figures.curves(title, lines, _chance(study, title))
             drawn.append(study.figure(title, drawing, f"{title} over the steps. {caption}", caption))
     if not drawn:
-        return ""
+        return []
     where = f"{study.pack.spec.group_by}s held out for this (split val)"
     if len(study.pack.rows("val")) < 2:
         where = "training rows (no val split)"
     said = [f"{r.source}, seed {r.run.seed}: {e['verdict']}." for r in study.runs for e in r.log if "verdict" in e]
     intro = f"Measured while training, on {where}. Dashed: the value at the start, before the first step."
-    return html.paragraph(intro) + "".join(map(html.paragraph, said)) + html.grid(drawn)
+    return [html.paragraph(intro), *map(html.paragraph, said), html.grid(drawn)]
 
 
 def _panels(study: Study) -> list[tuple[str, dict[str, tuple[str, str]], str]]:
@@ -209,7 +212,7 @@ def _chance(study: Study, title: str) -> dict[str, float]:
     return {}
 
 
-def confusions(study: Study) -> str:
+def confusions(study: Study) -> list[Markup]:
     """The first method's confusion matrix per task, on both modalities or its best one, summed over seeds."""
     source, drawn = study.sources[0], []
     for task, classes in study.result["classes"].items():
@@ -225,9 +228,9 @@ def confusions(study: Study) -> str:
         caption = f"{counts.sum() // len(found)} test rows{f', {len(found)} seeds added up' * (len(found) > 1)}."
         drawn.append(study.figure(f"confusion {task}", drawing, alt, caption))
     if not drawn:
-        return ""
+        return []
     intro = f"Each row is a true class and sums to 100 %: blue is correct, orange is a mistake ({source})."
-    return html.paragraph(intro) + html.grid(drawn)
+    return [html.paragraph(intro), html.grid(drawn)]
 
 
 def headline(study: Study, task: str) -> tuple[str, dict[str, Any], dict[str, dict[str, Any]]]:

@@ -14,7 +14,6 @@ from mvitac.evaluation.score_text import (
     columns_of,
     covered,
     error_text,
-    lead_text,
     percent,
     score_name,
     sources_of,
@@ -26,8 +25,6 @@ from mvitac.evaluation.scores import leaks_in
 PROBE_NAMES = {"linear": "logistic regression", "paper": "the paper's probe", "knn": "20 nearest neighbours"}
 VALUE_PROBE_NAMES = {"linear": "ridge regression"}
 RETRIEVAL = ("R@1", "R@5", "R@10", "chance R@5")  # columns of a retrieval table, in percent
-EVENT = ("", "features", "detected %", "false alarms %", "alarm before onset", "AUROC")
-"""Columns of a table of an event: shares of the recordings with and without it, and the median time."""
 
 
 def unseen_groups(group_by: str, records: Sequence[dict[str, Any]]) -> str:
@@ -56,14 +53,12 @@ def print_summary(result: dict[str, Any], file: TextIO | None = None, *, probe: 
         about = f"{probe_name(probe, score)}; {seeds} seed{'s' * (seeds != 1)}; {tested_on(task, result['group_by'])}"
         title = f"{result['data']}: {name} ({about})"
         # LEAK on a line of its own, else the table is too wide.
-        cells = [[s, *(cell_text(task, s, m).replace(" LEAK", "\nLEAK") for m in modalities)] for s in sources_of(task)]
-        print(text_table(title, [f"{score} %", *modalities], cells), file=file)
+        rows = [[cell.replace(" LEAK", "\nLEAK") for cell in row] for row in score_rows(task, modalities)]
+        print(text_table(title, [f"{score} %", *modalities], rows), file=file)
         if score == "R2":
             print(_targets(name, task), file=file)
         if clipped := clipped_text(task):
             print(clipped, file=file)
-        if events := event_rows(task):
-            print(text_table(event_title(name, task), EVENT, events, words=2), file=file)
     _print_notes(result, trained, file)
 
 
@@ -85,24 +80,9 @@ def _targets(name: str, task: dict[str, Any]) -> str:
     return text_table(f"{name}: R2 % and mean absolute error", ["", "", *columns_of(task)], rows, words=2)
 
 
-def event_rows(task: dict[str, Any]) -> list[list[str]]:
-    """Rows of ``EVENT`` of one task's summary; none without an event."""
-    rows = []
-    for source in sources_of(task):
-        for modality in (*columns_of(task), "none"):
-            if event := task.get(modality, {}).get(source, {}).get("event"):
-                found = (event[name] for name in ("detected", "false_alarms"))
-                shares = [with_interval(each["mean"], each["low"], each["high"]) for each in found]
-                shown = "" if modality == "none" else modality
-                rows.append([source, shown, *shares, lead_text(event), f"{event['auroc']:.2f}"])
-    return rows
-
-
-def event_title(name: str, task: dict[str, Any]) -> str:
-    """What a table of an event is about, such as 'slip: yes as an event (50 recordings with it, 101 without)'."""
-    event = next(cell["event"] for cells in task.values() for cell in cells.values() if "event" in cell)
-    num, without = event["detected"]["num"], event["false_alarms"]["num"]
-    return f"{name}: {event['class']} as an event ({num} recordings with it, {without} without)"
+def score_rows(task: dict[str, Any], modalities: Sequence[str]) -> list[list[str]]:
+    """Rows of source and its score at each of ``modalities``, of one task's summary."""
+    return [[source, *(cell_text(task, source, m) for m in modalities)] for source in sources_of(task)]
 
 
 def target_rows(task: dict[str, Any]) -> list[tuple[str, str, list[dict[str, Any] | None]]]:

@@ -55,7 +55,7 @@ def train(
     weights that were best on split val. Until it is finished, checkpoint.previous.pt is the checkpoint before.
 
     Args:
-        run: What to train, e.g. ``mvitac.recipe("demo")``.
+        run: What to train, e.g. ``mvitac.recipe("quick")``.
         out: Folder of the run. It must be new or empty, unless ``resume`` is set.
         resume: Continue from the last checkpoint in ``out``, if there is one.
         quiet: Print nothing.
@@ -73,7 +73,7 @@ def train(
         Busy: If another process trains in ``out``.
 
     Examples:
-        >>> out = mvitac.train(mvitac.recipe("demo"), "runs/mine")  # doctest: +SKIP
+        >>> out = mvitac.train(mvitac.recipe("quick"), "runs/mine")  # doctest: +SKIP
         >>> model = mvitac.load(out)  # doctest: +SKIP
     """
     out = Path(out)

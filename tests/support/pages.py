@@ -1,0 +1,11 @@
+"""Figures of an HTML page."""
+
+from __future__ import annotations
+
+import re
+from base64 import b64decode
+
+
+def drawings(page: str) -> list[str]:
+    """The figures of ``page`` as SVG."""
+    return [b64decode(found).decode() for found in re.findall(r'src="data:image/svg\+xml;base64,([^"]*)"', page)]
