@@ -65,8 +65,7 @@ COMMANDS = {
     "compare": "compare --plan {base}/plan.json --out {out}/c",
     "publish": "publish {base}/run {out}/a",
     "export": "export {base}/run --rows 4 --out {out}/x",
-    "index": "index {base}/pack --model {base}/run --out {out}/i",
-    "embed": "embed {base}/pack --model {base}/run --out {out}/e.npz",
+    "embed": "embed {base}/pack --model {base}/run --out {out}/e.parquet",
     "report": "report {base}/run --out {out}/report --quiet",
     "bench": "bench {base}/run --suite {base}/suite.toml --data-root {base} --out {out}/b",
 }

@@ -49,7 +49,7 @@ READING = {
     "data show": f"data show {{base}}/pack --side {SIDE} --out {{out}}/show.png",
     "live": "live {base}/export --vision {base}/table@99 --touch {base}/table@99 --seconds 1",
     "explore": "explore {base}/run --port 0",
-    "find": "find {base}/table/touch0.png --in {base}/index --from touch --to vision",
+    "find": "find {base}/table/touch0.png --model {base}/run --in {base}/e.parquet --from touch --to touch",
     "completion": "completion bash",
     "pretrain mix": "pretrain --recipe smoke --data mix --data.parts a={base}/pack:1 b={base}/pack:2 --augment.size 16"
     " --steps 2 --batch-size 8 --eval-every 0 --quiet --out {out}/m",
@@ -221,7 +221,7 @@ def main(argv: list[str] | None = None) -> int:
             raise RuntimeError(said.read_text())
         for words in (
             f"export {base}/run --rows 4 --out {base}/export",
-            f"index {base}/pack --model {base}/run --out {base}/index",
+            f"embed {base}/pack --model {base}/run --out {base}/e.parquet",
             f"bench {base}/run --suite {base}/suite.toml --data-root {base} --out {base}/results",
         ):
             if child(lambda words=words: mvitac(words.split()), said):  # type: ignore[misc]

@@ -46,8 +46,7 @@ class Model(nn.Module):
         projectors: modality -> head into the shared space.
         tasks: Names of the tasks of the method's own heads (``classifiers``); empty for a self-supervised method.
         probes: Name -> linear probe, if the model is a published artifact.
-        foreign: Whether it is from an artifact or an index, which may be a stranger's: no place that ``run`` names is
-            opened.
+        foreign: Whether it is from an artifact, which may be a stranger's: no place that ``run`` names is opened.
     """
 
     foreign = False

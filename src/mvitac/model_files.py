@@ -26,8 +26,8 @@ def weights_file(folder: Path, which: Which) -> Path:
 
 
 def is_foreign(folder: Path) -> bool:
-    """Whether ``folder`` is an artifact or an index, which may be a stranger's: no place that its run names is opened."""
-    return any((folder / name).exists() for name in ("artifact.json", "index.json"))
+    """Whether ``folder`` is an artifact, which may be a stranger's: no place that its run names is opened."""
+    return (folder / "artifact.json").exists()
 
 
 def fresh(run: Run, spec: DataSpec, stored: int) -> Model:

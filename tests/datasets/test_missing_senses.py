@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
@@ -131,11 +130,10 @@ def test_an_export_is_checked_and_calibrated_on_what_is_there(holes: Pack, model
 
 def test_what_is_not_there_is_not_searched_embedded_or_shown(holes: Pack, model: Model, tmp_path: Path) -> None:
     whole = np.flatnonzero(holes.has("vision") & holes.has("touch"))
-    index = search.build(model, holes, tmp_path / "index")
-    assert index.table.column("row").to_pylist() == whole.tolist() == ExplorerData(model, holes).rows.tolist()
-    model.save(tmp_path / "model.safetensors")
-    arguments = ["embed", str(holes.path), "--model", str(tmp_path), "--out", str(tmp_path / "e.npz")]
-    assert main(arguments) == 0
-    found = np.load(tmp_path / "e.npz")
-    for m in ("vision", "touch"):
-        assert (np.isnan(found[m]).all(1) == ~holes.has(m)).all() and (np.isnan(found[m]).any(1) == ~holes.has(m)).all()
+    assert whole.tolist() == ExplorerData(model, holes).rows.tolist()
+    search.embed(model, holes, tmp_path / "e.parquet")
+    known = search.Embeddings(tmp_path / "e.parquet", model.weights_digest())
+    for m, bank in known.banks.items():
+        assert (np.isnan(bank).all(1) == ~holes.has(m)).all() and (np.isnan(bank).any(1) == ~holes.has(m)).all()
+        rows, _ = known.find(model, holes.images[m][whole[:2]], m, m, len(whole))
+        assert rows[:, 0].tolist() == whole[:2].tolist() and holes.has(m)[rows].all()

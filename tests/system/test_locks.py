@@ -11,13 +11,11 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.artifact import load
 from mvitac.deploy.export import export
 from mvitac.deploy.publish import publish
-from mvitac.deploy.search import build
 from mvitac.system.locks import Busy, new_folder
 
 COMMANDS = {
     "publish": lambda run, pack, out: publish(run, out, pack),
     "export": lambda run, pack, out: export(load(run), pack, out),
-    "index": lambda run, pack, out: build(load(run), pack, out),
 }
 
 

@@ -32,7 +32,6 @@ COMMANDS = {
     "live": "live:live",
     "explore": "explore:explore",
     "embed": "search:embed",
-    "index": "search:index",
     "find": "search:find",
 }
 """Command -> module of this package:function, imported when called."""

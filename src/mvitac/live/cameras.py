@@ -180,17 +180,14 @@ class Simulated(Source):
 MODE = re.compile(r"(?P<which>.+?)(@(?P<width>\d+)x(?P<height>\d+))?(@(?P<fps>\d+(\.\d+)?))?")
 
 
-def source(text: str, modality: str, frames: int = 1) -> Source:
-    """The source that ``text`` names; ValueError if there is none, its file cannot be read, or it has too few pictures.
+def source(text: str, modality: str) -> Source:
+    """The source that ``text`` names; ValueError if there is none, or its file cannot be read.
 
     A camera (``0``, ``/dev/video2``, ``serial:D20345``; ``@320x240@60`` after it requests that mode), a video file, a
-    folder[@fps], or ``sim``[:seed] of this modality. ``frames``: how many the model looks at at once.
+    folder[@fps], or ``sim``[:seed] of this modality.
     """
-    if text == "sim" or text.startswith("sim:"):
-        seed = text.partition(":")[2] or "0"
-        if not seed.isdigit():
-            raise ValueError(f"source {text!r}: give sim or sim:NUMBER")
-        return Simulated(modality, int(seed))
+    if text.partition(":")[0] == "sim":
+        return Simulated(modality, int(text.partition(":")[2] or 0))
     mode = MODE.fullmatch(text)
     if mode and (mode["which"].isdigit() or text.startswith(("/dev/", "serial:"))):
         if importlib.util.find_spec("cv2") is None:
@@ -198,35 +195,15 @@ def source(text: str, modality: str, frames: int = 1) -> Source:
         size = (int(mode["width"]), int(mode["height"])) if mode["width"] else None
         return Camera(mode["which"].removeprefix("serial:"), size, float(mode["fps"]) if mode["fps"] else None)
     name, at, rate = text.rpartition("@")
-    path, fps = (Path(name), rate) if at and not Path(text).exists() else (Path(text), "30")
-    if path.is_dir():
-        try:
-            if not 0 < float(fps) < float("inf"):
-                raise ValueError
-        except ValueError:
-            raise ValueError(f"source {text!r}: {fps!r} is no frame rate, give e.g. {path}@30") from None
-        pictures = Folder(path, float(fps))
-        _readable(pictures, text)
-        if (num := len(pictures.left)) < frames:
-            raise ValueError(
-                f"source {text!r}: the model looks at {frames} frames at once, {path} holds {num} picture{'s' * (num > 1)}:"
-                f" give {frames} or more, a video or a camera"
-            )
-        return pictures
-    if path.is_file() and path.suffix.lower() in VIDEOS:
-        return _readable(Video(path), text)
-    what = "" if path.exists() else f"there is no {path} here; "
-    raise ValueError(
-        f"source {text!r}: {what}give a camera number, /dev/videoN, serial:NAME, a video file ({', '.join(VIDEOS)}),"
-        " a folder of pictures[@fps], or sim"
-    )
-
-
-def _readable(files: Source, text: str) -> Source:
-    """``files``, or ValueError if they cannot be opened: unlike a camera, a missing file does not come back."""
-    try:
+    path, fps = (Path(name), float(rate)) if at and Path(name).is_dir() else (Path(text), 30.0)
+    if not 0 < fps < float("inf"):
+        raise ValueError(f"source {text!r}: {rate} is no frame rate")
+    if not (path.is_dir() or path.suffix.lower() in VIDEOS):
+        raise ValueError(f"source {text!r}: give a camera, a video ({', '.join(VIDEOS)}), a folder[@fps] or sim")
+    files = Folder(path, fps) if path.is_dir() else Video(path)
+    try:  # now: unlike a camera, a missing file does not come back
         files.open()
     except OSError as error:
-        raise ValueError(f"source {text!r}: {brief(error)}, give another") from None
+        raise ValueError(f"source {text!r}: {brief(error)}") from None
     files.close()
     return files

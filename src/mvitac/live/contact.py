@@ -12,7 +12,7 @@ SIDE = 32  # side in pixels of the small gray pictures in which contact is detec
 
 @dataclass(frozen=True, kw_only=True)
 class LiveConfig:
-    """Contact detection and display of live input."""
+    """Contact detection of live input."""
 
     calibration: int = 30
     """Number of first frames, without contact, from which a sensor's background and noise are learned."""
@@ -22,23 +22,12 @@ class LiveConfig:
     """Mean change in grey levels below which nothing counts as contact, however low the noise."""
     follow: float = 0.01
     """Share of the change by which the background is updated per frame while nothing is touched."""
-    min_confidence: float = 0.5
-    """Probability below which an answer is marked as unsure."""
-    frame_seconds: float | None = None
-    """Seconds between two frames of the training data, for a model of windows whose stride counts frames. None: the interval
-    of the stream itself, as measured."""
-    neighbours: int = 3
-    """Number of nearest known touches to show, if there is an index."""
 
     def __post_init__(self) -> None:
         if self.calibration < 2:
             raise ValueError(f"calibration {self.calibration}: give at least 2 frames")
-        if self.frame_seconds is not None and not 0 < self.frame_seconds < 60:
-            raise ValueError(f"frame_seconds {self.frame_seconds:g}: give seconds between two frames, 0 to 60")
         if not (self.contact > 0 and self.least_change >= 0 and 0 <= self.follow < 1):
             raise ValueError("contact must be > 0, least_change >= 0 and follow in [0, 1)")
-        if not (self.neighbours >= 1 and 0 <= self.min_confidence <= 1):
-            raise ValueError("neighbours must be >= 1 (leave --index out for none) and min_confidence in [0, 1]")
 
 
 class Contact:

@@ -25,31 +25,6 @@ NUM_AGES = 10_000
 """Number of latest predictions, some minutes of them, over which the percentiles of the age are computed."""
 
 
-@dataclass(frozen=True)
-class Reading:
-    """One predicted number of a touch, in its unit."""
-
-    name: str
-    unit: str
-    value: float
-    spread: float  # root mean squared error of test rows whose prediction was in the range of ``value``
-    low: float
-    high: float  # lowest and highest value of the touch so far
-
-    def __str__(self) -> str:
-        return f"{self._digits(self.value)} {self.unit} +- {self._digits(self.spread)}"
-
-    def over_touch(self) -> str:
-        """The range of the touch, such as '0.3 to 3.2 N +- 0.4', or '3 N +- 2' if both ends are the same in print."""
-        ends = dict.fromkeys((self._digits(self.low), self._digits(self.high)))
-        return f"{' to '.join(ends)} {self.unit} +- {self._digits(self.spread)}"
-
-    def _digits(self, value: float) -> str:
-        """``value`` with the decimals of the first digit of the spread."""
-        decimals = -math.floor(math.log10(self.spread)) if self.spread > 0 else 3
-        return f"{value:.{min(6, max(0, decimals))}f}"
-
-
 @dataclass
 class Touch:
     """One touch, from contact to release, with the sum of its predictions."""
@@ -59,16 +34,14 @@ class Touch:
     end: float | None = None
     num_frames: int = 0
     totals: dict[str, np.ndarray] = field(default_factory=dict)
-    values: dict[str, list[np.ndarray]] = field(default_factory=dict)  # task -> newest, lowest and highest values [T]
-    known: list[str] = field(default_factory=list)  # the most similar known touches, if there is an index
+    values: dict[str, np.ndarray] = field(default_factory=dict)  # task -> values [T] of the newest frame
+    known: list[str] = field(default_factory=list)  # the nearest known touches, if some were given
 
     def add(self, probabilities: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> None:
         self.num_frames += 1
         for task, p in probabilities.items():
             self.totals[task] = self.totals.get(task, 0) + p
-        for task, v in values.items():
-            _, low, high = self.values.get(task, [v, v, v])
-            self.values[task] = [v, np.minimum(low, v), np.maximum(high, v)]
+        self.values = values
 
     def answer(self, task: str, classes: Sequence[str]) -> tuple[str, float]:
         """The likeliest class so far, and its mean probability."""
@@ -94,7 +67,7 @@ class Live:
         Args:
             engine: the exported model.
             streams: one stream per camera and sensor, by modality; two touch sensors are stacked in channels.
-            config: contact detection and display.
+            config: contact detection.
             clock: time in seconds, that of the streams.
             nearest: turns the engine's outputs into descriptions of known touches.
             record: called with every pair that was used (images, columns).
@@ -230,7 +203,7 @@ class Live:
     def _back(self, stream: Stream) -> list[float]:
         """Seconds from each frame of a window to the newest."""
         window = self.engine.window or {}
-        unit = 1.0 if window["order"] == "time" else self.config.frame_seconds or stream.interval() or 0.0
+        unit = 1.0 if window["order"] == "time" else stream.interval() or 0.0
         return [k * window["stride"] * unit for k in range(window["frames"])]
 
     def _remember(self) -> None:
@@ -265,28 +238,11 @@ class Live:
         if event.what in ("resolution changed", "back") and event.stream in self.contacts:
             self._changed.add(event.stream)
 
-    def state(self, stream: Stream) -> str:
-        """State of a stream in a word: its fault, "calibrating" or "good"."""
-        contact = self.contacts.get(stream.name)
-        return stream.fault or ("calibrating" if contact and contact.background is None else "good")
-
     def answers(self, touch: Touch | None) -> dict[str, tuple[str, float]]:
         """(class, confidence) by task of a touch."""
         if touch is None or not touch.num_frames:
             return {}
         return {task: touch.answer(task, classes) for task, classes in self.engine.classes.items()}
-
-    def readings(self, touch: Touch | None) -> dict[str, list[Reading]]:
-        """The values of a touch by task: of its newest frame, with the range over the touch."""
-        if touch is None or not touch.num_frames:
-            return {}
-        return {
-            task: [
-                Reading(target["name"], target["unit"], new, spread_at(target, new), low, high)
-                for target, (new, low, high) in zip(targets, np.stack(touch.values[task], 1).tolist(), strict=True)
-            ]
-            for task, targets in self.engine.values.items()
-        }
 
     def prediction(self) -> dict[str, Any]:
         """The newest prediction of the current touch, JSON-ready; without contact, that alone."""
@@ -296,8 +252,11 @@ class Live:
         said["age_ms"] = 1000 * self.age
         for task, (name, confidence) in self.answers(self.touch).items():
             said[task] = {"class": name, "confidence": confidence}
-        for task, found in self.readings(self.touch).items():
-            said[task] = {r.name: {"value": r.value, "unit": r.unit, "spread": r.spread} for r in found}
+        for task, targets in self.engine.values.items():
+            found = zip(targets, self.touch.values[task].tolist(), strict=True)
+            said[task] = {t["name"]: {"value": v, "unit": t["unit"], "spread": spread_at(t, v)} for t, v in found}
+        if self.touch.known:
+            said["known"] = self.touch.known
         return said
 
     def summary(self) -> dict[str, Any]:

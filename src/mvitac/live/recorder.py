@@ -1,5 +1,7 @@
-"""Record live input: pairs are written to a temporary folder, the spool, and become a pack at the end
-(after a crash: later, by ``mvitac live --finish``)."""
+"""Record live input: pairs are written to a temporary folder, the spool, and become a pack at the end.
+
+After a crash the spool stays, and ``finish`` makes the pack.
+"""
 
 import io
 import shutil
@@ -38,17 +40,14 @@ class Recorder:
         ``fps`` is the maximum number of pairs per second. ``sensor`` is the name of the touch sensor, if it is known
         (column sensor).
         """
-        if not fps > 0:
-            raise ValueError(f"fps {fps:g}: give pairs a second, more than 0")
         if out.exists():
             raise ValueError(f"{out} already exists: choose another --record, or delete it first")
         check_place(out)
         self.out, self.every, self.tell, self.failed = out, 1 / fps, tell, False
-        self.spool = out.with_name(out.name + ".spool")
+        self.spool = _spool(out)
         if self.spool.exists():
-            raise ValueError(
-                f"{self.spool} holds a recording that was not finished: `mvitac live --finish {out}` finishes it"
-            )
+            how = f'python -c "from mvitac.live.recorder import finish; finish({str(out)!r})"'
+            raise ValueError(f"{self.spool} is of a recording that still runs, or crashed and is finished by {how}")
         spec = DataSpec(
             name="recording",
             vision_channels=channels.get("vision", 0),
@@ -59,7 +58,7 @@ class Recorder:
             source="mvitac live",
         )
         self.spool.mkdir(parents=True)
-        write_json(self.spool / "recording.json", {"spec": to_json(spec), "sensor": sensor})
+        write_json(self.spool / "recording.json", {"spec": to_json(spec), "sensor": sensor}, sealed=True)
         self.waiting: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = []
         self.num = 0
         self._next = float("-inf")
@@ -99,13 +98,15 @@ class Recorder:
         return finish(self.out)
 
 
-def finish(out: Path) -> int:
+def _spool(out: Path) -> Path:
+    return out.with_name(out.name + ".spool")
+
+
+def finish(out: str | Path) -> int:
     """Make ``out`` from its spool, which is then deleted; returns its number of pairs (0: nothing is made)."""
-    spool = Recorded(out.with_name(out.name + ".spool"))
-    if not spool.files:  # a crash before the first file
-        shutil.rmtree(spool.path)
-        return 0
-    num = build(spool, out, size=spool.size(), quiet=True).num
+    spool, num = Recorded(_spool(Path(out))), 0
+    if spool.files:  # none after a crash before the first
+        num = build(spool, Path(out), size=spool.size(), quiet=True).num
     shutil.rmtree(spool.path)
     return num
 
@@ -115,12 +116,10 @@ class Recorded(Source):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if not path.is_dir():
-            raise ValueError(f"{path} does not exist: there is no unfinished recording to finish")
         self.files = sorted(path.glob("*.npz"))
         meta = read_json(path / "recording.json", "an unfinished recording")
         self._spec = meta["spec"]
-        self.named = {"sensor": sensor} if (sensor := meta.get("sensor")) else {}  # older recordings have none
+        self.named = {"sensor": meta["sensor"]} if meta["sensor"] else {}
 
     def spec(self) -> DataSpec:
         return from_json(DataSpec, self._spec, "spec")

@@ -6,7 +6,7 @@ comes from a clock passed as an argument, so tests use a fake one. Frames are ui
 
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -18,6 +18,9 @@ from mvitac.system.files import brief
 
 FROZEN_AFTER, RETRY_EVERY = 1.0, 1.0
 """Seconds: how long pictures may be identical to the last byte, and between two tries to open a lost device."""
+
+
+_RECOVERED = {"unplugged": "back", "stalled": "running again", "frozen": "moving again"}  # a fault, and its end
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,6 @@ class Stream:
         self.fault: str | None = None
         self.ended = False
         self.num_frames = self.num_dropped = self.num_damaged = 0
-        self.events: Counter[str] = Counter()
         self._side, self._keep = 0, 0.0
         self._past: deque[tuple[float, np.ndarray]] = deque()
         self._lock = threading.Lock()
@@ -68,8 +70,7 @@ class Stream:
         self._taken = True
         self._open = False
         self._retry_at = float("-inf")
-        self._lost_at = self._moved_at = self._opened_at = clock()
-        self._stalled = False
+        self._moved_at = self._opened_at = clock()
         self._arrivals: deque[float] = deque(maxlen=30)
 
     def pump(self) -> None:
@@ -132,19 +133,8 @@ class Stream:
         """Report a device that has stopped giving frames; ``pump`` cannot, as it waits for the device."""
         now = self.clock()
         last = max(self._opened_at, self._newest.time) if self._newest else self._opened_at
-        if self._open and not self.ended and not self._stalled and now - last > self.stale_after:
-            self._stalled = True
+        if self._open and not self.ended and self.fault != "stalled" and now - last > self.stale_after:
             self._say("stalled", f"gives no frames since {now - last:.1f} s")
-
-    def age(self) -> float:
-        """Seconds since the newest frame was taken; infinite before the first."""
-        frame = self._newest
-        return self.clock() - frame.time if frame else float("inf")
-
-    def rate(self) -> float:
-        """Frames per second over the last thirty."""
-        arrivals = list(self._arrivals)
-        return (len(arrivals) - 1) / (arrivals[-1] - arrivals[0]) if len(arrivals) > 1 and self._open else 0.0
 
     def close(self) -> None:
         self.origin.close()
@@ -152,18 +142,15 @@ class Stream:
 
     def _take(self, image: np.ndarray) -> None:
         now, before = self.clock(), self._newest
-        if self.fault == "unplugged":
-            self._say("back", f"is back after {now - self._lost_at:.1f} s")
-        elif self._stalled:
-            self._say("running again", "gives frames again")
-        self._stalled = False
+        if self.fault in ("unplugged", "stalled"):
+            self._recovered()
         if before is None or before.image.shape != image.shape:
             if before is not None:
                 self._say("resolution changed", f"changed from {_shape(before.image)} to {_shape(image)}")
             self._moved_at = now
         elif not np.array_equal(before.image, image):
             if self.fault == "frozen":
-                self._say("moving again", f"moves again after {now - self._moved_at:.1f} s")
+                self._recovered()
             self._moved_at = now
         elif self.fault != "frozen" and now - self._moved_at >= FROZEN_AFTER:
             self._say("frozen", f"shows the same picture since {now - self._moved_at:.1f} s")
@@ -181,19 +168,20 @@ class Stream:
 
     def _lost(self, error: Exception) -> None:
         self.origin.close()
-        self._open, self._stalled = False, False
+        self._open = False
         self._retry_at = self.clock() + RETRY_EVERY
         if self.fault != "unplugged":
-            self._lost_at = self.clock()
             self._arrivals.clear()
             self._say("unplugged", f"is gone ({brief(error)}): trying again every {RETRY_EVERY:g} s")
 
+    def _recovered(self) -> None:
+        what = _RECOVERED[self.fault or ""]
+        self.fault = None
+        self._say(what, f"is {what}")
+
     def _say(self, what: str, text: str) -> None:
-        self.events[what] += 1
-        if what in ("unplugged", "frozen", "stalled", "ended"):
+        if what in (*_RECOVERED, "ended"):
             self.fault = what
-        elif what in ("back", "moving again", "running again"):
-            self.fault = None
         self.tell(Event(self.clock(), self.name, what, f"{self.name} {text}"))
 
 

@@ -1,6 +1,6 @@
-"""Figures of predicted values: predicted against true, the error by range of the true value, and values over time."""
+"""Figures of predicted values: predicted against true, and the error by range of the true value."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from mvitac.report.figures import DASHES, STYLE, legend_below, new_figure, shorten
-from mvitac.report.palette import CONTROL_GREYS, MODALITY_HUES, colour
+from mvitac.report.palette import CONTROL_GREYS, colour
 
 
 @matplotlib.rc_context(STYLE)
@@ -59,37 +59,4 @@ def error_ranges(title: str, ranges: Mapping[str, Sequence[Mapping[str, Any]]], 
     axes.grid(axis="y")
     axes.set(xlabel=f"true, {unit}", ylabel=f"mean absolute error, {unit}")
     legend_below(figure, list(handles.values()), list(handles), 3)
-    return figure
-
-
-@matplotlib.rc_context(STYLE)
-def over_time(predictions: Iterable[Mapping[str, Any]]) -> Figure:
-    """Predicted values against time, one panel per value, with a band of the usual error. A line is one touch.
-
-    ``predictions`` are lines of `mvitac live --predictions`: "time" in s, "touch", and by task the values with unit and
-    spread. ValueError if they have no values.
-    """
-    panels: dict[tuple[str, str], dict[int, list[tuple[float, float, float]]]] = {}
-    for line in predictions:
-        for task, found in line.items():
-            for name, value in found.items() if isinstance(found, Mapping) else ():
-                if isinstance(value, Mapping):
-                    label = f"{name if name == task else f'{task}: {name}'}, {value['unit']}"
-                    point = line["time"], value["value"], value["spread"]
-                    panels.setdefault((task, label), {}).setdefault(line["touch"], []).append(point)
-    if not panels:
-        raise ValueError(
-            "these predictions have no values to draw: no touch was seen, or the model predicts classes only"
-        )
-    figure = Figure(figsize=(7, 0.8 + 1.7 * len(panels)))
-    hue = colour(MODALITY_HUES["touch"])
-    each = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, ((_, label), touches) in zip(each, panels.items(), strict=True):
-        for points in touches.values():
-            times, values, spreads = np.array(points, float).T
-            axes.fill_between(times, values - spreads, values + spreads, color=hue, alpha=0.2, linewidth=0)
-            axes.plot(times, values, color=hue, linewidth=1.4, marker="o" if len(times) == 1 else None, markersize=3)
-        axes.set_ylabel(shorten(label, 28), color=colour("ink"))
-        axes.grid(axis="y")
-    each[-1].set_xlabel("time, s")
     return figure
