@@ -129,8 +129,7 @@ def play(engine: Engine, pack: Pack, rows: np.ndarray, **options: Any) -> list[d
         live.tick()
         if live.touch is None and live.last is not None and live.last is not last:
             last = live.last
-            newest = {task: seen[0] for task, seen in last.values.items()}
-            answers.append({task: total / last.num_frames for task, total in last.totals.items()} | newest)
+            answers.append({task: total / last.num_frames for task, total in last.totals.items()} | last.values)
     return answers
 
 
