@@ -171,7 +171,7 @@ def test_the_background_stands_for_the_first_frame() -> None:
         difference(np.full((1, 1, 3), 60 + k, np.uint8), np.full((1, 1, 3), 10, np.uint8))[0, 0, 0] for k in (14, 13)
     ]
     assert [level + 60 for level in found[-1]] == levels
-    with pytest.raises(ValueError, match="frames minus the first one of vision"):
+    with pytest.raises(ValueError, match="background of touch alone"):
         play(Seeing(minus_first=True, of=["touch", "vision"]), [])
 
 

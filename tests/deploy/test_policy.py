@@ -83,7 +83,7 @@ def test_tuned_encoders_get_gradients_but_keep_their_batchnorm(model: Model, pac
 def test_what_does_not_fit_is_named(model: Model, pack: Pack) -> None:
     with pytest.raises(ValueError, match="no smell encoder"):
         ObservationEncoder(model, {"a": "smell"})
-    with pytest.raises(ValueError, match=r"takes 1 image\(s\), 2 given: left, right"):
+    with pytest.raises(ValueError, match=r"takes 1 image\(s\), given: left, right"):
         ObservationEncoder(model, {"left": "touch", "right": "touch"})
     encoder = ObservationEncoder(model, KEYS, state=2)
     seen = observe(pack, [0])

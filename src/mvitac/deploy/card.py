@@ -38,7 +38,7 @@ def card(model: Model, about: dict[str, Any]) -> str:
             leaks=list(dict.fromkeys(probe.info.leak for probe in model.probes.values() if probe.info.leak)),
             covered=covered(scores["group_by"], [{"source": "run", "seed": 0}]),
             given=about["preprocessing"],
-            start=about.get("start"),
+            start=about["start"],
         )
 
 

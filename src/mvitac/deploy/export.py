@@ -103,9 +103,7 @@ def export(
     if new and not len(rows):
         rows = np.flatnonzero(np.logical_and.reduce([new.has(modality) for modality in asked]))
     if not len(rows):
-        raise ValueError(
-            f"{pack.path} has no rows in split test: an export is checked on rows that no probe was fitted on"
-        )
+        raise ValueError(f"{pack.path} has no rows in split test, which no probe was fitted on, to check the export")
     rows = sample(rows, config.num_rows)
     with new_folder(out) as partial:
         with work("writing ONNX"), silent():
@@ -124,10 +122,8 @@ def _check_fits(model: Model, pack: Pack, modality: str) -> None:
     channels, difference = model.spec.channels(modality), modality == "touch" and model.spec.difference
     fits = (modality in pack.spec.modalities, pack.spec.channels(modality) == channels, pack.size == model.stored)
     if not all(fits) or (difference and not pack.spec.difference):
-        raise ValueError(
-            f"{pack.path} cannot check this model: it needs {modality} images of {channels} channels"
-            f" at {model.stored} px{' minus their background' * difference}, as the training data has"
-        )
+        what = f"{channels} channels at {model.stored} px{' minus their background' * difference}"
+        raise ValueError(f"{pack.path} cannot check this model: it needs {modality} images of {what}")
 
 
 def _examples(graph: ExportModule, pack: Pack) -> list[list[np.ndarray]]:

@@ -40,10 +40,8 @@ class ObservationEncoder(nn.Module):
             self.keys.setdefault(modality, []).append(key)
         for modality, names in self.keys.items():
             if 3 * len(names) != model.spec.channels(modality):
-                raise ValueError(
-                    f"the {modality} encoder takes {model.spec.channels(modality) // 3} image(s), {len(names)} given:"
-                    f" {', '.join(names)}"
-                )
+                wanted = model.spec.channels(modality) // 3
+                raise ValueError(f"the {modality} encoder takes {wanted} image(s), given: {', '.join(names)}")
         self.encoders = nn.ModuleDict({m: model.encoders[m] for m in self.keys})
         self.stored, self.state, self.tune, self._input = model.stored, state, tune, model.input
         self._checked: set[str] = set()

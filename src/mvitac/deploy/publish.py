@@ -134,9 +134,7 @@ def _controls(model: Model, pack: Pack, records: Records) -> Records:
 
 
 def own_data(model: Model, instead: str) -> Pack:
-    """The data ``model`` was trained on; the ValueError where it is missing ends with ``instead``, what to do."""
-    if model.foreign and model.run.data.names_a_place:
-        raise ValueError(f"the data of an artifact is not opened, as the artifact may be a stranger's: {instead}")
+    """The data ``model`` was trained on; the ValueError where it cannot be opened ends with ``instead``, what to do."""
     try:
         return model.open_data()
     except ValueError as error:
@@ -175,30 +173,21 @@ def publish(run: Path, out: Path, pack: Pack | None = None, *, allow_leak: bool 
         _, record = load_run(run)
         pack = as_trained(model, pack) if pack else own_data(model, "fit the probes on a pack, --on PACK")
         learned, scores = _fit_and_score(run, model, pack, allow_leak)
-        model.spec = replace(model.spec, sensors=_sensors(model, pack))
-        _write_weights(model, partial)
+        met = sensors_of(pack, pack.rows("train", "val", "unlabelled"))  # by the probes, if not by the encoders
+        model.spec = replace(model.spec, sensors=tuple(sorted({*model.spec.sensors, *met})))
+        model.save(partial / "model.safetensors")
+        if model.probes:
+            tensors = {f"{r.info.name}.{k}": v for r in model.probes.values() for k, v in r.state_dict().items()}
+            data = safetensors.torch.save(tensors)
+            write_atomic(partial / "probes.safetensors", lambda file: file.write(data))
         write_json(partial / "run.json", record, sealed=True)
         if learned is not None:
             write_sources(partial, learned)
-        start = {"start": start} if (start := record.get("start")) else {}
-        about = {**_describe(model, pack), **start, "scores": scores}
+        about = {**_describe(model, pack), "start": record.get("start"), "scores": scores}
         write_atomic(partial / "README.md", lambda file: file.write(card(model, about).encode()))
         ARTIFACT.write(partial, about)
         read(partial)
     return out
-
-
-def _write_weights(model: Model, folder: Path) -> None:
-    model.save(folder / "model.safetensors")
-    if model.probes:
-        tensors = {f"{r.info.name}.{k}": v for r in model.probes.values() for k, v in r.state_dict().items()}
-        data = safetensors.torch.save(tensors)
-        write_atomic(folder / "probes.safetensors", lambda file: file.write(data))
-
-
-def _sensors(model: Model, pack: Pack) -> tuple[str, ...]:
-    """Names of the touch sensors that the encoders of ``model`` met, as far as that is known, or its probes."""
-    return tuple(sorted({*model.spec.sensors, *sensors_of(pack, pack.rows("train", "val", "unlabelled"))}))
 
 
 def _describe(model: Model, pack: Pack) -> dict[str, Any]:
@@ -222,8 +211,5 @@ def push(artifact: Path, repo: str, *, private: bool = False) -> str:
     try:
         address = model.push_to_hub(repo, private=private, commit_message=f"{model.run.method.name} by mvitac publish")
     except Exception as error:  # offline, no login, no right to write: the client has an exception for each
-        raise ValueError(
-            f"{repo} could not be written on the Hugging Face Hub ({brief(error)}): check the network and the login"
-            f" (`hf auth login`); the artifact itself is complete, in {artifact}"
-        ) from None
+        raise ValueError(f"{artifact} is complete, but {repo} cannot be written on the Hub: {brief(error)}") from None
     return str(address)

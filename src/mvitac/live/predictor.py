@@ -279,10 +279,7 @@ def _check_window(engine: Engine) -> None:
     """ValueError if the model looks at differences that live input does not have."""
     window = engine.window
     if window and window["minus_first"] and (engine.difference or "vision" in window["of"]):
-        raise ValueError(
-            "live: this model looks at frames minus the first one of vision, or of touch minus a background already: live"
-            " knows the background of touch alone; train it with --data.frames-of touch and without --subtract-background"
-        )
+        raise ValueError("live learns the background of touch alone: not that of vision, nor frames minus it twice")
 
 
 def _check_inputs(engine: Engine, streams: dict[str, Sequence[Stream]]) -> None:
@@ -290,9 +287,6 @@ def _check_inputs(engine: Engine, streams: dict[str, Sequence[Stream]]) -> None:
     for modality, (_, _, channels) in frame_shapes(engine).items():
         given, wanted = len(streams.get(modality, ())), channels // 3
         if given != wanted:
-            raise ValueError(
-                f"the model takes {wanted} {modality} stream(s), {given} given:"
-                f" give {wanted} --{modality} (or export a model with other inputs)"
-            )
+            raise ValueError(f"the model takes {wanted} {modality} stream(s), {given} given")
     if extra := set(streams) - set(engine.inputs):
         raise ValueError(f"the model has no input for {', '.join(sorted(extra))}: leave it out")
