@@ -75,7 +75,6 @@ class Node:
         }
         # Live does not return embeddings, so the last outputs of the engine are kept to publish them.
         self.live = Live(Kept(engine, self.outputs), self.streams, clock=clock, tell=lambda event: warn(event.text))  # type: ignore[arg-type]
-        self.touched = False
 
     def image(self, modality: str, message: Any, which: int = 0) -> None:
         """Take one Image message, and publish if there is a new prediction."""
@@ -85,14 +84,12 @@ class Node:
 
     def tick(self) -> None:
         """Publish new results. Also called by a timer, because a topic that stops sends no message."""
-        predicted, before = self.live.tick(), self.touched
-        self.touched = self.live.touch is not None
-        if predicted:
-            self.publish("prediction", json.dumps(self.live.prediction()))
+        said = self.live.step()
+        if said:
+            self.publish("prediction", json.dumps(said))
+        if said and said["contact"]:
             names = [n for n in self.outputs if n.startswith("embedding_")]
             self.publish("embedding", np.concatenate([self.outputs[n][0] for n in names]).tolist())
-        elif before and not self.touched:
-            self.publish("prediction", json.dumps(self.live.prediction()))
 
 
 class Kept:

@@ -104,13 +104,11 @@ def _run(loop: Live, seconds: float | None, write: Callable[[Any], object]) -> N
     """Predict until all streams ended, ``seconds`` are over, or Ctrl-C; ``write`` gets every prediction and release."""
     start = loop.clock()
     with _capture(loop) as news:
-        touched = False
         while loop.clock() - start < (seconds or float("inf")) and not all(s.ended for s in loop.all):
             news.wait(0.05)
             news.clear()
-            predicted, before, touched = loop.tick(), touched, loop.touch is not None
-            if predicted or (before and not touched):
-                write({"time": round(loop.clock() - start, 4), **loop.prediction()})
+            if said := loop.step():
+                write({"time": round(loop.clock() - start, 4), **said})
     loop.finish()
 
 

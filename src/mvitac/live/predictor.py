@@ -132,6 +132,11 @@ class Live:
             self.record(images, {"time": now, "contact": bool(self.contact), "touch_number": self.num_touches})
         return bool(self.contact)
 
+    def step(self) -> dict[str, Any] | None:
+        """``tick``, and what is new: a prediction, or that a touch has ended, JSON-ready; else None."""
+        before = self.touch is not None
+        return self.prediction() if self.tick() or (before and self.touch is None) else None
+
     def _all_fresh(self, frames: dict[str, list[Frame | None]], now: float) -> bool:
         """Whether every stream has a frame that shows the present; an old one would give an answer about the past."""
         return all(
