@@ -1,4 +1,4 @@
-"""Windows of 1, 2, 4 and 8 frames, and slip as an event, without training (docs/results/time.md).
+"""Windows of 1, 2, 4 and 8 frames, without training (docs/results/time.md).
 
     python examples/real_manifests.py DATA MANIFESTS
     python examples/time_windows.py MANIFESTS slip_gsmini OUT.json
@@ -20,15 +20,13 @@ import numpy as np
 import pyarrow as pa
 
 from mvitac.data.pack import Pack
-from mvitac.data.spec import Event
 from mvitac.datasets.folder import FolderConfig
 from mvitac.evaluation.controls import thumbnails
-from mvitac.evaluation.events import with_event
 from mvitac.evaluation.intervals import interval, paired_difference
 from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.probe import probe_features, split_rows
-from mvitac.evaluation.score_text import lead_text, percent, with_interval
-from mvitac.evaluation.scores import event_of, pool
+from mvitac.evaluation.score_text import percent, with_interval
+from mvitac.evaluation.scores import pool
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from mvitac.system.files import read_json, write_json
@@ -42,7 +40,6 @@ SETS: dict[str, dict[str, Any]] = {
             "frames since the start": ("frame",),
         },
         "folds": 3,
-        "event": Event(happens="1", clock="frame", fps=25.0),
     },
     "slip_grasp": {
         "options": {
@@ -53,13 +50,11 @@ SETS: dict[str, dict[str, Any]] = {
         },
         "columns": {"width": ("width_mm",), "width in sweep": ("width_in_sweep",)},
         "folds": 6,
-        "event": Event(happens="0"),
     },
     "physiclear": {  # the split of docs/results/real.md, by group
         "options": {"touch": ("touch",), "labels": ("material", "hardness", "roughness"), "touch_group": "video"},
         "columns": {"contact energy": ("contact_energy",)},
         "folds": 0,
-        "event": None,
     },
 }
 WINDOWS, SEEDS = (1, 2, 4, 8), (0, 1, 2)
@@ -78,16 +73,13 @@ def folds_of(pack: Pack, num: int) -> Iterator[Pack]:
         yield pack
 
 
-def scored(
-    pack: Pack, num_folds: int, about: dict[str, Any], x: np.ndarray, event: Event | None = None
-) -> list[dict[str, Any]]:
-    """Records of a linear probe on features ``x`` [rows, D] for each task, pooled over the folds; also of its event."""
+def scored(pack: Pack, num_folds: int, about: dict[str, Any], x: np.ndarray) -> list[dict[str, Any]]:
+    """Records of a linear probe on features ``x`` [rows, D] for each task, pooled over the folds."""
     folds = []
     for fold in folds_of(pack, num_folds):
         records = []
         for task in fold.spec.tasks:
             rows = split_rows(fold, task)
-            task = with_event(task, event) if event else task
             found = probe_features(x[rows.all], fold, task, rows, "linear", about["seed"] or 0)
             records.append({**about, "task": task.name, "modality": "touch", "probe": "linear", **found})
         folds.append(records)
@@ -142,22 +134,15 @@ def cases(
             yield f"untrained, mean {frames}", seed, lambda o=options, p=pack, s=seed: (p, untrained(o, p, "mean", s))
 
 
-def show(kept: dict[str, list[dict[str, Any]]], task: str, event: bool) -> None:
+def show(kept: dict[str, list[dict[str, Any]]], task: str) -> None:
     """Print every source with its interval, and its difference to the untrained trunk on single frames."""
     by_source: dict[str, list[dict[str, Any]]] = {}
-    for record in (record for records in kept.values() for record in records if ("event" in record) == event):
+    for record in (record for records in kept.values() for record in records):
         if record["task"] == task:
             by_source.setdefault(record["source"], []).append(record)
     if not (base := by_source.get("untrained 1")):
         return
     for source, records in by_source.items():
-        if event:
-            found = event_of([record["event"] for record in records])
-            ends = [
-                with_interval(*(found[k][end] for end in ("mean", "low", "high"))) for k in ("detected", "false_alarms")
-            ]
-            print(f"{source:34} {ends[0]:20} {ends[1]:20} {lead_text(found):30} {found['auroc']:.2f}")
-            continue
         mean, low, high, p = paired_difference(records, base)
         auroc = [r["auroc"] for r in records if r["auroc"] is not None]
         rank = f"{np.mean(auroc):.2f}" if auroc else ""
@@ -172,29 +157,19 @@ def main(manifests: Path, name: str, out: Path) -> None:
     config = FolderConfig(**shared, **about["options"], title=name)
     kept: dict[str, list[dict[str, Any]]] = read_json(out, "scores") if out.exists() else {}
 
-    def score(source: str, seed: int | None, features: Any, event: Event | None = None) -> None:
-        if (key := f"{'event ' if event else ''}{source} seed {seed}") in kept:
+    def score(source: str, seed: int | None, features: Any) -> None:
+        if (key := f"{source} seed {seed}") in kept:
             return
         pack, x = features()
-        kept[key] = scored(pack, about["folds"], {"source": source, "seed": seed}, x, event)
+        kept[key] = scored(pack, about["folds"], {"source": source, "seed": seed}, x)
         write_json(out, kept)
         print(key, *(percent(r["accuracy"]) for r in kept[key]), flush=True)
 
     def print_all() -> None:
         for task in config.labels:
             print(f"\n{task}: accuracy %, AUROC, difference to the untrained trunk on single frames and its p")
-            show(kept, task, event=False)
-        print("\nevent: detected %, false alarms %, first alarm before the end, AUROC of recordings", flush=True)
-        show(kept, config.labels[0], event=True)
+            show(kept, task)
 
-    if about["event"]:  # of all frames, also those after the ones to predict from
-        asked = [
-            *about["columns"],
-            *(f"{kind} {n}" for kind in ("pixels", "untrained") for n in ("1", "4, minus first")),
-        ]
-        for case in cases(replace(config, label_only=()), about["columns"], 0):
-            if case[0] in asked and not case[1]:  # one seed
-                score(*case, event=about["event"])
     for case in cases(config, about["columns"], FIXED.get(name, 0)):
         score(*case)
     print_all()

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec, Target, listed
 from mvitac.methods.base import Method
-from mvitac.nn.encoders import last_map, num_features, timm_trunk
+from mvitac.nn.encoders import num_features, timm_trunk
 from mvitac.nn.linear_probe import LinearProbe, ProbeInfo, ValueInfo
 from mvitac.nn.weights import safetensors_digest, write_model
 from mvitac.registry import to_json, unknown
@@ -185,11 +185,6 @@ class Model(nn.Module):
         check_images(images, self.spec.channels(modality), modality)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
             return self._encode(modality, images, for_heads)
-
-    @torch.no_grad()
-    def last_map(self, modality: str, images: Tensor) -> Tensor:
-        """Places [B, P, D] of the trunk's last map (``nn.encoders.last_map``), of images as in ``features``."""
-        return last_map(self.encoders[modality], self.input(modality, images))
 
     @torch.no_grad()
     def project(self, modality: str, features: Tensor) -> Tensor:

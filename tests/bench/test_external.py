@@ -10,13 +10,12 @@ from typing import Any
 import pytest
 import safetensors.torch
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mvitac.bench.external.base import OpenEncoder, open_encoder, parse, randomised
 from mvitac.bench.external.preprocessing import Preprocessing
 from mvitac.bench.external.tower import Tower
-from support.owners import OWNERS, D, sparsh, tvl
+from support.owners import OWNERS, tvl
 
 
 @pytest.mark.parametrize("owner", OWNERS)
@@ -156,16 +155,3 @@ def test_random_weights_for_the_control_leave_the_encoder_as_it_is(tmp_path: Pat
     for name, value in untrained.encoder.network.state_dict().items():
         assert torch.equal(value, again[name]) and (value.ndim < 2 or not torch.equal(value, before[name]))
     assert open_encoder("external:timm/mvitac_tiny,weights=random,size=32").untrained() is None
-
-
-def test_maps_are_pooled_over_each_step_of_time(tmp_path: Path) -> None:
-    text, _ = sparsh(tmp_path, video=True)
-    encoder = open_encoder(f"{text.rsplit(',', 1)[0]},size=160x128").encoder
-    images = torch.rand(2, 3, 160, 128)
-    found = encoder.last_map(images)
-    whole = encoder.network.forward_features(encoder._prepared(images))  # type: ignore[operator]
-    assert whole.shape == (2, 1 + 2 * 10 * 8, D) and found.shape == (2, 1 + 2 * 7 * 7, D)
-    assert torch.equal(found[:, 0], whole[:, 0])
-    later = whole[:, 81:].mT.unflatten(2, (10, 8))
-    expected = F.adaptive_avg_pool2d(later, 7).flatten(2).mT
-    torch.testing.assert_close(found[:, 50:], expected)

@@ -89,7 +89,7 @@ def engine(run: Path, old: Pack, new: Pack, tmp_path_factory: pytest.TempPathFac
 
 def by_the_probe(model: Model, both: Pack, rows: np.ndarray) -> dict[str, np.ndarray]:
     """The answers of the probes on both modalities, on features of ``probe --standardise colours``."""
-    z = [touch_features(model, both, m, rows, ("colours",), maps=False) for m in ("vision", "touch")]
+    z = [touch_features(model, both, m, rows, ("colours",)) for m in ("vision", "touch")]
     x = torch.from_numpy(np.concatenate(z, axis=1))
     return {probe.info.task: probe(x).numpy() for probe in model.probes.values() if probe.info.modality == "both"}
 

@@ -89,3 +89,9 @@ def test_a_feature_that_is_hardly_there_in_the_fitted_rows_does_not_decide_the_l
     y = x[:, :1] + 0.3 * torch.randn(200, 1, generator=rng)
     error = d.linear_probe(x, y, torch.arange(200) // 4, new) - new[:, :1]
     assert float(error.abs().max()) < 1
+
+
+def test_an_r2_far_below_0_weighs_no_more_than_a_few_accuracies() -> None:
+    assert d.mean_error([[0.9], [0.6]]) == pytest.approx((0.1 * 0.4) ** 0.5)
+    assert d.mean_error([[1.0], [0.5, 0.98]]) == pytest.approx((0.01 * (0.5 * 0.02) ** 0.5) ** 0.5)
+    assert d.mean_error([[0.95], [-403.7]]) < d.mean_error([[0.1], [-300.0]])

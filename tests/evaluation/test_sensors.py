@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-import torch
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
@@ -30,7 +29,6 @@ from mvitac.evaluation.sensors import (
     sensors_of,
     touch_features,
     unlabelled_rows,
-    with_statistics,
 )
 from mvitac.model import Model
 from mvitac.model_files import load
@@ -151,7 +149,7 @@ def test_a_joined_pack_reads_only_images_that_no_probe_has_read(
 
 def test_features_are_standardised_by_each_sensors_own_images(model: Model, others: Pack) -> None:
     rows = others.rows("test")
-    found = touch_features(model, others, "touch", rows, ("features",), maps=False)
+    found = touch_features(model, others, "touch", rows, ("features",))
     for number in (0, 1):
         seen = features(model, others, "touch", unlabelled_rows(others, number))
         own = others.sensors[rows] == number
@@ -162,34 +160,8 @@ def test_features_are_standardised_by_each_sensors_own_images(model: Model, othe
         ("touch", ()),
         ("touch", ("colours",)),
     ):  # colours: no new sensor here
-        plain = touch_features(model, others, modality, rows, kinds, maps=False)  # type: ignore[arg-type]
+        plain = touch_features(model, others, modality, rows, kinds)  # type: ignore[arg-type]
         np.testing.assert_allclose(plain, features(model, others, modality, rows), rtol=1e-5, atol=1e-6)
-    maps = touch_features(model, others, "touch", rows, ("features",), maps=True)
-    assert maps.ndim == 3 and np.abs(maps.mean((0, 1))).mean() < 0.3
-
-
-def test_batch_norm_takes_the_statistics_of_the_given_images(model: Model, others: Pack) -> None:
-    rows, trunk = np.arange(48), model.encoders["touch"]
-    before = copy.deepcopy(trunk.state_dict())
-    made = with_statistics(model, others, rows)
-    names = [n for n, layer in trunk.named_modules() if isinstance(layer, torch.nn.BatchNorm2d)]
-    first = made.encoders["touch"].get_submodule(names[0])
-    inputs: list[torch.Tensor] = []
-    hook = trunk.get_submodule(names[0]).register_forward_hook(lambda _, given, out: inputs.append(given[0]))
-    images = torch.from_numpy(others.images["touch"][rows]).permute(0, 3, 1, 2)
-    with torch.no_grad():
-        trunk(model.input("touch", images))
-    hook.remove()
-    torch.testing.assert_close(first.running_mean, inputs[0].mean((0, 2, 3)))
-    assert not made.encoders["touch"].training
-    for name, value in trunk.state_dict().items():
-        assert torch.equal(value, before[name]), name  # the model itself is as it was
-        if "running" not in name and "num_batches" not in name:
-            assert torch.equal(made.encoders["touch"].state_dict()[name], value), name
-    found = touch_features(model, others, "touch", others.rows("test"), ("batch-norm",), maps=False)
-    own = others.sensors[others.rows("test")] == 1
-    anew = with_statistics(model, others, unlabelled_rows(others, 1))
-    np.testing.assert_allclose(found[own], features(anew, others, "touch", others.rows("test")[own]), rtol=1e-5)
 
 
 def test_new_sensors_are_shown_as_each_known_one(
@@ -207,10 +179,10 @@ def test_new_sensors_are_shown_as_each_known_one(
         np.testing.assert_array_equal(look.images["vision"][120:], others.images["vision"])
     assert len({both.digest, *(look.digest for look in both.looks)}) == 3  # features are cached by it
     rows = np.concatenate([both.rows("val"), both.rows("test")])
-    found = touch_features(model, both, "touch", rows, ("colours",), maps=False)
+    found = touch_features(model, both, "touch", rows, ("colours",))
     each = [features(model, look, "touch", rows) for look in both.looks]
     np.testing.assert_allclose(found, (each[0] + each[1]) / 2, rtol=1e-4, atol=1e-5)
-    both_kinds = touch_features(model, both, "touch", rows, ("features", "colours"), maps=False)
+    both_kinds = touch_features(model, both, "touch", rows, ("features", "colours"))
     seen = np.mean([features(model, look, "touch", unlabelled_rows(both, 2)) for look in both.looks], axis=0)
     new = rows >= 120
     np.testing.assert_allclose(

@@ -5,18 +5,19 @@ from __future__ import annotations
 import io
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import sensors
+from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import check_unseen
 from mvitac.evaluation.probe import probe_model
 from mvitac.experiments.adapt import COLOURED, NEW, OLD, TRANSFER, Adaptation, _old_packs, _scores, adapt
@@ -103,20 +104,21 @@ def test_a_loss_against_the_frozen_probe_is_said_with_what_to_do(lost: bool) -> 
 
 
 def tried_in(folder: Path) -> dict[str, float]:
-    """Score by settings, without the digest of the run."""
-    return {name.split(" (")[0]: score for name, score in read_json(folder / "choice.json", "").items()}
+    """Error by settings, without the digest of run and data."""
+    tried = read_json(folder / "choice.json", "").items()
+    return {name.split(" (")[0]: mean_error(scores.values()) for name, scores in tried}
 
 
 def test_settings_are_the_best_on_held_out_groups(tuned: Path) -> None:
     chosen = json.loads((tuned / "scores.json").read_text())["chosen"]
     for fraction, folder in (("40", tuned / "40-percent"), ("100", tuned)):
-        assert len(tried := tried_in(folder)) == 5  # two rates and random heads; two rates from scratch
+        assert len(tried := tried_in(folder)) == 4  # two rates, also from scratch
         for kind, best in chosen[fraction].items():
-            name = f"{kind}: lr {best['lr']}, steps {best['steps']}, heads_from {best['heads_from']}"
-            assert tried[name] == max(score for other, score in tried.items() if other.startswith(kind))
+            name = f"{kind}: lr {best['lr']}, steps {best['steps']}"
+            assert tried[name] == min(error for other, error in tried.items() if other.startswith(kind))
             run, _ = load_run(folder / ("scratch/seed0" if kind == SCRATCH else "seed0"))
             assert (run.optim.lr, run.steps) == (best["lr"], best["steps"])
-            assert run.method.heads_from == best["heads_from"] and not run.method.hold_out  # type: ignore[attr-defined]
+            assert not run.method.hold_out  # type: ignore[attr-defined]
 
 
 def edited(pack: Pack, to: Path, **columns: Any) -> Path:
@@ -139,7 +141,7 @@ def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp
     other = Pack(edited(pack, tmp_path / "other", label_pattern=next_class_in_test))
     assert other.digest != pack.digest
     result = tune(ancestor, other, tmp_path / "out", replace(ASKED, from_scratch=False))
-    assert len(tried := tried_in(tmp_path / "out")) == 3 and tried.items() <= tried_in(tuned).items()
+    assert len(tried := tried_in(tmp_path / "out")) == 2 and tried.items() <= tried_in(tuned).items()
     assert_equal_weights(tmp_path / "out" / "seed0", tuned / "seed0")
     before = json.loads((tuned / "scores.json").read_text())["records"]
     right = [
@@ -150,7 +152,7 @@ def test_test_labels_decide_nothing(ancestor: Path, pack: Pack, tuned: Path, tmp
 
 
 @pytest.mark.usefixtures("often")
-@pytest.mark.parametrize("after", [4, 10])  # while settings are tried, and in the final run
+@pytest.mark.parametrize("after", [4, 7])  # while settings are tried, and in the final run
 def test_killed_and_resumed_equals_straight(
     ancestor: Path, pack: Pack, tuned: Path, tmp_path: Path, after: int
 ) -> None:
@@ -166,6 +168,18 @@ def test_killed_and_resumed_equals_straight(
     for record in result["records"]:
         same = next(r for r in straight if r["source"] == record["source"])
         assert record["group_correct"] == same["group_correct"]
+
+
+def test_what_was_tried_on_other_labels_is_tried_again(ancestor: Path, pack: Pack, tmp_path: Path) -> None:
+    asked, out = replace(ASKED, from_scratch=False), tmp_path / "out"
+    changing = Pack(edited(pack, tmp_path / "data"))
+    with power_cut(4), pytest.raises(RuntimeError, match="power cut"):
+        tune(ancestor, changing, out, asked)
+    (first,) = tried_in(out)
+    shutil.rmtree(changing.path)
+    edited(pack, changing.path, label_pattern=lambda row: (row["label_pattern"] + 1) % 3)
+    tune(ancestor, Pack(changing.path), out, asked, resume=True)
+    assert [name.split(" (")[0] for name in read_json(out / "choice.json", "")].count(first) == 2
 
 
 def test_the_frozen_probe_is_that_of_mvitac_probe_with_all_labels(ancestor: Path, pack: Pack, tuned: Path) -> None:
@@ -197,9 +211,7 @@ def test_bad_input_is_refused_before_anything_is_written(
     refuse(capsys, command(pack.path)[:1] + command(pack.path)[2:], "name the model")
     refuse(capsys, command(pack.path, "--labels", "x"), "unknown task 'x': choose from pattern, bright")
     refuse(capsys, command(pack.path, "--values", "force"), "unknown task 'force'")
-    refuse(capsys, command(pack.path, "--lr", "1e-3", "1e-3"), "at least one number, and none twice")
-    refuse(capsys, command(pack.path, "--fractions", "0"), "in percent, above 0")
-    refuse(capsys, command(pack.path, "--rank", "0"), "rank 0: give 1 to 65536")
+    refuse(capsys, command(pack.path, "--fractions", "0"), "share 0.0: give a share of the groups, above 0")
     single = edited(
         pack, tmp_path / "single", label_pattern=lambda row: 0 if row["split"] != "test" else row["label_pattern"]
     )
@@ -251,17 +263,10 @@ def darker(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return build(Darker(), tmp_path_factory.mktemp("darker") / "pack", size=32, workers=1, quiet=True)
 
 
-def test_statistics_alone_change_statistics_alone(
-    ancestor: Path, pack: Pack, bare: Pack, darker: Pack, tmp_path: Path
+def test_before_and_after_are_scored_on_new_and_old_data(
+    ancestor: Path, pack: Pack, darker: Pack, tmp_path: Path
 ) -> None:
-    result = adapted(ancestor, darker, tmp_path / "out", Adaptation(steps=0, batches=4))
-    old, new = weights(ancestor), weights(tmp_path / "out")
-    changed = {name for name, value in new.items() if not torch.equal(value, old[name])}
-    assert changed == {name for name in new if "running_" in name or name.endswith("num_batches_tracked")}
-    adapted(ancestor, bare, tmp_path / "same", Adaptation(steps=0, batches=4, old=bare.path))
-    same = weights(tmp_path / "same")
-    means = [name for name in new if name.endswith("running_mean")]
-    assert all(torch.equal(new[name], same[name]) == ("vision" in name) for name in means)  # the camera is the same
+    result = adapted(ancestor, darker, tmp_path / "out", Adaptation(steps=1))
     cells = {(r["data"], r["task"], r["modality"], r["source"]) for r in result["records"]}
     assert {d for d, *_ in cells} == {NEW, OLD, TRANSFER} and len(cells) == len(result["records"])
     assert (NEW, "R@5", "touch -> vision", "after") in cells and (TRANSFER, "pattern", "both", "before") in cells
@@ -275,7 +280,7 @@ def test_statistics_alone_change_statistics_alone(
 def test_a_run_in_bf16_adapts(pack: Pack, bare: Pack, tmp_path: Path) -> None:
     """The precision of most recipes where the processor has it; every processor computes it."""
     start = train(smoke(pack, eval_every=0, precision="bf16"), tmp_path / "start", quiet=True)
-    adapted(start, bare, tmp_path / "out", Adaptation(steps=2, batches=2, old=bare.path))
+    adapted(start, bare, tmp_path / "out", Adaptation(steps=2, old=bare.path))
     assert all(bool(value.isfinite().all()) for value in weights(tmp_path / "out").values())
 
 
@@ -319,17 +324,14 @@ def no_label(row: dict[str, Any]) -> int:
 
 @pytest.mark.usefixtures("often")
 def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tmp_path: Path) -> None:
-    asked = Adaptation(steps=4, batches=3, old=bare.path)
+    asked = Adaptation(steps=4, old=bare.path)
     straight = adapted(ancestor, bare, tmp_path / "straight", asked)
-    with power_cut(5), pytest.raises(RuntimeError, match="power cut"):
+    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):
         adapted(ancestor, bare, tmp_path / "cut", asked)
     assert (tmp_path / "cut" / "checkpoint.pt").exists()
     result = adapted(ancestor, bare, tmp_path / "cut", asked, resume=True)
     assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
     assert result["records"] == straight["records"]
-    with power_cut(2), pytest.raises(RuntimeError, match="power cut"):  # among the statistics
-        adapted(ancestor, bare, tmp_path / "early", asked)
-    assert not (tmp_path / "early").exists() or not list((tmp_path / "early").iterdir())
     old, _ = load_run(ancestor)
     run, record = load_run(tmp_path / "straight")
     assert run.method == old.method and run.optim.lr == pytest.approx(old.optim.lr / 10)
@@ -339,7 +341,7 @@ def test_adapt_killed_and_resumed_equals_straight(ancestor: Path, bare: Pack, tm
 def test_unlabelled_data_is_scored_by_retrieval(
     ancestor: Path, bare: Pack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 0 --batches 2".split()
+    command = f"adapt {ancestor} --data pack --data.path {bare.path} --steps 1".split()
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     records = json.loads((tmp_path / "out" / "adapted.json").read_text())["records"]
     assert {(r["data"], r["task"]) for r in records if r["data"] == NEW} == {(NEW, "R@5")}
@@ -357,13 +359,8 @@ def test_bad_input_of_adapt(ancestor: Path, pack: Pack, tmp_path: Path, capsys: 
     six = toy_pack(tmp_path / "six", touch_channels=6)
     refuse(capsys, command(six.path), "cannot embed this data's touch (6 channels)")
     single = toy_pack(tmp_path / "single", vision_channels=0)
-    refuse(
-        capsys,
-        command(single.path),
-        "trained with vision, which the data lacks",
-        "--init.modalities touch --renew-norms 16`",
-    )
-    refuse(capsys, command(pack.path, "--steps", "0", "--batches", "0"), "steps 0: give at least 1")
+    refuse(capsys, command(single.path), "trained with vision, which the data lacks")
+    refuse(capsys, command(pack.path, "--steps", "0"), "steps 0: give at least 1")
     refuse(capsys, command(pack.path, "--lr", "0"), "optim lr 0")
     refuse(capsys, command(pack.path, "--old", str(tmp_path / "none")), "no pack at")
     assert not out.exists()

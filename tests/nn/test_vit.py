@@ -7,7 +7,7 @@ import timm
 import torch
 from timm.models.vision_transformer import VisionTransformer
 
-from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk, last_map
+from mvitac.nn.encoders import SCRATCH, EncoderConfig, build_trunk
 from mvitac.nn.positions import sin_cos_positions
 from mvitac.nn.vit import encode_visible, patches, row_uniform
 
@@ -18,9 +18,8 @@ def test_a_vit_takes_images_of_any_size(channels: int) -> None:
     vit = build_trunk(EncoderConfig(trunk="mvitac_tiny_vit", weights=SCRATCH), channels).eval()
     assert isinstance(vit, VisionTransformer)
     images = torch.randn(2, channels, 72, 72)
-    for size, places in ((64, 49), (72, 49), (48, 36), (50, 49), (16, 4)):
+    for size in (64, 72, 48, 50, 16):
         assert vit(images[:, :, :size, :size]).shape == (2, 64)
-        assert last_map(vit, images[:, :, :size, :size]).shape == (2, places, 64)
     fixed = VisionTransformer(64, 8, channels, 0, "avg", 64, 2, 2, class_token=False, fc_norm=False).eval()
     fixed.load_state_dict(vit.state_dict())
     torch.testing.assert_close(vit(images[:, :, :64, :64]), fixed(images[:, :, :64, :64]))

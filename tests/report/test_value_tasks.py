@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import csv
 import io
 import json
@@ -13,7 +12,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from matplotlib.figure import Figure
 
@@ -25,13 +23,11 @@ from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import split_rows
-from mvitac.evaluation.robustness import DROPOUT, LEAK, NOISE, SHARES, stress
 from mvitac.evaluation.score_text import cell_text
 from mvitac.evaluation.scores import summarise, summarise_again
 from mvitac.experiments import table_formats
 from mvitac.experiments.plan import Plan, Row
 from mvitac.experiments.table import lines_of, target_lines
-from mvitac.model_files import load
 from mvitac.recipes import recipe
 from mvitac.registry import to_json
 from mvitac.report import figures
@@ -219,26 +215,6 @@ def test_predictions_that_are_exact_lie_on_the_line() -> None:
     at = axes.collections[0].get_offsets()
     assert at[:2].tolist() == [[0, 0], [2, 2]] and at[2, 1] == axes.get_ylim()[1]  # far off: at the edge
     assert axes.get_xlabel() == "true, N"
-
-
-def test_stress_of_values(scored: tuple[Path, Pack, dict[str, Any]]) -> None:
-    run, pack, _ = scored
-    model, pack = load(run), copy.copy(pack)
-    at = pack.table.column_names.index("weight")
-    weight = np.where(np.arange(pack.num) // 3 % 2, np.arange(pack.num), np.nan)  # one row of each group has it
-    pack.table = pack.table.set_column(at, "weight", pa.array(weight))
-    found = {(r["task"], r["probe"]): r for r in stress(model, pack, pack.spec.values, ["both"])}
-    assert {(task, kind) for task in ("light", "both") for kind in (*SHARES, NOISE, DROPOUT, *LEAK)} <= set(found)
-    assert all(r["r2"] <= 1 and len(r["alpha"]) == len(r["targets"]) for r in found.values())
-    whole = next(
-        r for r in scored[2]["records"] if (r["task"], r["modality"], r["probe"]) == ("light", "both", "linear")
-    )
-    assert found["light", NOISE]["num_test"] == whole["num_test"]
-    assert found["light", "1 % of labels"]["r2"] < whole["r2"]
-    model.run = replace(model.run, seed=7)
-    other = {(r["task"], r["probe"]): r for r in stress(model, pack, pack.spec.values, ["touch"])}
-    for kind in LEAK:  # one half for all seeds, as half of the weights is missing
-        assert other["both", kind]["group_sums"]["n"] == found["both", kind]["group_sums"]["n"]
 
 
 def test_packs_list_their_values(

@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from mvitac.bench.result import GUESS, pinned_of, problems, read_result, records_of, suite_of
 from mvitac.bench.suite import SuiteTask
+from mvitac.evaluation import few_labels
 from mvitac.evaluation.intervals import paired_difference
 from mvitac.evaluation.leaks import UNKNOWN
 from mvitac.evaluation.score_text import percent, score_name, tested_on, with_interval
@@ -119,7 +120,7 @@ def _rows(task: str, by: str, records: list[dict[str, Any]], probe: str, ask: Su
     found, cells = summarise(records, probe)[ask.name], by_cell(records, probe)
     shares = {}
     for share in sorted(ask.labels):
-        kind = f"{100 * share:g} % of labels"
+        kind = few_labels.name(100 * share)
         shares[share] = summarise([r for r in records if r["probe"] == kind], kind).get(ask.name, {})
     rows, none = [], found.pop("none", {})
     for modality in (m for m in ask.modalities if m in found):

@@ -20,11 +20,11 @@ from mvitac.bench.suite import Opened, Suite, SuiteSet, SuiteTask, open_set
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Images, Pack
 from mvitac.data.spec import AnyTask
+from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import Records, label_controls, pixel_controls
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, declared_leak, read_sources
 from mvitac.evaluation.probe import joined, names_in, probe_all, split_rows
-from mvitac.evaluation.robustness import few_labels
 from mvitac.evaluation.scores import pool
 from mvitac.model import Model
 from mvitac.system.files import digest, read_json, write_json
@@ -77,7 +77,7 @@ class Reader:
     model: Model
     opened: Opened
     name: str
-    known: dict[tuple[str, bool], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    known: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @cached_property
     def bound(self) -> tuple[Model, Pack]:
@@ -90,29 +90,29 @@ class Reader:
         """What the data lacks that the encoder's owner wants."""
         return list(self.bound[0].notes) if isinstance(self.bound[0], ExternalModel) else []
 
-    def read(self, modality: str, rows: np.ndarray, maps: bool = False) -> np.ndarray:
-        """Features [len(rows), D], or maps [len(rows), P, D]."""
+    def read(self, modality: str, rows: np.ndarray) -> np.ndarray:
+        """Features [len(rows), D]."""
         parts = []
         for m in names_in(modality, self.opened.packs[0]):
-            if (m, maps) not in self.known:
-                self.known[m, maps] = self._all(m, maps)
-            own, z = self.known[m, maps]
+            if m not in self.known:
+                self.known[m] = self._all(m)
+            own, z = self.known[m]
             parts.append(z[np.searchsorted(own, rows)])
         return joined(parts)
 
-    def _all(self, modality: str, maps: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _all(self, modality: str) -> tuple[np.ndarray, np.ndarray]:
         """All rows of a modality that are needed, and their features; ValueError if these are no finite numbers."""
         model, pack = self.bound
         asked = [(task, m) for ask, task in self.opened.tasks for m in ask.modalities if modality in names_in(m, pack)]
         rows = np.unique(np.concatenate([split_rows(v, task, m).all for v in self.opened.packs for task, m in asked]))
         parts = sensors(pack, modality, model.spec.channels(modality))
-        z = joined([features(model, part, modality, rows, maps=maps) for part in parts])
-        if z.ndim != 2 + maps or len(z) != len(rows):
+        z = joined([features(model, part, modality, rows) for part in parts])
+        if z.ndim != 2 or len(z) != len(rows):
             raise ValueError(
                 f"{self.name} gives features of shape {list(z.shape)} for {len(rows)} images of {modality}: give one"
                 " vector per image"
             )
-        if bad := int((~np.isfinite(z).reshape(len(z), -1).all(axis=1)).sum()):
+        if bad := int((~np.isfinite(z).all(axis=1)).sum()):
             raise ValueError(
                 f"{self.name} gives NaN or infinite features of {modality} for {bad} of {len(rows)} images: check its"
                 " weights and preprocessing"
@@ -123,14 +123,9 @@ class Reader:
         """Records of every modality that the model can read; folds are pooled."""
         pack, each = self.opened.packs[0], []
         able = [m for m in ask.modalities if not any(misfit(self.model, pack, one) for one in names_in(m, pack))]
-        maps = (lambda m, rows: self.read(m, rows, maps=True)) if "attentive" in probes else None
+        kinds = [*probes, *(few_labels.name(100 * share) for share in ask.labels)]
         for view in self.opened.packs if able else ():
-            found = probe_all(self.read, view, [task], able, probes, suite.seed, maps)
-            for modality, share in ((m, share) for m in able for share in ask.labels):
-                rows = split_rows(view, task, modality)
-                few = few_labels(self.read(modality, rows.all), view, task, rows, share, suite.seed)
-                about = {"task": task.name, "modality": modality, "probe": f"{100 * share:g} % of labels"}
-                found.append({**about, **few})
+            found = probe_all(self.read, view, [task], able, kinds, suite.seed)
             each.append([{"source": source, "seed": self.model.seed, **record} for record in found])
         return pool(each) if len(each) > 1 else [record for found in each for record in found]
 

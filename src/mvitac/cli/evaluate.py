@@ -1,8 +1,8 @@
 """``mvitac probe`` and ``mvitac report``."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional
@@ -11,15 +11,13 @@ from mvitac.cli.options import check_json, parse, printed_to, save_json
 from mvitac.data.pack import Pack
 from mvitac.data.several import JoinedPack
 from mvitac.evaluation.encoders import about_lines
-from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, as_trained, chosen, probe_runs
-from mvitac.evaluation.robustness import STRESSES, stress
-from mvitac.evaluation.scores import summarise, summarise_again
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
+from mvitac.evaluation.scores import summarise_again
 from mvitac.evaluation.sensors import RecolouredPack
-from mvitac.model_files import load
 from mvitac.report.report import write_report
 from mvitac.report.tables import print_retrieval, print_sensors, print_summary
 from mvitac.system.files import read_json
-from mvitac.system.progress import shown, work
+from mvitac.system.progress import shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +39,8 @@ class _ProbeOptions:
     """Score a run also on rows or groups of --on that it was trained on. LEAK stands beside every such score."""
     weights: Literal["last", "best"] = "last"
     """Weights after the last step, or the best on split val, which training keeps with --eval-every."""
-    stress: bool = False
-    """Also use 1 % and 10 % of the labels, score noisy test images and a modality missing at test time, and report the
-    gain of a split that leaks groups."""
     json: Path | None = None
-    """Also write everything that is printed, and more, to this file; - = stdout, and the tables to stderr. Without
-    it, all but the results of --stress is in probe.json in the folder of each run."""
+    """Also write everything that is printed, and more, to this file; - = stdout, and the tables to stderr."""
 
 
 def probe(argv: list[str]) -> None:
@@ -64,38 +58,15 @@ def probe(argv: list[str]) -> None:
     with shown():
         more = {"allow_leak": options.allow_leak, "weights": options.weights, "encoders": options.encoder}
         result = probe_runs(options.runs, options.config, pack, **more)
-    say, stressed = printed_to(options.json), _stress(options, pack, result) if options.stress else []
+    say = printed_to(options.json)
     print_summary(result, say, probe=options.config.probes[0])
-    for kind in options.config.probes[1:]:
+    for kind in options.config.kinds[1:]:
         print_summary({**result, "summary": summarise_again(result["records"], kind)}, say, probe=kind)
-    majority = [r for r in result["records"] if r["source"] in ("majority", "mean")]
-    for kind in STRESSES:
-        if mine := [r for r in stressed if r["probe"] == kind]:
-            print_summary({**result, "summary": summarise(mine + majority, kind)}, say, probe=kind)
     for line in about_lines(result["encoders"]):
         print(f"encoder: {line}", file=say)
     print_retrieval(result, say)
     print_sensors(result, say)
-    result["records"] += stressed
     save_json(options.json, result, sealed=True)
-
-
-def _stress(options: _ProbeOptions, pack: Pack | None, result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Records of every run under few labels, noise, missing modalities and a leaking split."""
-    names = {r["run"]: r["source"].removesuffix(END_TO_END) for r in result["records"] if "run" in r}
-    records = []
-    for i, path in enumerate(options.runs, start=1):
-        what = f"few labels, noise, missing modalities, leaks: run {i} of {len(options.runs)}"
-        with shown(), work(what):
-            model = load(path, options.weights)
-            data = as_trained(model, pack) if pack else model.open_data()
-            own = {"source": names.get(str(path), ""), "seed": model.seed, "run": str(path)}
-            leaks = {r["task"]: r["leak"] for r in result["records"] if r.get("run") == str(path)}
-            records += [
-                {**own, **r, "leak": leaks[r["task"]]}
-                for r in stress(model, data, *chosen(data, replace(options.config, event=(), fps=None, clock=None)))
-            ]
-    return records
 
 
 @dataclass(frozen=True, kw_only=True)

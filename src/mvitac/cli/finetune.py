@@ -70,8 +70,8 @@ def finetune(argv: list[str]) -> None:
 def adapt(argv: list[str]) -> None:
     """mvitac adapt MODEL --data D [--steps N] [--old PACK] --out DIR"""
     about = (
-        "Adapt a model to data of a new sensor without labels: new statistics of BatchNorm, then a few steps of its own"
-        " method. Prints what it gains on the new data and what it forgets of the old."
+        "Adapt a model to data of a new sensor without labels, by a few steps of its own method. Prints what it gains on the"
+        " new data and what it forgets of the old."
     )
     options, _ = _run(_AdaptOptions, run_adapt, print_adaptation, argv, "adapt", about)
     print(f"scores: {options.out / 'adapted.json'}\nnext: mvitac probe {options.out}")

@@ -16,26 +16,6 @@ PHASES = ("before", "during", "after")  # values of column phase: the moments of
 
 
 @dataclass(frozen=True, kw_only=True)
-class Event:
-    """A class that sets in during a recording (touch group), such as slip (``evaluation/events.py``)."""
-
-    happens: str
-    """Name of the class."""
-    clock: str | None = None
-    """Column with the time of each frame. None: the one that orders the frames of windows."""
-    fps: float | None = None
-    """Frames a second, if the clock counts frames."""
-    false_alarms: float = 0.1
-    """Share of the recordings without the event in which an alarm is accepted."""
-
-    def __post_init__(self) -> None:
-        if self.fps is not None and not 0 < self.fps < math.inf:
-            raise ValueError(f"fps {self.fps}: give frames a second, more than 0")
-        if not 0 <= self.false_alarms < 1:
-            raise ValueError(f"false_alarms {self.false_alarms}: give a share of the recordings, from 0 to below 1")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Task:
     """A classification task for linear probes."""
 
@@ -46,8 +26,6 @@ class Task:
     """Column -> value that a row must have to belong to the task, e.g. {"phase": "during"} for grasp success."""
     split: str = "split"
     """Column with the split of this task, if it differs from that of pre-training."""
-    event: Event | None = None
-    """Also score one class as an event in time."""
 
 
 def task_title(name: str, classes: Sequence[str]) -> str:

@@ -29,7 +29,7 @@ def windowed(pack: Pack, window: Window) -> Pack:
     """
     if not window.active and window.order is None:
         return pack
-    if not window.active:  # frames have an order also for positives and events
+    if not window.active:  # frames have an order also for positives
         made = copy.copy(pack)
         made.spec = replace(pack.spec, window=replace(pack.spec.window, order=window.order))
         return made

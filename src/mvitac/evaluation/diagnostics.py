@@ -3,7 +3,7 @@
 Shapes: features [N, D] of one modality. Row i of vision and row i of touch are a pair.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -130,6 +130,16 @@ def _ridge(x: Tensor, y: Tensor, new: Tensor, alpha: float) -> Tensor:
     factor = torch.linalg.cholesky(gram)
     weight = x.T @ torch.cholesky_solve(y, factor) if wide else torch.cholesky_solve(x.T @ y, factor)
     return (new - centre) @ weight + offset
+
+
+def mean_error(scores: Iterable[Sequence[float]]) -> float:
+    """Geometric mean of 1 - score over tasks, each a mean over targets; an error under .01 counts as .01.
+
+    Halving the error counts alike for every task. A mean of accuracies and R2, which has no lower end, would follow the
+    worst R2.
+    """
+    logs = [(1 - torch.tensor(task, dtype=torch.float64)).clamp(min=0.01).log().mean() for task in scores]
+    return float(torch.stack(logs).mean().exp())
 
 
 def group_means(z: Float[Tensor, "N D"], groups: Int[Tensor, " N"]) -> Float[Tensor, "G D"]:

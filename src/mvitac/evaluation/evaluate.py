@@ -11,12 +11,11 @@ from tabulate import tabulate
 from mvitac.data.pack import Pack
 from mvitac.data.row_hashes import number_hint
 from mvitac.data.several import JoinedPack
-from mvitac.data.spec import AnyTask, Task, ValueTask
+from mvitac.data.spec import AnyTask, ValueTask
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation.controls import Records, controls_of, start_weights
 from mvitac.evaluation.encoders import open_encoders, probe_encoders
-from mvitac.evaluation.events import check_event, with_event
 from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import PROBES, probe_model, probes_of, seen_by, split_rows, with_classes
 from mvitac.evaluation.probe_config import ProbeConfig
@@ -61,8 +60,7 @@ def probe(*runs: str | Path, on: str | Path | Pack | None = None, allow_leak: bo
         runs: Folders of runs: seeds of one method, or several methods, trained on one dataset.
         on: Another pack, or its folder, to probe on. Default: the data the runs were trained on.
         allow_leak: Score also test rows of ``on`` that a run was trained on.
-        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet, event, fps, clock,
-            false_alarms.
+        options: Fields of ``ProbeConfig``: probes, tasks, modalities, controls, imagenet, fractions.
 
     Returns:
         The scores, a dict (see ``probe_runs``).
@@ -120,10 +118,10 @@ def probe_runs(
     sources = check_unseen(paths, pack, tasks, allow_leak=allow_leak)
     each = [*zip(paths, models, names, sources, strict=True)]
     records, retrieval = _probe_models(each, pack, tasks, modalities, session)
-    records += probe_encoders(others, tasks, modalities, session.probes, controls=session.controls)
+    records += probe_encoders(others, tasks, modalities, session.kinds, controls=session.controls)
     if session.controls:
         specs = [m.spec for m in models]
-        found = controls_of(runs, pack, tasks, modalities, session.probes, session.imagenet, specs, session.standardise)
+        found = controls_of(runs, pack, tasks, modalities, session.kinds, session.imagenet, specs, session.standardise)
         records, retrieval = records + found[0], retrieval + found[1]
     result = {**_describe_data(pack, tasks), "asked": to_json(session), "models": _digests(paths, weights)}
     result |= {"encoders": [m.describe() for m, _ in others], "leaks": leaks_of([*records, *retrieval])}
@@ -146,12 +144,10 @@ def _about_sensors(each: Sequence[Probed], pack: Pack, session: ProbeConfig) -> 
 
 
 def _check_tasks(pack: Pack, tasks: Sequence[AnyTask], modalities: Sequence[str]) -> None:
-    """Raise ValueError if a task has no rows to fit or to score, or no recordings for its event."""
+    """Raise ValueError if a task has no rows to fit or to score."""
     for task in tasks:
         for modality in seen_by(pack, task, modalities):
-            rows = split_rows(pack, task, modality)
-            if isinstance(task, Task) and task.event:
-                check_event(pack, task, rows.fitted, rows.test)
+            split_rows(pack, task, modality)
 
 
 def _describe_data(pack: Pack, tasks: Sequence[AnyTask]) -> dict[str, Any]:
@@ -193,7 +189,7 @@ def _probe_models(
     def probed(one: Probed) -> tuple[Records, Records]:
         path, model, source, learned = one
         own = {"source": source, "seed": model.run.seed, "run": str(path)}
-        found = probe_model(model, pack, tasks, modalities, session.probes, session.standardise)
+        found = probe_model(model, pack, tasks, modalities, session.kinds, session.standardise)
         leaks = {task.name: rows.leak(learned, split_rows(pack, task).test) for task in tasks}
         records = [{**own, **record, "leak": leaks[record["task"]]} for record in found]
         for record in records:
@@ -201,7 +197,7 @@ def _probe_models(
         ranked = cross_modal(model, pack)
         return records, [{**own, **r, "leak": rows.leak(learned, retrieved_rows(pack))} for r in ranked]
 
-    num = len(each) * len(modalities) * sum(len(probes_of(task, session.probes)) for task in tasks)
+    num = len(each) * len(modalities) * sum(len(probes_of(task, session.kinds)) for task in tasks)
     with work("fitting probes", num, "probes"):
         scored = in_threads(probed, list(each))
     return [r for own, _ in scored for r in own], [r for _, found in scored for r in found]
@@ -212,17 +208,19 @@ def stored_result(paths: Sequence[Path], pack: Pack) -> dict[str, Any] | None:
 
     None if that file is missing or damaged, is about other runs, weights or data, or lacks tasks, modalities or controls.
     """
-    try:
-        result = read_json(paths[0] / "probe.json", "a probe result")
-        asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
-        scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
-        # Of one pack, the notes tell scores on val from those on test.
-        same = (result["pack"], result["notes"]) == (pack.digest, list(pack.spec.notes))
-        same &= result["models"] == _digests(paths)
-    except (ValueError, KeyError, TypeError) as error:  # 0.1.0 wrote the scores of the run alone
-        if isinstance(error, ValueError) and (paths[0] / "probe.json").exists():
-            print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)
+    path = paths[0] / "probe.json"
+    if not path.exists():
         return None
+    try:
+        result = read_json(path, "a probe result")
+        asked: ProbeConfig = from_json(ProbeConfig, result["asked"], "asked")
+    except ValueError as error:
+        print(f"mvitac: {error}; the runs are probed again", file=sys.stderr)
+        return None
+    scored = {Path(r["run"]).resolve() for r in result["records"] if "run" in r}
+    # Of one pack, the notes tell scores on val from those on test.
+    same = (result["pack"], result["notes"]) == (pack.digest, list(pack.spec.notes))
+    same &= result["models"] == _digests(paths)
     whole = asked.probes[0] == "linear" and asked.controls and not asked.tasks and not asked.modalities
     whole &= not asked.standardise
     return result if same and whole and scored == {path.resolve() for path in paths} else None
@@ -287,10 +285,6 @@ def _check_weights(runs: Sequence[Run], session: ProbeConfig) -> None:
 def chosen(pack: Pack, session: ProbeConfig) -> tuple[list[AnyTask], list[str]]:
     """The tasks and modalities that ``session`` asks for; ValueError if the data lacks one."""
     known = {task.name: task for task in pack.spec.all_tasks}
-    for name, _, happens in (asked.partition("=") for asked in session.event):
-        if not isinstance(task := known.get(name), Task):
-            raise unknown("task with classes", name, [task.name for task in pack.spec.tasks])
-        known[name] = with_event(task, session.event_of(happens))
     if not known:
         raise ValueError(
             f"dataset {pack.spec.name!r} has no labels and no values: name columns with --labels or --values of `mvitac"

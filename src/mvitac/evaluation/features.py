@@ -22,32 +22,27 @@ def sample(rows: np.ndarray, num: int) -> np.ndarray:
     return np.sort(np.random.default_rng(0).choice(rows, min(num, len(rows)), replace=False))
 
 
-def features(
-    model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False, maps: bool = False
-) -> np.ndarray:
+def features(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool = False) -> np.ndarray:
     """Features [len(rows), D] float32, cached on disk by weights, data, rows and image size (``Model.features``).
-
-    With ``maps`` they are the trunk's last feature map, [len(rows), P, D] float16 of at most 49 places.
 
     The cached file is a .npy followed by its sha256. One that does not match, or has none, is computed again.
     """
-    asked = {"for_heads": for_heads, "maps": maps}
     if isinstance(pack, JoinedPack) and (known := rows < pack.learn.num).any():
         every = np.arange(pack.learn.num)
-        if _place(model, pack.learn, modality, every, **asked).exists():  # of a probe on that pack alone
-            learned = features(model, pack.learn, modality, every, **asked)[rows[known]]
+        if _place(model, pack.learn, modality, every, for_heads=for_heads).exists():  # of a probe on that pack alone
+            learned = features(model, pack.learn, modality, every, for_heads=for_heads)[rows[known]]
             values = np.empty((len(rows), *learned.shape[1:]), learned.dtype)
             values[known] = learned
             if not known.all():
-                values[~known] = features(model, pack, modality, rows[~known], **asked)
+                values[~known] = features(model, pack, modality, rows[~known], for_heads=for_heads)
             return values
-    path = _place(model, pack, modality, rows, **asked)
+    path = _place(model, pack, modality, rows, for_heads=for_heads)
     if path.exists():
         data = path.read_bytes()
         if hashlib.sha256(memoryview(data)[:-32]).digest() == data[-32:]:
             return np.load(io.BytesIO(data), allow_pickle=False)
-    with work(f"reading {modality} {'maps' if maps else 'features'}", len(rows), "images") as advance:
-        values = pack_features(model, pack, modality, rows, for_heads=for_heads, maps=maps, advance=advance).numpy()
+    with work(f"reading {modality} features", len(rows), "images") as advance:
+        values = pack_features(model, pack, modality, rows, for_heads=for_heads, advance=advance).numpy()
     buffer = io.BytesIO()
     np.save(buffer, values)
     buffer.write(hashlib.sha256(buffer.getbuffer()).digest())
@@ -55,10 +50,10 @@ def features(
     return values
 
 
-def _place(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool, maps: bool) -> Path:
+def _place(model: Model, pack: Pack, modality: str, rows: np.ndarray, *, for_heads: bool) -> Path:
     """The file of these features in the cache."""
     whole, heads = model.sides(modality)  # the weights' digest covers the first
-    kind = [*([heads] if for_heads and heads != whole else []), *(["map"] if maps else [])]
+    kind = [heads] if for_heads and heads != whole else []
     device = next(model.parameters()).device.type
     key = digest([model.weights_digest(), pack.digest, modality, digest(rows.tolist()), device, *kind])
     return cache_dir() / "features" / f"{key[:32]}.npy"

@@ -10,8 +10,6 @@ from mvitac.data.pack import Pack
 from mvitac.model import Model
 from mvitac.system.malloc import keep_freed_memory
 
-HALF = (-65504.0, 65504.0)  # range of fp16
-
 
 def pack_features(
     model: Model,
@@ -21,13 +19,11 @@ def pack_features(
     *,
     for_heads: bool = False,
     bf16: bool = False,
-    maps: bool = False,
     advance: Callable[[int], object] = lambda num: None,
 ) -> Tensor:
     """``Model.features`` [len(rows), D] of pack rows, computed in chunks on the model's device, on the CPU.
 
-    With ``maps``, ``last_map`` instead: [len(rows), P, D] of fp16. ``advance`` is called with each chunk's number of
-    rows.
+    ``advance`` is called with each chunk's number of rows.
     """
     device = next(model.parameters()).device
     if device.type == "cpu":
@@ -35,9 +31,6 @@ def pack_features(
     chunks = []
     for chunk in np.array_split(rows, max(1, len(rows) // 256)):
         images = torch.from_numpy(pack.images[modality][chunk]).permute(0, 3, 1, 2).to(device)
-        if maps:
-            chunks.append(model.last_map(modality, images).clamp(*HALF).half().cpu())
-        else:
-            chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
+        chunks.append(model.features(modality, images, for_heads=for_heads, bf16=bf16).cpu())
         advance(len(chunk))
     return torch.cat(chunks)

@@ -1,4 +1,4 @@
-"""Probes of one model's frozen features on one pack: linear classifiers, regression, kNN and small networks.
+"""Probes of one model's frozen features on one pack: linear classifiers, regression and kNN.
 
 Nothing is chosen on test rows: regularisation is chosen on held-out groups of train. Shapes: features [N, D].
 """
@@ -9,28 +9,25 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.special import softmax
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task, ValueTask
 from mvitac.evaluation.classifiers import Classifier, Constant, fit_knn, fit_linear, fit_papers
-from mvitac.evaluation.events import group_folds, score_event
 from mvitac.evaluation.features import features
+from mvitac.evaluation.few_labels import few, percent_of
 from mvitac.evaluation.regressors import Linear, fit_curve, fit_neighbours, fit_ridge
 from mvitac.evaluation.scores import score
 from mvitac.evaluation.sensors import Standardise, touch_features
-from mvitac.evaluation.trained_probes import TRAINED, fit_network
 from mvitac.evaluation.value_scores import score_values
 from mvitac.model import Model
 from mvitac.registry import unknown
 from mvitac.system.progress import tick
 
-PROBES = ("linear", "paper", "knn", *TRAINED)
-"""linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest.
-mlp, attentive: small networks on features, or on the trunk's last map (``trained_probes``)."""
-Probe = Literal["linear", "paper", "knn", "mlp", "attentive"]
-VALUE_PROBES = ("linear", "knn", *TRAINED)
-"""Probes of tasks with values: ridge regression, alpha chosen on validation groups, the mean of the 20 nearest, networks."""
+PROBES = ("linear", "paper", "knn")
+"""linear: logistic regression, C chosen on validation groups. paper: dropout .2, Adam 1e-4, 60 epochs. knn: 20 nearest."""
+Probe = Literal["linear", "paper", "knn"]
+VALUE_PROBES = ("linear", "knn")
+"""Probes of tasks with values: ridge regression, alpha chosen on validation groups, and the mean of the 20 nearest."""
 
 FeatureSource = Callable[[str, np.ndarray], np.ndarray]  # (modality, pack rows) -> features [len(rows), D]
 Fitted = Callable[[np.ndarray], np.ndarray]  # features -> class probabilities or values
@@ -121,25 +118,16 @@ def probe_features(
     x: np.ndarray, pack: Pack, task: AnyTask, rows: ProbeSplit, kind: str, seed: int, paper: Classifier | None = None
 ) -> dict[str, Any]:
     """Fit and score one probe of ``kind`` on features ``x`` of ``rows.all``; ``paper`` is an already fitted one."""
+    if percent := percent_of(kind):
+        train, val = few(pack, task, rows.train, rows.val, percent, seed)
+        keep = np.concatenate([train, len(rows.train) + val, np.arange(len(rows.fitted), len(x))])
+        x, rows, kind = x[keep], ProbeSplit(rows.train[train], rows.val[val], rows.test), "linear"
     num = len(rows.fitted)
     predict, extra = fit_probe(x[:num], pack, task, rows, kind, seed, paper)
     predicted = predict(x[num:])
     if isinstance(predict, Linear):
         extra["clipped"] = predict.clipped(x[num:])
-    if isinstance(task, Task) and task.event:
-        held = _held_out(x[:num], pack, task, rows, kind, seed)
-        extra = {**extra, "event": score_event(pack, task, rows.fitted, held, rows.test, predicted)}
     return {**score_rows(pack, task, rows.test, predicted), **extra}
-
-
-def _held_out(x: np.ndarray, pack: Pack, task: Task, rows: ProbeSplit, kind: str, seed: int) -> np.ndarray:
-    """Class probabilities [len(rows.fitted), K], each row's by a probe that was fitted on other groups."""
-    fitted, found = rows.fitted, np.empty((len(x), len(task.classes)))
-    for train, val, held in group_folds(pack.column("group")[fitted].astype(str)):
-        part = ProbeSplit(fitted[train], fitted[val], fitted[held])
-        predict, _ = fit_probe(x[np.concatenate([train, val])], pack, task, part, kind, seed)
-        found[held] = predict(x[held])
-    return found
 
 
 def fit_probe(
@@ -164,9 +152,6 @@ def fit_probe(
         return paper or fit_papers(x, [y_whole], [num], seed)[0], {}
     if kind == "knn":
         return fit_knn(x, y_whole, num), {}
-    if kind in TRAINED:
-        logits, steps = fit_network(kind, x, y_whole, len(rows.val), num, seed)
-        return lambda z: softmax(logits(z), axis=1), {"steps": steps}
     raise unknown("probe", kind, PROBES)
 
 
@@ -181,9 +166,6 @@ def _fit_values(
         return fit_curve(x, y, len(rows.val)), {}
     if kind == "knn":
         return fit_neighbours(x, y), {}
-    if kind in TRAINED:
-        predict, steps = fit_network(kind, x, y, len(rows.val), len(task.targets), seed)
-        return predict, {"steps": steps}
     raise unknown("probe of values", kind, VALUE_PROBES)
 
 
@@ -207,24 +189,17 @@ def probe_model(
     needed = np.unique(np.concatenate(parts))
     own = {m: needed[pack.has(m)[needed]] for m in model.encoders if m in modalities or "both" in modalities}
 
-    def source_of(maps: bool) -> FeatureSource:
-        by_modality = {m: touch_features(model, pack, m, rows, standardise, maps=maps) for m, rows in own.items()}
+    by_modality = {m: touch_features(model, pack, m, rows, standardise) for m, rows in own.items()}
 
-        def source(modality: str, rows: np.ndarray) -> np.ndarray:
-            return joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
+    def source(modality: str, rows: np.ndarray) -> np.ndarray:
+        return joined([by_modality[m][np.searchsorted(own[m], rows)] for m in names_in(modality, pack)])
 
-        return source
-
-    maps = source_of(True) if "attentive" in probes else None
-    records = probe_all(source_of(False), pack, tasks, modalities, probes, model.seed, maps)
+    records = probe_all(source, pack, tasks, modalities, probes, model.seed)
     return records + own_heads(model, pack, tasks, modalities)
 
 
 def joined(parts: list[np.ndarray]) -> np.ndarray:
-    """Features [N, D] of several modalities, or maps [N, P, D], side by side. Narrow maps are filled up with zeros."""
-    if parts[0].ndim == 3:
-        width = max(part.shape[2] for part in parts)
-        parts = [np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[2]))) for part in parts]
+    """Features [N, D] of several modalities side by side."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
@@ -280,11 +255,8 @@ def probe_all(
     modalities: Sequence[str],
     probes: Sequence[str],
     seed: int,
-    maps: FeatureSource | None = None,
 ) -> list[dict[str, Any]]:
     """Records of every (task, modality, probe) on the features of ``source``. The paper's probe has no values.
-
-    The attentive probe is fitted on those of ``maps``, [len(rows), P, D].
 
     Each fitted probe advances the ``progress.work`` that counts "probes".
     """
@@ -295,8 +267,7 @@ def probe_all(
             rows = split_rows(pack, task, modality)
             x = source(modality, rows.all)
             for kind in probes_of(task, probes):
-                z = maps(modality, rows.all) if maps and kind == "attentive" else x
-                result = probe_features(z, pack, task, rows, kind, seed, papers.get((task.name, modality)))
+                result = probe_features(x, pack, task, rows, kind, seed, papers.get((task.name, modality)))
                 tick("probes")
                 records.append({"task": task.name, "modality": modality, "probe": kind, **result})
     return records
@@ -304,7 +275,7 @@ def probe_all(
 
 def probes_of(task: AnyTask, probes: Sequence[str]) -> list[str]:
     """Those of ``probes`` that ``task`` can have."""
-    return [kind for kind in probes if isinstance(task, Task) or kind in VALUE_PROBES]
+    return [kind for kind in probes if isinstance(task, Task) or kind in VALUE_PROBES or percent_of(kind)]
 
 
 def _papers(

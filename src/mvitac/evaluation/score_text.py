@@ -51,15 +51,6 @@ def clipped_text(task: dict[str, Any]) -> str:
     return f"test features far beyond the fitted rows were clipped: {', '.join(found)}" if found else ""
 
 
-def lead_text(event: dict[str, Any]) -> str:
-    """How early the alarms of an event are, such as '480 [320, 640] ms' before its onset; negative = after it."""
-    lead, unit = event["lead"], event["unit"]
-    if lead["median"] is None:
-        return "no alarm"
-    ends = "" if lead["low"] is None else f" [{lead['low']:,.4g}, {lead['high']:,.4g}]"
-    return f"{lead['median']:,.4g}{ends} {unit}"
-
-
 def covered(group_by: str, records: Sequence[dict[str, Any]]) -> str:
     """What the 95 % intervals of ``records`` cover (``interval``)."""
     seeds: dict[str, set[int]] = {}

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support, roc_auc_score
 
-from mvitac.evaluation.events import lead_of, pool_events, shares
 from mvitac.evaluation.intervals import interval, num_groups_of
 from mvitac.evaluation.value_scores import one_target, pool_values
 
@@ -62,8 +61,6 @@ def pool(folds: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
             whole["leak"] = leaks
         if clipped := most_clipped(parts):
             whole["clipped"] = clipped
-        if all("event" in part for part in parts):
-            whole["event"] = pool_events([part["event"] for part in parts])
         pooled.append({**{key: parts[0][key] for key in keys}, **whole})
     return pooled
 
@@ -101,13 +98,18 @@ def by_cell(records: Sequence[dict[str, Any]], probe: str) -> dict[Cell, list[di
     return found
 
 
+def each_score(record: dict[str, Any]) -> list[float]:
+    """The accuracy of a record, or the R2 of each target."""
+    return [target["r2"] for target in record["targets"]] if "targets" in record else [record["accuracy"]]
+
+
 def most_clipped(records: Sequence[dict[str, Any]]) -> list[int]:
     """The largest number of features that ridge clipped in test rows, and of how many; [] of records without ridge."""
     return max((record["clipped"] for record in records if "clipped" in record), default=[])
 
 
 def leaks_in(records: Sequence[dict[str, Any]]) -> str:
-    """The leaks of records (``evaluation.leaks``), without repetition; controls and records of 0.1.0 have none."""
+    """The leaks of records (``evaluation.leaks``), without repetition; controls have none."""
     return "; ".join(dict.fromkeys(record["leak"] for record in records if record.get("leak")))
 
 
@@ -115,8 +117,7 @@ def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[
     """Scores as task -> modality -> method or control -> mean, low, high, seeds, number of test groups (``by_cell``).
 
     Of values, the score is R2, and "targets" has the scores of each target (``targets_of``). With one test group R2 has
-    no lower end: ``low`` is None. "clipped" is ``most_clipped`` of ridge regression. Of a task with an event, "event" has
-    its scores (``event_of``).
+    no lower end: ``low`` is None. "clipped" is ``most_clipped`` of ridge regression.
     """
     summary: dict[str, Any] = {}
     for (task, modality, source), found in by_cell(records, probe).items():
@@ -126,8 +127,6 @@ def summarise(records: Sequence[dict[str, Any]], probe: str = "linear") -> dict[
         cell["groups"] = num_groups_of(found[0])
         if "targets" in found[0]:
             cell["targets"] = targets_of(found)
-        if all("event" in record for record in found):
-            cell["event"] = event_of([record["event"] for record in found])
         if clipped := most_clipped(found):
             cell["clipped"] = clipped
         if leaks := leaks_in(found):
@@ -150,24 +149,6 @@ def targets_of(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         errors = {key: float(np.mean([record["targets"][t][key] for record in records])) for key in ("mae", "rmse")}
         about = {"name": target["name"], "unit": target["unit"]}
         found.append({**about, "mean": mean, "low": _finite(low), "high": high, **errors})
-    return found
-
-
-def event_of(events: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Scores of an event over runs, from what ``events.score_event`` returned for each.
-
-    "detected" and "false_alarms": mean, low, high and number of recordings with and without the event, of those that raised
-    an alarm. "lead" (``events.lead_of``) in "unit". "auroc": of the recordings' highest scores, without a threshold.
-    """
-    found: dict[str, Any] = {"class": events[0]["class"], "unit": events[0]["unit"], "lead": lead_of(events)}
-    for name, with_it in (("detected", True), ("false_alarms", False)):
-        records = shares(events, with_it=with_it)
-        mean, low, high = interval(records)
-        num = sum(records[0]["group_sizes"])
-        found[name] = {"mean": mean, "low": low, "high": high, "num": num}
-    happened = [[r["onset"] is not None for r in event["recordings"]] for event in events]
-    highest = [[r["highest"] for r in event["recordings"]] for event in events]
-    found["auroc"] = float(np.mean([roc_auc_score(y, x) for y, x in zip(happened, highest, strict=True)]))
     return found
 
 

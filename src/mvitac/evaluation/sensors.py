@@ -10,8 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import nn
-from torch.optim.swa_utils import update_bn
 
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
@@ -23,7 +21,7 @@ from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.transforms.gel_colours import MIN_IMAGES, NUM_IMAGES, GelColours, Looks, learn_colours, recolour
 
-Standardise = Literal["colours", "batch-norm", "features"]
+Standardise = Literal["colours", "features"]
 NUM_STATISTICS = 256  # images of a sensor that statistics are taken from, at most
 MIN_GALLERY = 11  # least number of presses for retrieval
 COLOURS = "--standardise colours"  # the option of probe that errors name
@@ -86,52 +84,31 @@ def describe_statistics(pack: Pack, standardise: tuple[Standardise, ...]) -> lis
 
 
 def touch_features(
-    model: Model, pack: Pack, modality: str, rows: np.ndarray, standardise: tuple[Standardise, ...] = (), *, maps: bool
+    model: Model, pack: Pack, modality: str, rows: np.ndarray, standardise: tuple[Standardise, ...] = ()
 ) -> np.ndarray:
     """``features`` of pack ``rows`` (ascending), those of touch in the statistics of each row's own sensor.
 
     ``ProbeConfig.standardise`` says how. With colours, the features of a ``RecolouredPack``'s new sensors are the mean over
-    its ``looks``. With ``maps``, they are the trunk's last feature maps [N, P, D].
+    its ``looks``.
     """
     if modality != "touch" or not standardise:
-        return features(model, pack, modality, rows, maps=maps)
+        return features(model, pack, modality, rows)
     parts, sensors = [], pack.sensors[rows]
     for number in np.unique(sensors):
         known, own = unlabelled_rows(pack, int(number)), rows[sensors == number]
         looks = pack.looks if isinstance(pack, RecolouredPack) and number in pack.new else [pack]
-        models = [with_statistics(model, look, known) if "batch-norm" in standardise else model for look in looks]
 
-        def mean(rows: np.ndarray, each: list[tuple[Model, Pack]]) -> np.ndarray:
-            each_look = [features(m, look, modality, rows, maps=maps) for m, look in each]
-            return np.asarray(np.mean(each_look, axis=0, dtype=np.float32))
+        def mean(rows: np.ndarray, looks: list[Pack]) -> np.ndarray:
+            each = [features(model, look, modality, rows) for look in looks]
+            return np.asarray(np.mean(each, axis=0, dtype=np.float32))
 
-        z = mean(own, each := list(zip(models, looks, strict=True)))
+        z = mean(own, looks)
         if "features" in standardise:
-            seen = mean(known, each)
-            axes = tuple(range(seen.ndim - 1))
-            z = (z - seen.mean(axes)) / (seen.std(axes) + 1e-6)
+            seen = mean(known, looks)
+            z = (z - seen.mean(0)) / (seen.std(0) + 1e-6)
         parts.append(z)
     order = np.argsort(sensors, kind="stable")  # of the rows in ``parts``
     return np.concatenate(parts)[np.argsort(order)]
-
-
-def with_statistics(model: Model, pack: Pack, rows: np.ndarray) -> Model:
-    """A copy of ``model`` whose touch encoder has the BatchNorm statistics of the touch images of ``rows``.
-
-    ValueError if it has no BatchNorm. Source: Schneider et al., https://arxiv.org/abs/2006.16971.
-    """
-    made = copy.deepcopy(model)
-    trunk = made.encoders["touch"]
-    if not any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in trunk.modules()):
-        raise ValueError(f"trunk {model.run.encoder.touch.trunk} has no BatchNorm: leave --standardise batch-norm out")
-    device = next(trunk.parameters()).device
-
-    def images(rows: np.ndarray) -> torch.Tensor:
-        found = torch.from_numpy(np.ascontiguousarray(pack.images["touch"][rows])).permute(0, 3, 1, 2).to(device)
-        return model.input("touch", found)
-
-    update_bn((images(chunk) for chunk in np.array_split(rows, max(1, len(rows) // 64))), trunk)
-    return made.eval()
 
 
 class _Recoloured(Lazy):

@@ -1,7 +1,7 @@
 """``mvitac adapt``: a model on unlabelled data of a new sensor, what it gains there and what it forgets of the old ones.
 
-First the running statistics of BatchNorm are estimated anew on the new data (arXiv:1603.04779), then the run's own method
-goes on from its weights for a few steps. The result is a run like any other, with all scores in adapted.json.
+The run's own method goes on from its weights for a few steps. The result is a run like any other, with all scores in
+adapted.json.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,11 +35,9 @@ class Adaptation:
     """How far a model is adapted, and on what it is scored."""
 
     steps: int = 200
-    """Steps of the run's own method on the new data. 0 = new statistics of BatchNorm only."""
+    """Steps of the run's own method on the new data."""
     lr: float | None = None
     """Peak learning rate. Default: a tenth of that of the run."""
-    batches: int = 16
-    """Batches on which the statistics of BatchNorm are estimated anew. 0 = keep them."""
     batch_size: int | None = None
     """Pairs per step. Default: as in the run; at most all rows."""
     seed: int = 0
@@ -72,8 +70,7 @@ def adapt(
     check_out(out, resume)
     model, pack = load(ancestor), data.open(quiet=quiet)
     if lacking := [m for m in model.encoders if m not in pack.spec.modalities]:
-        one = f"mvitac pretrain --init {ancestor} --init.modalities {' '.join(pack.spec.modalities)} --renew-norms 16"
-        raise ValueError(f"{ancestor} was trained with {lacking[0]}, which the data lacks: use `{one}` instead")
+        raise ValueError(f"{ancestor} was trained with {lacking[0]}, which the data lacks")
     check_channels(ancestor, model, pack, tuple(model.encoders))
     packs = {NEW: pack} | _old_packs(model, asked.old, pack, say)
     sources = {  # refuses leaks before anything is trained
@@ -105,7 +102,7 @@ def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, asked
     lr = old.optim.lr / 10 if asked.lr is None else asked.lr
     size = asked.batch_size or max(2, min(old.batch_size, len(old.method.training_rows(pack))))
     optim = replace(old.optim, lr=lr, schedule="cosine", warmup=0.1)
-    run = replace(old, recipe="adapt", data=data, init=Init(path=ancestor), renew_norms=asked.batches, optim=optim)
+    run = replace(old, recipe="adapt", data=data, init=Init(path=ancestor), optim=optim)
     return replace(run, steps=asked.steps, batch_size=size, seed=asked.seed, eval_every=0, checkpoint_every=0)
 
 

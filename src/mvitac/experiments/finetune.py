@@ -7,8 +7,7 @@
           10-percent/...    the same for another share of the labelled groups
 
 Settings are chosen on held-out groups of the labelled rows, never on test rows: first the learning rate, then the number of
-steps, then whether the heads start as linear probes (LP-FT, arXiv:2202.10054). The final model learns from all of these
-groups. A call that is repeated with ``resume`` continues.
+steps. The final model learns from all of these groups. A call that is repeated with ``resume`` continues.
 """
 
 import shutil
@@ -22,17 +21,18 @@ import numpy as np
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, Task
 from mvitac.datasets.base import DatasetConfig
+from mvitac.evaluation.diagnostics import mean_error
 from mvitac.evaluation.evaluate import ProbeConfig, check_channels, check_unseen, chosen
 from mvitac.evaluation.features import features
 from mvitac.evaluation.leaks import Scored, Source, leaks_of, read_sources
 from mvitac.evaluation.probe import ProbeSplit, own_heads, probe_features, split_rows
+from mvitac.evaluation.scores import each_score
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.nn.finetuning import Part
 from mvitac.nn.initial import Init
 from mvitac.run import Optim, Run
-from mvitac.system.files import check_place, read_json, write_json
+from mvitac.system.files import check_place, digest, read_json, write_json
 from mvitac.training.loop import train
 from mvitac.transforms.random_views import Augment, ViewAugment
 
@@ -52,11 +52,8 @@ class Finetuning:
     """Tasks with values to learn."""
     modalities: tuple[Literal["touch", "vision"], ...] = ()
     """Modalities to learn from. Default: all that the model and the data have."""
-    train: Part = "all"
-    """What of the encoders is trained, beside new heads. last-stage: the last stage of the trunk. lora: low-rank updates of
-    all layers, and BatchNorm. attentive: an attention over the last feature map. head: nothing."""
-    rank: int = 8
-    """Rank of the updates of lora."""
+    train: Literal["all", "head"] = "all"
+    """What is trained: encoders and new heads, or the heads alone."""
     lr: tuple[float, ...] = (3e-4, 1e-4, 1e-3, 3e-3)
     """Learning rates to try. The first is used where there are too few groups to choose."""
     steps: tuple[int, ...] = (200, 600)
@@ -74,11 +71,8 @@ class Finetuning:
     """Go on if the model, or one it started from, was trained on test rows or groups. LEAK stands beside every score."""
 
     def __post_init__(self) -> None:
-        for name in ("lr", "steps", "fractions"):
-            if not (given := getattr(self, name)) or len(set(given)) < len(given):
-                raise ValueError(f"{name} {given}: give at least one number, and none twice")
-        if not all(0 < percent <= 100 for percent in self.fractions) or self.seeds < 1:
-            raise ValueError("give fractions in percent, above 0, at most 100, and at least 1 seed")
+        if not (self.lr and self.steps and self.fractions and self.seeds > 0):
+            raise ValueError("give at least one of lr, steps, fractions and seeds")
 
 
 def finetune(
@@ -133,7 +127,7 @@ def _method(
     modalities: Any = asked.modalities or tuple(m for m in pack.spec.modalities if m in model.encoders)
     check_channels(ancestor, model, pack, modalities or tuple(model.encoders))
     names = tuple(task.name for task in tasks)
-    return SupervisedConfig(tasks=names, modalities=modalities, train=asked.train, rank=asked.rank)
+    return SupervisedConfig(tasks=names, modalities=modalities, train=asked.train)
 
 
 def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, method: SupervisedConfig) -> Run:
@@ -165,8 +159,8 @@ class _Job:
         return replace(self.run.method, share=percent / 100, draw=seed + 1, **changes)  # type: ignore[call-arg]
 
     def run_of(self, percent: float, seed: int, kind: str, settings: dict[str, Any], *, hold_out: bool = False) -> Run:
-        """The run of ``kind`` on this share of the labels with these lr, steps and start of the heads."""
-        method = self.method(percent, seed, hold_out=hold_out, heads_from=settings["heads_from"])
+        """The run of ``kind`` on this share of the labels with this lr and number of steps."""
+        method = self.method(percent, seed, hold_out=hold_out)
         if kind == SCRATCH:
             method = replace(method, train="all")
         size = max(2, min(self.asked.batch_size, len(method.training_rows(self.pack))))
@@ -230,36 +224,37 @@ def _fraction(job: _Job, percent: float, sources: list[Source] | None) -> tuple[
 
 
 def _choose(job: _Job, percent: float, kind: str) -> dict[str, Any]:
-    """The settings with the best score on held-out groups of the first seed, tried one after the other."""
-    starts = ("random",) if kind == SCRATCH else ("probe", "random")
-    tried = {"lr": job.asked.lr, "steps": job.asked.steps, "heads_from": starts}
+    """The settings with the lowest ``mean_error`` on held-out groups of the first seed, tried one after the other."""
+    tried: dict[str, tuple[float, ...]] = {"lr": job.asked.lr, "steps": job.asked.steps}
     best: dict[str, Any] = {name: values[0] for name, values in tried.items()}
     if why := job.too_few(percent):
         job.say(f"{percent:g} %: {kind}: {why}: the first of --lr and --steps is used")
         return best
     for name, values in tried.items():
         if len(values) > 1:
-            scores = [_held_out_score(job, percent, kind, {**best, name: value}) for value in values]
-            best[name] = values[int(np.argmax(scores))]  # the first of equals
+            errors = [_held_out_error(job, percent, kind, {**best, name: value}) for value in values]
+            best[name] = values[int(np.argmin(errors))]  # the first of equals
     return best
 
 
-def _held_out_score(job: _Job, percent: float, kind: str, settings: dict[str, Any]) -> float:
-    """Score on held-out groups, mean over tasks; from choice.json if it was tried before."""
+def _held_out_error(job: _Job, percent: float, kind: str, settings: dict[str, Any]) -> float:
+    """``mean_error`` on held-out groups; from choice.json if these settings were tried on this data before."""
     file, work = job.folder(percent) / "choice.json", job.folder(percent) / "choice"
-    tried: dict[str, float] = read_json(file, "what was tried") if file.exists() else {}
+    tried: dict[str, dict[str, list[float]]] = read_json(file, "what was tried") if file.exists() else {}
     run = job.run_of(percent, 0, kind, settings, hold_out=True)
-    name = f"{kind}: {', '.join(f'{key} {value}' for key, value in settings.items())} ({run.digest()[:8]})"
+    key = digest([run.digest(), job.pack.digest])[:8]
+    name = f"{kind}: {', '.join(f'{name} {value}' for name, value in settings.items())} ({key})"
     if name not in tried:
-        train(run, work / run.digest()[:8], resume=True, quiet=True, pack=job.pack, validate=False)
-        learned, model = run.method.training_rows(job.pack), load(work / run.digest()[:8])
+        train(run, work / key, resume=True, quiet=True, pack=job.pack, validate=False)
+        learned, model = run.method.training_rows(job.pack), load(work / key)
         held = np.setdiff1d(job.method(percent, 0).training_rows(job.pack), learned)
         found = own_heads(model, job.pack, job.tasks, [job.modality], held)
-        tried[name] = float(np.mean([record["r2" if "r2" in record else "accuracy"] for record in found]))
+        tried[name] = {record["task"]: each_score(record) for record in found}
         write_json(file, tried, sealed=True)
-        job.say(f"{percent:g} %: {name}: {100 * tried[name]:.1f} on held-out {job.pack.spec.group_by}s")
+        said = ", ".join(f"{task} {100 * np.mean(scores):.1f}" for task, scores in tried[name].items())
+        job.say(f"{percent:g} %: {name}: {said} on held-out {job.pack.spec.group_by}s")
     shutil.rmtree(work, ignore_errors=True)
-    return tried[name]
+    return mean_error(tried[name].values())
 
 
 def _frozen(job: _Job, percent: float, seed: int, task: AnyTask) -> dict[str, Any]:

@@ -212,11 +212,6 @@ class MethodConfig(Registered, ABC):
             )
 
     @property
-    def heads_from_probes(self) -> bool:
-        """Whether the heads start as linear probes of the start weights' features (``training.heads``)."""
-        return False
-
-    @property
     def label_splits(self) -> tuple[str, ...]:
         """Splits whose labels ``Views.labels`` has."""
         return ("train",)

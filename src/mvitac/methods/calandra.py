@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from mvitac.data.spec import DataSpec
 from mvitac.methods.supervised import LabelledConfig, Supervised
-from mvitac.nn.encoders import EncoderConfig, Encoders, build_trunk, last_map, num_features
+from mvitac.nn.encoders import EncoderConfig, Encoders, build_trunk, num_features
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,3 @@ class Streams(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         return torch.cat([trunk(x) for trunk, x in zip(self.trunks, images.split(3, dim=1), strict=True)], dim=1)
-
-    def last_map(self, images: Tensor) -> Tensor:
-        """The streams' maps one after the other: [B, S P, D]."""
-        return torch.cat([last_map(trunk, x) for trunk, x in zip(self.trunks, images.split(3, dim=1), strict=True)], 1)

@@ -21,7 +21,6 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
 from mvitac.nn.encoders import Encoders, build_trunk, is_locked, num_features
-from mvitac.nn.finetuning import AttentivePool, Part, freeze_statistics, merged, train_part
 from mvitac.registry import unknown
 
 
@@ -122,14 +121,8 @@ class SupervisedConfig(LabelledConfig):
 
     name: ClassVar[str] = "supervised"
 
-    train: Part = "all"
-    """What of the trunks is trained, beside the heads. all. last-stage. lora: low-rank updates of all layers, and
-    BatchNorm. attentive: an attention over the last feature map that is added to the pooled features. head: nothing."""
-    rank: int = 8
-    """Rank of the updates of lora."""
-    heads_from: Literal["random", "probe"] = "random"
-    """Start of the heads. probe: linear probes fitted on the start features of the training rows (LP-FT,
-    arXiv:2202.10054)."""
+    train: Literal["all", "head"] = "all"
+    """What is trained: trunks and heads, or the heads alone."""
     share: float = 1.0
     """Share of the labelled groups to learn from, drawn at random; at least one group of each class."""
     draw: int = 1
@@ -138,13 +131,9 @@ class SupervisedConfig(LabelledConfig):
     """Leave out some of these groups, on which settings are chosen: those of split val, else a fifth."""
 
     def __post_init__(self) -> None:
-        self.check_fields(width=("rank", "draw"))
+        self.check_fields(width=("draw",))
         if not 0 < self.share <= 1:
             raise ValueError(f"share {self.share}: give a share of the groups, above 0, at most 1")
-
-    @property
-    def heads_from_probes(self) -> bool:
-        return self.heads_from == "probe"
 
     def training_rows(self, pack: Pack) -> np.ndarray:
         rows = super().training_rows(pack)
@@ -178,21 +167,16 @@ class SupervisedConfig(LabelledConfig):
 
     def build(self, spec: DataSpec, encoder: Encoders) -> "Supervised":
         trunks = {m: build_trunk(encoder[m], spec.channels(m), spec.frames(m)) for m in self.modalities_of(spec)}
-        for m in trunks if self.train == "attentive" else ():
-            trunks[m] = AttentivePool(trunks[m])
         width = sum(num_features(trunk) for trunk in trunks.values())
-        return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)), self.train, self.rank)
+        return Supervised(trunks, self.heads(spec, lambda num: nn.Linear(width, num)), self.train == "all")
 
 
 class Supervised(Method):
-    """One head per task on the concatenated features. Of the trunks, ``part`` is trained (``nn.finetuning.train_part``)."""
+    """One head per task on the concatenated features. Trunks that are not trained keep their statistics, too."""
 
-    def __init__(
-        self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module], part: Part = "all", rank: int = 8
-    ) -> None:
+    def __init__(self, trunks: dict[str, nn.Module], classifiers: dict[str, nn.Module], trained: bool = True) -> None:
         super().__init__()
-        self.part: Part = part
-        self.rank = rank
+        self.trained = trained
         self.trunks = nn.ModuleDict(trunks)
         # A list, because task names may contain characters that module names may not.
         self.tasks = tuple(classifiers)
@@ -213,12 +197,12 @@ class Supervised(Method):
     def prepare(self, rows: Tensor) -> None:
         for trunk in self.trunks.values():
             if not is_locked(trunk):
-                train_part(trunk, self.part, self.rank)
+                trunk.requires_grad_(self.trained)
 
     def train(self, mode: bool = True) -> Self:
         super().train(mode)
-        for trunk in self.trunks.values() if self.part != "all" else ():
-            freeze_statistics(trunk)
+        if not self.trained:
+            self.trunks.eval()
         return self
 
     def learn_scale(self, values: dict[str, Tensor]) -> None:
@@ -227,7 +211,7 @@ class Supervised(Method):
                 head.learn_scale(values[task])
 
     def encoders(self) -> dict[str, nn.Module]:
-        return {m: merged(trunk) for m, trunk in self.trunks.items()}
+        return dict(self.trunks.items())
 
     def classifiers(self) -> dict[str, nn.Module]:
         return dict(zip(self.tasks, self.heads, strict=True))

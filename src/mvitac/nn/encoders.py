@@ -2,7 +2,6 @@
 
 import copy
 import difflib
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any, Literal
 
 import timm
 import torch
-import torch.nn.functional as F
 from timm.data.constants import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
 from timm.models import PretrainedCfg, register_model
 from timm.models.resnet import BasicBlock, ResNet
@@ -25,7 +23,6 @@ from mvitac.nn.weights import load_weights, read_tensors, stem_names
 from mvitac.system.files import brief
 
 IMAGENET, SCRATCH = "imagenet", "scratch"
-MAP_SIDE = 7  # a feature map for probes has at most this many places on a side: that of ResNet-18 at 224 px
 _VITS = ("timm.models.vision_transformer", "timm.models.deit", "timm.models.eva")
 """timm's files of ViTs that take images of any size ..."""
 _ANY_SIZE = {"dynamic_img_size": True, "dynamic_img_pad": True}
@@ -192,45 +189,12 @@ class PerFrame(nn.Module):
         features = self.trunk(self._each(images)).unflatten(0, (-1, self.frames))
         return features.mean(1) if self.score is None else (self._weights(features).unsqueeze(2) * features).sum(1)
 
-    def last_map(self, images: Tensor) -> Tensor:
-        """The same mean of the frames' maps: [B, P, D]."""
-        each = self._each(images)
-        maps = last_map(self.trunk, each).unflatten(0, (-1, self.frames))
-        if self.score is None:
-            return maps.mean(1)
-        weights = self._weights(self.trunk(each).unflatten(0, (-1, self.frames)))
-        return (weights[:, :, None, None] * maps).sum(1)
-
     def _each(self, images: Tensor) -> Tensor:
         return images.unflatten(1, (self.frames, -1)).flatten(0, 1)
 
     def _weights(self, features: Tensor) -> Tensor:
         assert self.score is not None
         return (self.score(features).squeeze(2) + self.age).softmax(dim=1)
-
-
-def last_map(trunk: nn.Module, images: Tensor) -> Tensor:
-    """The places of a trunk's last feature map, before pooling: [B, C, H, W] to [B, P, D].
-
-    Maps larger than 7 x 7 places are averaged to 7 x 7. Tokens that are no place (class, registers) are kept, in front.
-    """
-    if not hasattr(trunk, "forward_features"):
-        return trunk.last_map(images)  # type: ignore[operator]
-    found = trunk.forward_features(images)  # type: ignore[operator]
-    if found.ndim == 3:  # [B, tokens, D]
-        front = int(getattr(trunk, "num_prefix_tokens", 0))
-        side = math.isqrt(found.shape[1] - front)
-        grid: tuple[int, ...] = getattr(trunk, "grid", (1, side, side))  # steps of time, rows, columns
-        if max(grid[1:]) <= MAP_SIDE or math.prod(grid) != found.shape[1] - front:
-            return found
-        places = found[:, front:].mT.unflatten(2, grid).flatten(1, 2)
-        places = F.adaptive_avg_pool2d(places, (min(grid[1], MAP_SIDE), min(grid[2], MAP_SIDE)))
-        places = places.unflatten(1, (-1, grid[0])).flatten(2).mT
-        return torch.cat([found[:, :front], places], dim=1)
-    if found.shape[1] != num_features(trunk) == found.shape[3]:
-        found = found.permute(0, 3, 1, 2)  # timm's Swin has channels last
-    height, width = (min(side, MAP_SIDE) for side in found.shape[2:])
-    return F.adaptive_avg_pool2d(found, (height, width)).flatten(2).mT
 
 
 def _with_stem(config: EncoderConfig, channels: int) -> nn.Module:

@@ -9,7 +9,6 @@ import tyro
 from torch import Tensor, nn
 
 from mvitac.nn.encoders import PerFrame
-from mvitac.nn.finetuning import AttentivePool
 from mvitac.nn.weights import load_weights, misfit, read_safetensors, safetensors_digest
 
 MODEL = "model.safetensors"  # the file with the weights in the folder of a run or an artifact
@@ -72,9 +71,6 @@ def load_trunk(trunk: nn.Module, state: dict[str, Tensor], file: Path | str = "i
     sees a single image, take each other's weights. ValueError if they are different networks; ``trunk`` is then unchanged.
     """
     inner = {name.removeprefix("trunk."): value for name, value in state.items() if name.startswith("trunk.")}
-    if isinstance(trunk, AttentivePool) or "query" in state:  # a learned pooling starts anew
-        single = trunk.trunk if isinstance(trunk, AttentivePool) else trunk
-        return load_trunk(single, inner if "query" in state else state, file)
     single = trunk.trunk if isinstance(trunk, PerFrame) else trunk
     load_weights(single, inner or state, file)
     if isinstance(trunk, PerFrame) and inner and fits(trunk, state):

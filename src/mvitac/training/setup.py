@@ -225,7 +225,7 @@ def _build_method(
 
 
 def _before_first_step(setup: Setup) -> None:
-    """Estimate statistics of BatchNorm and fit heads, if the run asks for it. Their rows are a function of the seed."""
+    """Estimate statistics of BatchNorm, if the run asks for it. Their rows are a function of the seed."""
     run, method = setup.run, setup.method
     if run.renew_norms:
         if setup.world.size > 1:
@@ -236,10 +236,6 @@ def _before_first_step(setup: Setup) -> None:
         for module in method.modules():
             if isinstance(module, Momentum):
                 module.restart()
-    if run.method.heads_from_probes:
-        from mvitac.training.heads import fit_heads  # few runs need scikit-learn
-
-        fit_heads(method, run, setup.pack, setup.rows)
 
 
 @torch.no_grad()

@@ -1,7 +1,7 @@
 """Evaluation during training on held-out groups (split val, never test): what the features are worth, from step 0 on.
 
 A linear probe, kNN accuracy, retrieval and signs of collapse. The start (step 0) is the baseline. The best weights are
-those with the lowest errors of the linear probe (``_error``).
+those with the lowest errors of the linear probe (``diagnostics.mean_error``).
 """
 
 import math
@@ -59,14 +59,11 @@ class Validation:
         self.log.evaluation(step, values, self._verdict(cells) if last else "")
 
     def _verdict(self, cells: Cells) -> str:
-        start = self.kept.get("start")
-        if start is None:
-            return ""
+        start = self.kept["start"]
         text = verdict(start, cells, self.pack.spec.group_by)
-        best = self.kept.get("best_step")
-        if self.run.eval_every and cells and best is not None:
+        if self.run.eval_every and cells:
             change = 100 * (self.kept["best"] / _error(start) - 1)
-            text += f"; best at step {best} (errors {change:+.0f} % in the mean over tasks, {BEST})"
+            text += f"; best at step {self.kept['best_step']} (errors {change:+.0f} % in the mean over tasks, {BEST})"
         return text
 
 
@@ -193,12 +190,8 @@ def _scores(cell: Tensor) -> Tensor:
 
 
 def _error(cells: Cells) -> float:
-    """Geometric mean over tasks and modalities of the error, as a share of that of a guess; under .01 it counts as .01.
-
-    Halving it counts alike for every task. A mean of accuracies and R2, which has no lower end, would follow the worst R2.
-    """
-    each = [(1 - _scores(cell)).clamp(min=0.01).log().mean() for cell in cells.values()]
-    return float(torch.stack(each).mean().exp())
+    """``mean_error`` over tasks and modalities."""
+    return diagnostics.mean_error(_scores(cell).tolist() for cell in cells.values())
 
 
 def verdict(start: Cells, end: Cells, by: str) -> str:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mvitac.bench.external.preprocessing import Preprocessing
-from mvitac.nn.encoders import last_map, num_features
+from mvitac.nn.encoders import num_features
 from mvitac.system.files import brief
 
 
@@ -91,11 +91,6 @@ class ExternalEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         return self._pooled(self._prepared(images)).unflatten(0, (-1, self.layout.sensors)).flatten(1)
-
-    def last_map(self, images: Tensor) -> Tensor:
-        """Places [B, S P, D] of the last tokens or map, at most 7 x 7 per sensor and step of time."""
-        maps = last_map(self.network, self._prepared(images))
-        return maps.unflatten(0, (-1, self.layout.sensors)).flatten(1, 2)
 
     def _prepared(self, images: Tensor) -> Tensor:
         shape = (self.layout.frames, self.layout.sensors, 3)

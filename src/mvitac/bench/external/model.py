@@ -143,11 +143,6 @@ class ExternalModel(Model):
             )
         return found
 
-    @torch.no_grad()
-    def last_map(self, modality: str, images: Tensor) -> Tensor:
-        """Tokens or map [B, P, D] before pooling, of uint8 images [B, C, H, W]."""
-        return self.encoders[modality].last_map(images)  # type: ignore[operator]
-
     def describe(self) -> dict[str, Any]:
         """What is needed to repeat and to judge the scores, JSON-ready."""
         return {

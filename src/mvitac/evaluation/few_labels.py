@@ -1,0 +1,47 @@
+"""Few labels: the linear probe fitted on a share of the labelled rows. Its kind is named by ``name``."""
+
+import numpy as np
+
+from mvitac.data.pack import Pack
+from mvitac.data.spec import AnyTask, Task
+
+ENDING = " % of labels"
+
+
+def name(percent: float) -> str:
+    """The kind of a linear probe that sees this percentage of the labels, such as "10 % of labels"."""
+    return f"{percent:g}{ENDING}"
+
+
+def percent_of(kind: str) -> float:
+    """The percentage of labels that a probe of ``kind`` sees; 0 for another kind."""
+    return float(kind.removesuffix(ENDING)) if kind.endswith(ENDING) else 0.0
+
+
+def few(
+    pack: Pack, task: AnyTask, train: np.ndarray, val: np.ndarray, percent: float, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions among pack rows ``train`` and ``val`` of those that keep their label, drawn at random.
+
+    There is at least one row of each class; of values, one of each target, and of a single target two different values.
+    """
+    share = percent / 100
+    rng, strata = np.random.default_rng([seed, round(1000 * share)]), _strata(pack, task, train)
+
+    def some(rows: np.ndarray) -> np.ndarray:
+        order = rng.permutation(len(rows))
+        _, first = np.unique(strata[rows[order]], return_index=True)  # one of each class, then any
+        rest = np.setdiff1d(np.arange(len(rows)), first)
+        wanted = max(len(first), round(share * len(rows)))
+        return np.sort(order[np.concatenate([first, rest])[:wanted]])
+
+    return some(train), some(val)
+
+
+def _strata(pack: Pack, task: AnyTask, train: np.ndarray) -> np.ndarray:
+    """The class of each row of the pack; of values, which of them it has and whether they are low."""
+    if isinstance(task, Task):
+        return pack.labels(task.name)
+    values = pack.values(task)
+    low = (values < np.nanmedian(values[train], axis=0)).any(axis=1)
+    return np.unique(np.column_stack([np.isnan(values), low]), axis=0, return_inverse=True)[1]
