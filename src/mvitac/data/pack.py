@@ -214,7 +214,7 @@ class Pack:
 
     @functools.cached_property
     def presses(self) -> np.ndarray:
-        """int64 [N], number of each row's press (column press): its rows are moments of one press.
+        """int64 [N], number of each row's press (column press): its rows are of one spot, through several sensors.
 
         Raises:
             ValueError: If the pack has no such column.

@@ -6,7 +6,6 @@ They are the default data: every experiment runs without a download. Results are
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -67,8 +66,6 @@ class MaterialsConfig(SimulatedConfig):
 
     touches: int = 5
     """Touches per instance, each with its own position, force, sensor and lamp."""
-    moments: int = 1
-    """Rows per touch: moments of one press, which differ in a little movement, force and noise (for same-press)."""
     difference: Annotated[bool, tyro.conf.arg(name="subtract-background")] = False
     """Store (touch - background) / 2 + 128, with the background of the same sensor; no contact is mid-gray."""
     makes: tuple[str, ...] = ()
@@ -82,16 +79,12 @@ class MaterialsConfig(SimulatedConfig):
         super().__post_init__()
         check_range(self, 1, math.inf, "touches")
         check_range(self, 0, 10_000, "sensors")
-        if not 1 <= self.moments <= 1000:
-            raise ValueError(f"moments {self.moments}: give moments per touch, 1 to 1000")
         for name in self.makes:
             if name not in SENSORS:
                 raise unknown("sensor", name, SENSORS)
         if bool(self.makes) + bool(self.sensors) + self.held_out_sensor > 1:
             raise ValueError("makes, sensors and held_out_sensor each say which sensors press: give one of them")
         check_range(self, 1, len(self.choice()), "sensors_per_press")
-        if self.sensors_per_press > 1 and self.moments > 1:
-            raise ValueError("a press has either several moments or several sensors: leave moments at 1")
 
     def choice(self) -> tuple[Sensor, ...]:
         """The sensors that a touch chooses from."""
@@ -104,7 +97,7 @@ class MaterialsConfig(SimulatedConfig):
         if self.held_out_sensor:
             return None
         few = min(-(-self.num // self.touches), 600)  # one touch of each of the first 600 instances at most
-        once = {"num": few, "touches": 1, "moments": 1, "sensors_per_press": 1}
+        once = {"num": few, "touches": 1, "sensors_per_press": 1}
         return replace(self, **once, makes=(), sensors=0, held_out_sensor=True)
 
     def source(self) -> Source:
@@ -141,34 +134,30 @@ class Materials(Source):
         return ["{:02d}-{:04d}-{:02d}".format(*self._address(i)) for i in range(self.config.num)]
 
     def fingerprint(self) -> dict[str, Any]:
-        known = self.config._fingerprint(materials.VERSION)
-        if not self.config.difference:  # omitted, to keep old digests valid
-            del known["difference"]
-        return known
+        return self.config._fingerprint(materials.VERSION)
 
     def samples_per_item(self) -> list[int]:
-        return [self.config.moments * self.config.sensors_per_press] * self.config.num
+        return [self.config.sensors_per_press] * self.config.num
 
     def _address(self, item: int) -> tuple[int, int, int]:
         num_classes, touches = len(materials.CLASSES), self.config.touches
         return item % num_classes, item // num_classes // touches, item // num_classes % touches
 
     def read(self, item: int) -> list[Sample]:
-        numbers = product(range(self.config.moments), range(self.config.sensors_per_press))
-        return [self._moment(*self._address(item), moment, through) for moment, through in numbers]
+        return [self._through(number, *self._address(item)) for number in range(self.config.sensors_per_press)]
 
-    def _moment(self, category: int, instance: int, touch: int, moment: int, through: int) -> Sample:
-        config, which = self.config, {"moment": moment, "through": through}
+    def _through(self, number: int, category: int, instance: int, touch: int) -> Sample:
+        config = self.config
         asked: Any = {"background": config.difference, "measured": config.contact, "sensors": config.choice()}
-        made = materials.touch(config.seed, category, instance, touch, size=config.size, **which, **asked)
+        made = materials.touch(config.seed, category, instance, touch, size=config.size, through=number, **asked)
         labels = {f"label_{task}": int(made.pop(task)) for task in ("category", "soft", "rough")}
         vision, pressed = made.pop("vision"), made.pop("touch")
         if self.config.difference:
             pressed = difference(pressed, made.pop("background"))
         group = f"{category:02d}-{instance:04d}"
         name, press = f"{group}-{touch:02d}", {}
-        if self.config.moments > 1 or self.config.sensors_per_press > 1:
-            name, press = f"{name}-{moment + through:02d}", {"press": name}
+        if config.sensors_per_press > 1:
+            name, press = f"{name}-{number:02d}", {"press": name}
         # Of 20 instances of a class, 4 are in test and 3 in val. Instances are independent, so any fixed rule is fair.
         split = "test" if instance % 20 in (2, 7, 12, 17) else "val" if instance % 20 in (5, 10, 15) else "train"
         columns = {"id": name, "group": group, "touch_group": group, **press, "split": split, **labels, **made}

@@ -1,6 +1,4 @@
-"""Coordinates of the pictures of materials, and how they change between two moments of one press."""
-
-from dataclasses import dataclass
+"""Coordinates of the pictures of materials."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,42 +40,3 @@ def outline(x: F, y: F, rng: np.random.Generator, radius: float, curl: float) ->
         round_ = np.float32(radius) * (1 + np.float32(0.3) * lobes) - np.hypot(x, y)
         inside = np.float32(1 - curl) * inside + np.float32(curl) * round_
     return inside.astype(np.float32)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Motion:
-    """What changes from moment 0 of a press to a later one: camera and hand move a little, and the hand presses harder.
-
-    Object, lamp, clutter and sensor stay. The sizes were set by eye, for frames of a video some tenths of a second apart.
-    """
-
-    turn: float  # rotation of the camera in radians
-    shift: Place  # shift of the camera picture (x, y) in parts of its width
-    zoom: float  # factor of the camera's field of view
-    slip: Place  # movement of the object over the gel (x, y) in mm
-    force: float  # factor of the force, at least 1
-    noise: np.random.Generator  # source of the pixel noise of both pictures
-
-    @classmethod
-    def draw(cls, *numbers: int) -> "Motion":
-        """Draw a motion that depends only on ``numbers``."""
-        rng = np.random.default_rng(numbers)
-        return cls(
-            turn=rng.normal(0, 0.04),
-            shift=rng.normal(0, 0.03, 2),
-            zoom=float(np.exp(rng.normal(0, 0.03))),
-            slip=rng.normal(0, 0.4, 2),
-            force=float(np.exp(rng.uniform(0.0, 0.6))),
-            noise=rng,
-        )
-
-    def seen(self, x: F, y: F, width: float) -> tuple[F, F]:
-        """Camera coordinates x, y [n, n] in mm of a picture ``width`` mm wide, after the camera has moved."""
-        cos, sin = (np.float32(self.zoom * part) for part in (np.cos(self.turn), np.sin(self.turn)))
-        dx, dy = (np.float32(part * width) for part in self.shift)
-        return cos * x + sin * y + dx, cos * y - sin * x + dy
-
-    def felt(self, x: F, y: F, force: float, shear: Place) -> tuple[F, F, float, Place]:
-        """Gel coordinates x, y [n, n] in mm, force in N and shear in mm. The gel follows half of the slip."""
-        dx, dy = (np.float32(part) for part in self.slip)
-        return x - dx, y - dy, force * self.force, shear + self.slip / 2

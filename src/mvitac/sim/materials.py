@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mvitac.sim.coordinates import Motion, Place, grid, outline, turn
+from mvitac.sim.coordinates import Place, grid, outline, turn
 from mvitac.sim.gel import GEL_STIFFNESS, F, area_resize, contact, press, render
 from mvitac.sim.relief import Relief, draw_tables, fractal, marks
 from mvitac.sim.sensors import SENSORS, Sensor
@@ -137,7 +137,6 @@ def touch(
     *,
     size: int,
     background: bool = False,
-    moment: int = 0,
     measured: bool = False,
     sensors: Sequence[Sensor] = (),
     through: int = 0,
@@ -146,7 +145,6 @@ def touch(
 
     Args:
         background: Also return "background", the same copy of the sensor before contact.
-        moment: 0, or the number of a later moment of the same press (`motion.Motion`).
         measured: Also return depth, position and size of the contact (`gel.KNOWN`).
         sensors: Sensors to choose from; all else is the same. Default: all that are not held out.
         through: 0, or the number of a further sensor that is pressed on the same spot with the same force. It differs
@@ -155,19 +153,18 @@ def touch(
     Returns:
         "vision" and "touch" (uint8 [size, size, 3]), "category", "soft", "rough" and the latents.
     """
-    _check_request(seed, category, instance, touch, size, moment)
+    _check_request(seed, category, instance, touch, size)
     thing = draw_instance(seed, category, instance)
     # One random stream per picture, so that they are independent; pixel noise is drawn last in each.
     pose, eye, finger = np.random.default_rng([_TAG, seed, category, instance, touch]).spawn(3)
     angle, place = pose.uniform(0, 2 * np.pi), pose.uniform(-400, 400, 2)
-    motion = Motion.draw(_TAG, seed, category, instance, touch, moment) if moment else None
     choice = sensors or [s for s in SENSORS.values() if not s.held_out]
     if not 0 <= through < len(choice):
         raise ValueError(f"through {through}: there are {len(choice)} sensors for one spot, give a smaller number")
     again = np.random.default_rng([_TAG, seed, category, instance, touch, 0, through]) if through else None
-    vision = _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size, motion)
+    vision = _look(thing, again or eye, angle + (again or eye).normal(0, 0.1), place, size)
     pressed = _feel(
-        thing, finger, angle + finger.normal(0, 0.1), place, size, choice, background, motion, measured, through, again
+        thing, finger, angle + finger.normal(0, 0.1), place, size, choice, background, measured, through, again
     )
     return {
         "vision": vision,
@@ -186,8 +183,8 @@ def touch(
     }
 
 
-def _check_request(seed: int, category: int, instance: int, touch: int, size: int, moment: int) -> None:
-    for name, value in (("seed", seed), ("instance", instance), ("touch", touch), ("moment", moment)):
+def _check_request(seed: int, category: int, instance: int, touch: int, size: int) -> None:
+    for name, value in (("seed", seed), ("instance", instance), ("touch", touch)):
         if value < 0:
             raise ValueError(f"{name} must be >= 0, got {value}")
     if not 0 <= category < len(CLASSES):
@@ -196,14 +193,10 @@ def _check_request(seed: int, category: int, instance: int, touch: int, size: in
         raise ValueError(f"size must be {MIN_SIZE} to {MAX_SIZE} pixels, got {size}")
 
 
-def _look(
-    thing: Instance, rng: np.random.Generator, angle: float, place: Place, size: int, motion: Motion | None
-) -> NDArray[np.uint8]:
+def _look(thing: Instance, rng: np.random.Generator, angle: float, place: Place, size: int) -> NDArray[np.uint8]:
     """Render the object on a table with clutter under a lamp: uint8 [size, size, 3]."""
     x, y, pixel = grid(size, _CAMERA_MM * np.exp(rng.uniform(-0.25, 0.25)))
     width = float(x.shape[0] * pixel)
-    if motion:
-        x, y = motion.seen(x, y, width)
     curl = thing.curl
     inside = outline(x, y, rng, rng.uniform(0.42, 0.62) * width, curl)
     texture = thing.sight(*turn(x, y, angle, place))
@@ -230,8 +223,7 @@ def _look(
     vignette = 1 - np.float32(0.5 / width**2) * (x * x + y * y)
     picture = area_resize(picture * tint * ((1 + np.float32(drop) * ramp) * vignette)[..., None], size, size)
     picture = 255 * np.clip(picture, 0, 1.2) ** np.float32(0.8)
-    noise = motion.noise if motion else rng
-    picture = picture + noise.standard_normal(picture.shape, np.float32) * np.float32(grain)
+    picture = picture + rng.standard_normal(picture.shape, np.float32) * np.float32(grain)
     return np.clip(picture + 0.5, 0, 255).astype(np.uint8)
 
 
@@ -276,7 +268,6 @@ def _feel(
     size: int,
     choice: Sequence[Sensor],
     background: bool,
-    motion: Motion | None,
     measured: bool,
     through: int,
     again: np.random.Generator | None,
@@ -292,8 +283,6 @@ def _feel(
     tilt = rng.normal(0, 0.04, 2).astype(np.float32)
     shear = rng.normal(0, 0.25, 2)
     x, y, pixel = grid(size, _TOUCH_MM)
-    if motion:
-        x, y, force, shear = motion.felt(x, y, force, shear)
     u, v = turn(x, y, angle, place)
     curl = thing.curl
     # Soft objects deform, which would make their imprints shallower, so their relief is higher.
@@ -315,8 +304,7 @@ def _feel(
     if again is not None:
         rng, gain = again, float(np.exp(again.uniform(*np.log((0.5, 1.2)))))
     unit = int(rng.integers(2**31))
-    noise = motion.noise if motion else rng
-    draw = partial(render, sensor=sensor, rng=noise, pixel_mm=pixel, size=size, unit=unit, gain=gain)
+    draw = partial(render, sensor=sensor, rng=rng, pixel_mm=pixel, size=size, unit=unit, gain=gain)
     made: dict[str, Any] = {"touch": draw(imprint, shear_mm=(float(shear[0]), float(shear[1])))}
     if background:  # rendered last, so that other pictures do not change
         made["background"] = draw(np.zeros_like(imprint))
