@@ -91,9 +91,6 @@ class Run:
     data: DatasetConfig
     encoder: Encoders = Encoders()
     init: Init = Init()
-    renew_norms: int = 0
-    """Batches on which the running statistics of BatchNorm are estimated anew before the first step, for data of another
-    sensor than that of --init. 0 = keep them."""
     augment: Augment = Augment()
     optim: Optim = Optim()
     batch_size: int = 256
@@ -101,7 +98,7 @@ class Run:
     epochs: float = 240.0
     """Passes over the training rows (paper: 240)."""
     steps: int | None = None
-    """Number of steps. If given, epochs is ignored. 0 is for renew_norms alone."""
+    """Number of steps. If given, epochs is ignored."""
     sampler: Literal["shuffle", "one-per-touch", "spread"] = "shuffle"
     """Order of the rows. shuffle: random permutation (paper). The others keep near-duplicates from being negatives of each
     other: spread distributes the rows of a touch group over the whole epoch. one-per-touch takes one row of each group,
@@ -147,9 +144,7 @@ class Run:
             raise ValueError(f"positives_within {self.positives_within}: give a number of frames >= 0")
         if self.positives_within and self.positives == "same-image":
             raise ValueError("positives_within has no effect on same-image positives: choose --positives same-touch")
-        if not 0 <= self.renew_norms <= 1000:
-            raise ValueError(f"renew_norms {self.renew_norms}: give 0 to 1000 batches")
-        if self.steps is not None and self.steps < (0 if self.renew_norms else 1):
+        if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps {self.steps}: give at least 1, or leave it out to use epochs")
         if not 0 <= self.seed < 1 << 63:
             raise ValueError(f"seed {self.seed}: give a number from 0 to 2^63 - 1")
@@ -202,8 +197,6 @@ class Run:
                 f"encoder.{modality}.temporal {encoder.temporal} has no effect on single images: give --data.num-frames 2"
                 " or more, or leave it out"
             )
-        if encoder.locked and self.renew_norms:
-            raise ValueError(f"renew_norms would change the locked trunk of {modality}: leave one of them out")
         taken = self.init and modality in (self.init.modalities or spec.modalities)
         if encoder.locked and encoder.weights == SCRATCH and not taken:
             raise ValueError(f"{modality} is locked at random weights: give --encoder.{modality}.weights, or --init")

@@ -134,7 +134,7 @@ def _run_of(model: Model, ancestor: Path, data: DatasetConfig, pack: Pack, metho
     """Fine-tuning with all labels: light views at the size at which the frozen features are probed."""
     sides = {m: min(model.sides(m)[0], pack.size) for m in model.encoders}
     run = replace(model.run.fresh(), recipe="finetune", data=data, method=method, optim=OPTIM, precision="auto")
-    run = replace(run, init=Init(path=ancestor, modalities=method.modalities, heads=False).resolved(), renew_norms=0)
+    run = replace(run, init=Init(path=ancestor, modalities=method.modalities, heads=False).resolved())
     views: Any = {m: replace(LIGHT, size=side) for m, side in sides.items()}
     augment = Augment(size=max(sides.values()), **views)
     run = replace(run, augment=augment, sampler="shuffle", positives="same-image")

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.optim.swa_utils import update_bn
 
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
@@ -21,7 +20,6 @@ from mvitac.model import Model
 from mvitac.model_files import load
 from mvitac.nn.encoders import IMAGENET
 from mvitac.nn.imagenet import source
-from mvitac.nn.momentum import Momentum
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
 from mvitac.system.device import describe, pick_device, pick_precision
@@ -80,8 +78,6 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
     num_steps = run.num_steps(len(rows))
     setup = Setup(asked, run, pack, rows, device, world, method, views, step, done, num_steps, kept, spec)
-    if done == 0:
-        _before_first_step(setup)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere([*method.parameters(), *method.buffers()])
     if world.writes:
@@ -222,20 +218,6 @@ def _build_method(
     _check_image_size(method, run, pack)
     synchronise_norms(method, world)
     return method, taken
-
-
-def _before_first_step(setup: Setup) -> None:
-    """Estimate statistics of BatchNorm, if the run asks for it. Their rows are a function of the seed."""
-    run, method = setup.run, setup.method
-    if run.renew_norms:
-        if setup.world.size > 1:
-            raise ValueError("renew_norms works on one process only: leave it out, or start without torchrun")
-        steps = setup.chunks(0, run.renew_norms)
-        with setup.step.autocast():  # views are in the precision of the run
-            update_bn((chunk() for chunks in steps for chunk in chunks), method)
-        for module in method.modules():
-            if isinstance(module, Momentum):
-                module.restart()
 
 
 @torch.no_grad()
