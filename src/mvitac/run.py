@@ -28,11 +28,9 @@ class Optim:
     """The optimiser and its learning-rate schedule."""
 
     name: Literal["adam", "adamw", "sgd"] = "adam"
-    """Optimiser (paper: Adam)."""
+    """Optimiser (paper: Adam). sgd has momentum .9."""
     lr: float = 0.03
     """Peak learning rate (paper: .03)."""
-    betas: tuple[float, float] = (0.9, 0.999)
-    """Decay rates of Adam. The first is the momentum of SGD."""
     eps: float = 1e-7
     """Epsilon of Adam (paper: 1e-7)."""
     weight_decay: float = 0.0
@@ -48,8 +46,6 @@ class Optim:
     def __post_init__(self) -> None:
         if not (self.lr > 0 and math.isfinite(self.lr)):
             raise ValueError(f"optim lr {self.lr}: give a positive learning rate")
-        if not (0 <= self.betas[0] < 1 and 0 <= self.betas[1] < 1):
-            raise ValueError(f"optim betas {self.betas}: give two numbers in [0, 1)")
         if not (self.eps > 0 and math.isfinite(self.eps)):
             raise ValueError(f"optim eps {self.eps}: give a positive number")
         if not (self.weight_decay >= 0 and math.isfinite(self.weight_decay)):

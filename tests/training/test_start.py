@@ -279,8 +279,6 @@ def test_mistakes_are_one_line(pack: Pack, smoke_run: Path, tmp_path: Path, caps
             [f"--init={smoke_run}", "--encoder.trunk", "resnet10t"],
             "does not fit this run (vision: its trunk is mvitac_tiny",
         ),
-        (["--init", str(only_touch), "--init.modalities", "vision"], "(vision: it has touch only)"),
-        (["--init.modalities", "vision"], "name them, --init RUN"),
     ]
     for words, expected in cases:
         assert main([*data, *words, "--out", str(tmp_path / "out")]) == 2, words

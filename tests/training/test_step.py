@@ -199,7 +199,7 @@ def test_norms_and_biases_are_not_decayed_unless_asked() -> None:
 def test_layers_nearer_the_images_learn_more_slowly(decay_norms: bool) -> None:
     """layer_decay .5: decoders at full rate, the last block and its norm at half of it, the one before at half of that."""
     run = replace(RUN, method=small("mae"), encoder=TINY_VIT.changed(layer_decay=0.5))
-    optim = Optim(name="sgd", betas=(0.0, 0.9), weight_decay=0.1, decay_norms=decay_norms)
+    optim = Optim(name="sgd", weight_decay=0.1, decay_norms=decay_norms)
     method = build(run)
     before = {name: p.clone() for name, p in method.named_parameters()}
     step = Step(replace(run, optim=optim), method, CPU)

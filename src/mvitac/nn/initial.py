@@ -21,10 +21,10 @@ class Init:
     path: Path | None = None
     """Folder of a finished run or of an artifact, or a .safetensors file with weights. `--init X` is short for
     `--init.path X`. Adapted where the number of channels differs."""
-    modalities: tuple[Literal["vision", "touch"], ...] = ()
+    modalities: tyro.conf.Suppress[tuple[Literal["vision", "touch"], ...]] = ()
     """Encoders to take. Default: all that fit, and at least one."""
-    heads: bool = True
-    """Also take the heads into the space shared by both modalities, where they fit. --init.no-heads leaves them."""
+    heads: tyro.conf.Suppress[bool] = True
+    """Also take the heads into the space shared by both modalities, where they fit."""
     digest: tyro.conf.Suppress[str] = ""
     """sha256 of the weights. Training records it."""
 

@@ -82,9 +82,7 @@ def load_start(start: Start, method: Method) -> dict[str, Any]:
             taken[modality].append("head")
     if reasons and (init.modalities or not taken):
         why = "; ".join(f"{modality}: {reason}" for modality, reason in reasons.items())
-        hint = (
-            "give other --init.modalities, or another --init" if taken else "give weights of the same --encoder.trunk"
-        )
+        hint = "give another --init" if taken else "give weights of the same --encoder.trunk"
         raise ValueError(f"init {init.path} does not fit this run ({why}): {hint}")
     for module in method.modules():
         if isinstance(module, Momentum):

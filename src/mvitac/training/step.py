@@ -143,10 +143,9 @@ def build_optimiser(config: Optim, method: Method, encoders: Encoders) -> torch.
         matrices = [p for p in parameters if p.ndim > 1]
         parameters = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
     if config.name == "sgd":
-        momentum, decay = config.betas[0], config.weight_decay
-        return torch.optim.SGD(parameters, config.lr, momentum=momentum, weight_decay=decay, fused=fused)
+        return torch.optim.SGD(parameters, config.lr, momentum=0.9, weight_decay=config.weight_decay, fused=fused)
     kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[config.name]
-    return kind(parameters, config.lr, config.betas, config.eps, config.weight_decay, fused=fused)
+    return kind(parameters, config.lr, eps=config.eps, weight_decay=config.weight_decay, fused=fused)
 
 
 def _scales(method: Method, encoders: Encoders) -> dict[int, float]:
