@@ -11,7 +11,7 @@ import safetensors.torch
 from mvitac.bench.external import open_model
 from mvitac.bench.external.timm_models import said
 from mvitac.data.pack import Pack
-from mvitac.evaluation.leaks import DECLARED, UNKNOWN, Scored, file_source, read_sources, weights_sources
+from mvitac.evaluation.leaks import DECLARED, UNKNOWN, Scored, file_source, read_sources, weights_files
 from mvitac.nn.encoders import build_trunk
 from mvitac.nn.initial import Init
 from mvitac.training.loop import train
@@ -25,7 +25,7 @@ SAID = [
 
 
 def weights(pack: Pack, folder: Path, text: str) -> Path:
-    trunk = build_trunk(smoke(pack).encoder, 3)
+    trunk = build_trunk(smoke(pack).encoder.touch, 3)
     header = {"trained_on": text} if text else None
     safetensors.torch.save_file(trunk.state_dict(), folder / "theirs.safetensors", metadata=header)
     return folder / "theirs.safetensors"
@@ -43,9 +43,9 @@ def test_start_weights_of_which_their_owner_says_it(
     assert own.name == "toy" and theirs.name == (f"{DECLARED}{text}" if text else "theirs.safetensors")
     assert Scored(pack).leak([theirs], pack.rows("test")) == leak
     run = smoke(pack)
-    run = replace(run, encoder=replace(run.encoder, weights=str(file)))
-    assert [source.name for source in weights_sources(run)] == [theirs.name]
-    encoder = open_model(f"external:{file},trunk={run.encoder.trunk},size=32")
+    run = replace(run, encoder=run.encoder.changed(weights=str(file)))
+    assert [file_source(file).name for file in weights_files(run)] == [theirs.name]
+    encoder = open_model(f"external:{file},trunk={run.encoder.touch.trunk},size=32")
     assert encoder.trained_on == (text or UNKNOWN,)
 
 

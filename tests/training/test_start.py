@@ -19,7 +19,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.publish import publish
-from mvitac.evaluation.leaks import read_sources, weights_sources
+from mvitac.evaluation.leaks import read_sources, weights_files
 from mvitac.experiments.plan import Plan, Row
 from mvitac.methods.byol import BYOLConfig
 from mvitac.methods.mvitac import MViTacConfig
@@ -229,7 +229,7 @@ def test_weights_of_a_file_are_a_leak_that_cannot_be_excluded(
     assert said.startswith("mvitac: warning: nothing says what ") and "trunk.safetensors was trained on" in said
     assert main(["probe", str(tmp_path / "run"), "--tasks", "pattern", "--no-controls"]) == 0
     assert " LEAK?" in capsys.readouterr().out
-    assert weights_sources(replace(run, encoder=encoder)) == []
+    assert weights_files(replace(run, encoder=encoder)) == []
 
 
 def test_pretrain_warns_of_seen_test_rows(

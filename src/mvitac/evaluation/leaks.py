@@ -59,10 +59,10 @@ def file_source(file: Path) -> Source:
     return unknown_source(f"{DECLARED}{said}" if said else file.name)
 
 
-def weights_sources(run: Run) -> list[Source]:
-    """What the files of ``--encoder.weights`` learned from, if the run starts from some."""
+def weights_files(run: Run) -> list[Path]:
+    """The files of ``--encoder.weights``, if the run starts from some."""
     weights = dict.fromkeys(run.encoder[m].weights for m in MODALITIES)
-    return [file_source(Path(name)) for name in weights if name not in (IMAGENET, SCRATCH)]
+    return [Path(name) for name in weights if name not in (IMAGENET, SCRATCH)]
 
 
 def with_ancestors(own: Source, ancestors: Sequence[Source]) -> list[Source]:

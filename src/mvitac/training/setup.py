@@ -13,7 +13,7 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.data.windows import places
 from mvitac.datasets.base import DatasetConfig
-from mvitac.evaluation.leaks import FILE, source_of, weights_sources, with_ancestors, write_sources
+from mvitac.evaluation.leaks import FILE, file_source, source_of, weights_files, with_ancestors, write_sources
 from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model
@@ -118,7 +118,7 @@ def _record(setup: Setup, out: Path, start: Start | None, taken: dict[str, Any],
             print(f"mvitac: {line}", file=sys.stderr)
         write_json(out / "run.json", {**record, **provenance()}, sealed=True)
     if not (out / FILE).exists():
-        before = [*(start.sources if start else []), *weights_sources(run)]
+        before = [*(start.sources if start else []), *map(file_source, weights_files(run))]
         write_sources(out, with_ancestors(source_of(pack, setup.rows), before))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from mvitac.data.pack import Pack
-from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_sources
+from mvitac.evaluation.leaks import UNKNOWN, Scored, Source, file_source, read_sources, unknown_source, weights_files
 from mvitac.methods.base import Method
 from mvitac.model_files import load
 from mvitac.nn.initial import MODEL, Init, fits, load_trunk
@@ -114,14 +114,14 @@ def describe(record: dict[str, Any]) -> str:
 
 def warning(run: Run, start: Start | None, pack: Pack) -> str:
     """A line on rows of split test that start weights were trained on, or may have been; "" if there are none."""
-    sources = [*(start.sources if start else []), *weights_sources(run)]
+    sources = [*(start.sources if start else []), *map(file_source, weights_files(run))]
     if not sources:
         return ""
     tasks = pack.spec.all_tasks
     tested = [pack.rows("test", only=task.only, by=task.split) for task in tasks] or [pack.rows("test")]
     rows = np.unique(np.concatenate(tested))
     leak = Scored(pack).leak(sources, rows) if len(rows) else ""
-    path = start.init.path if start else ", ".join(source.name for source in sources)
+    path = start.init.path if start else ", ".join(map(str, weights_files(run)))
     if leak == UNKNOWN:
         return f"nothing says what {path} was trained on: leaks of test rows cannot be excluded"
     return leak and f"{path} has seen what this data tests: {leak}; `mvitac probe` will need --allow-leak"
