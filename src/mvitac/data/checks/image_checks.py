@@ -127,7 +127,8 @@ def swapped_modalities(pack: Pack, looks: dict[str, ImageStats]) -> Finding:
     # Both images of a row resemble the other modality: always if swapped, sometimes by chance.
     chance = float((as_touch > 0).mean() * (as_vision > 0).mean() * len(seen))
     look = len(bad) > 2 * chance + 3 * chance**0.5
-    evidence = f"{share(len(bad), len(seen))} look swapped, {chance:.1f} by chance{_where(pack, bad) if look else ''}"
+    where = _where(pack, bad) * look
+    evidence = f"{share(len(bad), len(seen))} look swapped, {chance:.1f} by chance{where}; a swap of all is not seen"
     advice = "look at the sheet (vision left, touch right); exchange the two paths or keys of these rows"
     return judged(item, evidence, advice, bad.tolist(), look=look)
 
