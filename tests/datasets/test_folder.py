@@ -787,5 +787,5 @@ def test_rows_that_share_something_are_told_where_no_group_is_given(tmp_path: Pa
     (note,) = FolderConfig(path=file, labels=("material",), split_seed=1).source().spec().notes
     assert re.search(r"also in train: press \d of \d, vision files 4 of 4\)$", note)
     assert not FolderConfig(path=file, labels=("material",), group="press").source().spec().notes
-    findings, _ = examine_source(FolderConfig(path=file, labels=("material",), size=16).source(), quiet=True)
+    findings = examine_source(FolderConfig(path=file, labels=("material",), size=16).source(), quiet=True)
     assert [(f.verdict, f.item) for f in findings if "vision files" in f.evidence] == [("look", "groups")]

@@ -147,10 +147,10 @@ def test_a_split_that_cuts_a_video_is_refused_and_seen_by_the_doctor(films: Path
     config = FolderConfig(path=table(films / "cut.csv", rows), size=16)
     with pytest.raises(ValueError, match=r"4 of 4 groups \(video\) are in more than one split, e\.g\. '0/gel\.avi'"):
         config.source()
-    findings, _ = examine_source(replace(config, allow_leak=True).source(), size=16, quiet=True)
+    findings = examine_source(replace(config, allow_leak=True).source(), size=16, quiet=True)
     (found,) = [finding for finding in findings if finding.item == "groups across splits"]
     assert found.verdict == "broken" and "group (video): 4 of 4 in more than one split" in found.evidence
-    findings, _ = examine_source(replace(config, split="by-group").source(), size=16, quiet=True)
+    findings = examine_source(replace(config, split="by-group").source(), size=16, quiet=True)
     assert [finding.verdict for finding in findings if finding.item == "groups across splits"] == ["ok"]
 
 

@@ -11,10 +11,10 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.image_grid import Block, Tile, draw, font, pair, wrap
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
+from mvitac.report.image_grid import Block, Tile, draw, font, pair, wrap
 from support.toy import Toy
 
 

@@ -10,14 +10,16 @@ from tabulate import tabulate
 from tyro.conf import Positional
 
 from mvitac.cli.options import check_json, parse, printed_to, save_json, selectors, short
-from mvitac.data.checks.examine import examine_open, examine_pack, examine_source
-from mvitac.data.checks.finding import exit_code
-from mvitac.data.image_grid import Block, draw
+from mvitac.data.checks.examine import Draw, examine_open, examine_pack, examine_source, nothing
+from mvitac.data.checks.finding import Finding, exit_code
+from mvitac.data.pack import Pack
 from mvitac.data.spec import Window
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.mix import open_packs
 from mvitac.datasets.table.table import RowsConfig
 from mvitac.registry import default
+from mvitac.report.contact_sheet import suspicious
+from mvitac.report.image_grid import draw
 from mvitac.system.files import check_place, write_atomic
 
 _MANUAL = """Examine a dataset: unreadable, constant, swapped, mislabelled, copied, leaking, out of step, outside train.
@@ -67,8 +69,10 @@ def check(argv: list[str]) -> int:
         _check_places(options)
         window = Window(frames=options.num_frames, stride=options.stride, order=options.order)
         single = len(options.pack) == 1
-        found = examine_pack(options.pack[0], window) if single else examine_open(open_packs(options.pack), window)
-        return _report(" + ".join(options.pack), *found, options)
+        name = " + ".join(options.pack)
+        given = window, _sheet(name, options)
+        found = examine_pack(options.pack[0], *given) if single else examine_open(open_packs(options.pack), *given)
+        return _report(name, found, options)
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
     options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
@@ -79,7 +83,8 @@ def check(argv: list[str]) -> int:
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     asked: Any = {"num": options.items, "size": options.thumbnail, "workers": data.workers, "quiet": options.quiet}
-    return _report(name, *examine_source(source, window=data.frame_window(), **asked), options)
+    asked |= {"window": data.frame_window(), "draw": _sheet(name, options)}
+    return _report(name, examine_source(source, **asked), options)
 
 
 def _check_places(options: _Options) -> None:
@@ -88,7 +93,19 @@ def _check_places(options: _Options) -> None:
         check_place(options.sheet)
 
 
-def _report(what: str, findings: Sequence[Any], blocks: Sequence[Block], options: _Options) -> int:
+def _sheet(what: str, options: _Options) -> Draw:
+    """What draws the contact sheet that ``options`` ask for."""
+    if not (out := options.sheet):
+        return nothing
+
+    def sheet(pack: Pack, findings: Sequence[Finding]) -> None:
+        write_atomic(out, lambda file: draw(what, suspicious(pack, findings)).save(file, format="PNG"))
+        print(f"written: {out}", file=printed_to(options.json))
+
+    return sheet
+
+
+def _report(what: str, findings: Sequence[Finding], options: _Options) -> int:
     """Print the findings, write the files that ``options`` name, and return the exit code."""
     code = exit_code(findings)
     rows = [[f.verdict, f.item, f.evidence + (f"\n-> {f.advice}" if f.advice else "")] for f in findings]
@@ -96,7 +113,4 @@ def _report(what: str, findings: Sequence[Any], blocks: Sequence[Block], options
     say = printed_to(options.json)
     print(f"{what}: {('ok', 'look', 'broken')[code]}", table, "", sep="\n", file=say)
     save_json(options.json, {"what": what, "exit_code": code, "findings": [asdict(f) for f in findings]})
-    if options.sheet:
-        write_atomic(options.sheet, lambda file: draw(what, blocks).save(file, format="PNG"))
-        print(f"written: {options.sheet}", file=say)
     return code

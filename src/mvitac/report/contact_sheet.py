@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from mvitac.data.image_grid import Block, Tile, contents, draw, pair
+from mvitac.data.checks.finding import Finding
 from mvitac.data.pack import Pack
 from mvitac.data.pack_table import SPLITS
 from mvitac.registry import unknown
+from mvitac.report.image_grid import Block, Tile, contents, draw, pair
 
 TASK = "label_"
+SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24  # pixels; rows shown of a finding; rows shown if nothing is suspicious
 
 
 @dataclass(frozen=True)
@@ -88,3 +90,21 @@ def to_image(pack: Pack, found: Sequence[Strip], num_all: int, *, side: int = 96
     title = f"{pack.spec.name}, {pack.num} rows at {pack.size} px; each pair: {contents(pack)}{left_out}"
     blocks = [Block(heading(strip, pack), [Tile(pair(pack, int(row), side)) for row in strip.rows]) for strip in found]
     return draw(title, blocks)
+
+
+def suspicious(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
+    """Return a block per finding of ``data check`` that lists rows. Without any, one block of rows drawn at random."""
+    order = f"each pair: {contents(pack)}"
+    wrong = [f for f in findings if f.rows and f.verdict in ("look", "broken")]
+    if wrong:
+        return [
+            Block(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN])) for f in wrong
+        ]
+    num = min(NUM_SAMPLE, pack.num)
+    rows = np.sort(np.random.default_rng(0).choice(pack.num, num, replace=False))
+    return [Block(f"No suspicious rows. {num} of {pack.num} rows, drawn at random ({order})", _tiles(pack, rows))]
+
+
+def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:
+    ids, splits = pack.column("id").astype(str), pack.column("split").astype(str)
+    return [Tile(pair(pack, int(row), SIDE), f"{ids[row]} {splits[row]}") for row in rows]

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from matplotlib import colormaps, colors
 
-from mvitac.data.image_grid import side_by_side
 from mvitac.data.pack import Pack
 from mvitac.deploy.publish import with_probes
 from mvitac.deploy.search import check_pack, nearest
@@ -20,6 +19,7 @@ from mvitac.evaluation.features import features, sample
 from mvitac.model import Model
 from mvitac.nn.linear_probe import ProbeInfo
 from mvitac.registry import unknown
+from mvitac.report.image_grid import side_by_side
 from mvitac.report.palette import COLOURS, MAP_HUES
 
 LEVELS = 32  # number of colours between the lowest and the highest value

@@ -16,16 +16,17 @@ from PIL import Image
 
 from mvitac.cli.main import main
 from mvitac.data.build import build
-from mvitac.data.checks.examine import blocks_of, examine, examine_pack, examine_source
+from mvitac.data.checks.examine import examine, examine_pack, examine_source
 from mvitac.data.checks.finding import Finding, exit_code
 from mvitac.data.checks.image_checks import MAX_LAG, motion_correlations
 from mvitac.data.checks.image_stats import area_means, look_at
 from mvitac.data.checks.name_checks import similar_names
-from mvitac.data.image_grid import MISSING, pair
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Sample, Source
 from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.folder import FolderConfig
+from mvitac.report.contact_sheet import suspicious
+from mvitac.report.image_grid import MISSING, Block, pair
 
 NUM_OBJECTS, NUM_FRAMES, SIDE = 20, 16, 32
 TEST, VAL = (3, 8, 13, 18), (4, 9)
@@ -235,7 +236,10 @@ def test_groups_of_two_parts_that_differ_in_spelling_only(pack: Pack) -> None:
 
 def test_a_source_is_examined_as_it_came(tmp_path: Path) -> None:
     """Only the source knows how large the images were; the pack made of it does not, and says so."""
-    findings, blocks = examine_source(Presses("sizes"), size=SIDE, quiet=True)
+    blocks: list[Block] = []
+    findings = examine_source(
+        Presses("sizes"), size=SIDE, quiet=True, draw=lambda pack, found: blocks.extend(suspicious(pack, found))
+    )
     found = {f.item: f for f in findings}["sensors and resolutions"]
     assert found.verdict == "look" and "vision_size: 32 x 32 75 %, 64 x 64 25 %" in found.evidence
     assert "vision_size 32 x 32 75 %" not in check("sizes", tmp_path)["sensors and resolutions"].evidence
@@ -252,13 +256,13 @@ def test_images_that_a_reader_shrinks_keep_their_size(tmp_path: Path) -> None:
         rows.append(f"{i}.png,{'ab'[i % 2]},g{i // 2}")
     (tmp_path / "m.csv").write_text("\n".join(rows))
     source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), size=40).source()
-    findings, _ = examine_source(source, size=SIDE, quiet=True)
+    findings = examine_source(source, size=SIDE, quiet=True)
     found = {f.item: f for f in findings}["sensors and resolutions"]
     assert found.verdict == "look" and "touch_size: 32 x 24 75 %, 64 x 48 25 %" in found.evidence
 
 
 def test_a_part_of_a_source_is_spread_over_it() -> None:
-    findings, _ = examine_source(Presses(), num=40, size=SIDE, quiet=True)
+    findings = examine_source(Presses(), num=40, size=SIDE, quiet=True)
     assert findings[0].evidence == "presses: 40 of 320 items examined, kept at 32 px"
     assert {f.item: f for f in findings}["classes of material"].verdict == "ok"
 
@@ -272,7 +276,7 @@ def test_a_part_of_a_source_proves_no_class_unseen(tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text("\n".join(rows))
     source = FolderConfig(path=tmp_path / "m.csv", labels=("label",), group="object", size=16).source()
     for num, verdict in ((0, "ok"), (12, "look")):
-        findings, _ = examine_source(source, num=num, size=16, quiet=True)
+        findings = examine_source(source, num=num, size=16, quiet=True)
         found = {f.item: f for f in findings}["classes of label"]
         assert found.verdict == verdict and exit_code(findings) <= ("ok", "look").index(verdict)
     assert found.evidence.startswith("in the items examined: 10 classes") and "never seen in training" in found.evidence
@@ -294,7 +298,7 @@ def test_a_damaged_pack_names_its_row_and_training_refuses_it(
     images = np.lib.format.open_memmap(path / "vision.npy", mode="r+")
     images[137, 5, 5, 0] ^= 1
     images.flush()
-    findings, _ = examine_pack(path)
+    findings = examine_pack(path)
     assert [f.verdict for f in findings] == ["broken"] and exit_code(findings) == 2
     assert "vision.npy does not match its digest in 1 of 320 rows, first row 137 (id '08-09')" in findings[0].evidence
     command = ["pretrain", "--data", "pack", "--data.path", str(path), "--recipe", "smoke"]
@@ -409,7 +413,7 @@ def test_missing_images_are_no_faults_of_the_others(tmp_path: Path) -> None:
             return [Sample(vision=None if gone else sample.vision, touch=sample.touch, columns=columns)]
 
     for fault in ("", "test"):
-        findings, _ = examine_source(Gaps(fault), size=SIDE, quiet=True)
+        findings = examine_source(Gaps(fault), size=SIDE, quiet=True)
         told = {f.item: f for f in findings}
         wrong = {f.item for f in findings if f.verdict in ("look", "broken")}
         assert wrong == ({"missing images"} if fault else set())
@@ -427,13 +431,13 @@ def test_a_gap_is_gray_on_the_sheet(tmp_path: Path) -> None:
             return [replace(sample, vision=sample.vision if item != 3 else None, columns=columns)]
 
     pack = build(Blind("constant"), tmp_path / "p", size=SIDE, quiet=True)
-    first = blocks_of(pack, examine(pack))[0].tiles[0].image
+    first = suspicious(pack, examine(pack))[0].tiles[0].image
     assert (first[48, 5] == MISSING).all() and (first[:, 96:] == 7).all()
 
 
 def test_without_suspicious_rows_the_sheet_is_a_sample(tmp_path: Path) -> None:
     pack = build(Presses(), tmp_path / "p", size=SIDE, quiet=True)
-    (block,) = blocks_of(pack, examine(pack))
+    (block,) = suspicious(pack, examine(pack))
     assert block.heading.startswith("No suspicious rows. 24 of 320 rows, drawn at random (each pair: camera, touch)")
     rows = [pack.column("id").tolist().index(tile.caption.split()[0]) for tile in block.tiles]
     assert len(set(rows)) == 24 and set(pack.column("split")[rows]) == {"train", "val", "test"}

@@ -1,7 +1,7 @@
 """Runs all checks on a pack, or on a source that is packed as thumbnails first."""
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,15 +10,18 @@ import numpy as np
 
 from mvitac.data.build import build
 from mvitac.data.checks import duplicates, image_checks, name_checks, table_checks, value_checks
-from mvitac.data.checks.finding import Finding
+from mvitac.data.checks.finding import Finding, judged
 from mvitac.data.checks.image_stats import look_at
-from mvitac.data.image_grid import Block, Tile, contents, pair
 from mvitac.data.pack import Pack
 from mvitac.data.source import Count, Lost, Sample, Source
 from mvitac.data.spec import DataSpec, Window
 
 SINGLE = Window()
-SIDE, NUM_SHOWN, NUM_SAMPLE = 96, 8, 24  # pixels; rows shown of a finding; rows shown if nothing is suspicious
+Draw = Callable[[Pack, Sequence[Finding]], None]
+
+
+def nothing(pack: Pack, findings: Sequence[Finding]) -> None:
+    """Draw no contact sheet."""
 
 
 class ThumbnailSource(Source):
@@ -96,23 +99,22 @@ def examine(
     ]
 
 
-def examine_pack(path: str | Path, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
-    """Check the pack at ``path``; return the findings and the blocks of the contact sheet."""
+def examine_pack(path: str | Path, window: Window = SINGLE, draw: Draw = nothing) -> list[Finding]:
+    """Check the pack at ``path``."""
     try:
         pack = Pack(path)
     except ValueError as error:
         if not (Path(path) / "pack.json").is_file():
             raise
-        found = Finding("pack", "broken", str(error), "make it again; training refuses it, too")
-        return [found], [Block(f"broken: pack. {error}")]
-    return examine_open(pack, window)
+        return [judged("pack", str(error), "make it again; training refuses it, too", broken=True)]
+    return examine_open(pack, window, draw)
 
 
-def examine_open(pack: Pack, window: Window = SINGLE) -> tuple[list[Finding], list[Block]]:
+def examine_open(pack: Pack, window: Window = SINGLE, draw: Draw = nothing) -> list[Finding]:
     """As ``examine_pack``, for a pack that is open."""
-    whole = Finding("pack", "ok", f"{pack.num} rows, every digest matches")
-    findings = [whole, *examine(pack, window=window)]
-    return findings, blocks_of(pack, findings)
+    findings = [Finding("pack", "ok", f"{pack.num} rows, every digest matches"), *examine(pack, window=window)]
+    draw(pack, findings)
+    return findings
 
 
 def examine_source(
@@ -123,8 +125,9 @@ def examine_source(
     workers: int = 1,
     quiet: bool = False,
     window: Window = SINGLE,
-) -> tuple[list[Finding], list[Block]]:
-    """Findings about ``source``, which is read into a temporary pack of ``size`` px, and the contact sheet's blocks.
+    draw: Draw = nothing,
+) -> list[Finding]:
+    """Findings about ``source``, which is read into a temporary pack of ``size`` px, to ``draw`` while it is there.
 
     ``num`` items are read, evenly spaced; 0 = all. Damaged items are a finding; it is an error only if nothing can be
     read.
@@ -136,24 +139,5 @@ def examine_source(
         findings = examine(pack, thumbnails.expected(), part=partly, window=window)
         read = f"{len(thumbnails.items())} of {len(source.items())} items examined, kept at {size} px"
         findings.insert(0, Finding("source", "ok", f"{pack.spec.name}: {read}"))
-        return findings, blocks_of(pack, findings)
-
-
-def blocks_of(pack: Pack, findings: Sequence[Finding]) -> list[Block]:
-    """Return a block per finding that lists rows. Without any, one block of rows drawn at random."""
-    order = f"each pair: {contents(pack)}"
-    blocks = [
-        Block(f"{f.verdict}: {f.item}. {f.evidence} ({order})", _tiles(pack, f.rows[:NUM_SHOWN]))
-        for f in findings
-        if f.rows and f.verdict in ("look", "broken")
-    ]
-    if blocks:
-        return blocks
-    num = min(NUM_SAMPLE, pack.num)
-    rows = np.sort(np.random.default_rng(0).choice(pack.num, num, replace=False))
-    return [Block(f"No suspicious rows. {num} of {pack.num} rows, drawn at random ({order})", _tiles(pack, rows))]
-
-
-def _tiles(pack: Pack, rows: Sequence[int] | np.ndarray) -> list[Tile]:
-    ids, splits = pack.column("id").astype(str), pack.column("split").astype(str)
-    return [Tile(pair(pack, int(row), SIDE), f"{ids[row]} {splits[row]}") for row in rows]
+        draw(pack, findings)
+        return findings

@@ -1,4 +1,4 @@
-"""Labelled grids of images, drawn as one picture: contact sheets and search results."""
+"""Labelled grids of images, drawn as one picture: contact sheets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,18 +11,17 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from mvitac.data.images import fit
 from mvitac.data.pack import Pack
 
-GAP, EDGE = 8, 3  # pixels between pictures, and of the coloured frame around one
+GAP = 8  # pixels between pictures
 INK, SOFT = "#1d232b", "#5a6470"
 MISSING, CROSS = (225, 225, 225), (150, 150, 150)  # colours of the tile that stands for a missing image
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One picture, uint8 [H, W, 3]. ``caption`` is printed below it, ``frame`` is the colour of a frame around it."""
+    """One picture, uint8 [H, W, 3]; ``caption`` is printed below it."""
 
     image: np.ndarray
     caption: str = ""
-    frame: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,47 +40,35 @@ def font(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
 
 
-def draw(
-    title: str, blocks: Sequence[Block], *, heads: Sequence[str] = (), width: int = 1280, across: int = 1
-) -> Image.Image:
-    """Draw ``blocks``, ``across`` of them side by side, as one picture.
+def draw(title: str, blocks: Sequence[Block], *, width: int = 1280) -> Image.Image:
+    """Draw ``blocks`` below each other as one picture.
 
-    Within a block, pictures fill rows of equal length. ``heads`` are headings of the columns of pictures. ``width`` in
-    pixels is kept if it has room for one picture.
+    Within a block, pictures fill rows of equal length. ``width`` in pixels is kept if it has room for one picture.
     """
-    tiles = [tile for block in blocks for tile in block.tiles]
-    cell = max((_framed(tile).width for tile in tiles), default=width // across - GAP)
+    cell = max((tile.image.shape[1] for block in blocks for tile in block.tiles), default=width - GAP)
     most = max((len(block.tiles) for block in blocks), default=1)
-    fitting = max(1, (width // across - GAP) // (cell + GAP))
+    fitting = max(1, (width - GAP) // (cell + GAP))
     columns = -(-most // -(-most // fitting)) if most else 1
-    room = max(columns * (cell + GAP), 0 if across > 1 else min(width, 480))
+    room = max(columns * (cell + GAP), min(width, 480))
     drawn = [_block(block, cell, columns, room) for block in blocks]
-    if heads:
-        head = _row([_text(text, cell, 13, SOFT) for text in heads], cell)
-        drawn[:across] = [_stack([head, first]) for first in drawn[:across]]
-    rows = [_row(drawn[i : i + across], room, GAP) for i in range(0, len(drawn), across)]
-    return ImageOps.expand(_stack([_text(title, (room + GAP) * across - GAP, 13, SOFT), *rows], GAP), GAP, "white")
+    return ImageOps.expand(_stack([_text(title, room, 13, SOFT), *drawn], GAP), GAP, "white")
 
 
 def _block(block: Block, cell: int, columns: int, room: int) -> Image.Image:
     captions = [[_text(tile.caption, cell, 12, INK)] if tile.caption else [] for tile in block.tiles]
-    cells = [_stack([_framed(tile), *under], 2) for tile, under in zip(block.tiles, captions, strict=True)]
-    rows = [_row(cells[i : i + columns], cell, GAP) for i in range(0, len(cells), columns)]
+    images = [Image.fromarray(np.ascontiguousarray(tile.image)) for tile in block.tiles]
+    cells = [_stack([image, *under], 2) for image, under in zip(images, captions, strict=True)]
+    rows = [_row(cells[i : i + columns], cell) for i in range(0, len(cells), columns)]
     heading = [_text(block.heading, room, 14, INK)] if block.heading else []
     return _stack([*heading, *rows], 4)
 
 
-def _framed(tile: Tile) -> Image.Image:
-    image = Image.fromarray(np.ascontiguousarray(tile.image))
-    return ImageOps.expand(image, EDGE, tile.frame) if tile.frame else image
-
-
-def _row(images: Sequence[Image.Image], step: int, gap: int = GAP) -> Image.Image:
-    """Images side by side, one every ``step + gap`` pixels."""
-    width = (len(images) - 1) * (step + gap) + max(step, images[-1].width)
+def _row(images: Sequence[Image.Image], step: int) -> Image.Image:
+    """Images side by side, one every ``step + GAP`` pixels."""
+    width = (len(images) - 1) * (step + GAP) + max(step, images[-1].width)
     row = Image.new("RGB", (width, max(image.height for image in images)), "white")
     for place, image in enumerate(images):
-        row.paste(image, (place * (step + gap), 0))
+        row.paste(image, (place * (step + GAP), 0))
     return row
 
 
