@@ -14,7 +14,7 @@ from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.data.source import Sample
 from mvitac.report import contact_sheet
-from mvitac.report.image_grid import Block, Tile, draw, font, pair, wrap
+from mvitac.report.image_grid import Block, Tile, draw, pair
 from support.toy import Toy
 
 
@@ -105,15 +105,6 @@ def test_mistakes_in_one_line(
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_text_is_broken_between_words_and_never_wider_than_its_room() -> None:
-    face = font(12)
-    text = "look: constant frames of object_0001/a-very-long-name-without-any-space-000123.png and others"
-    lines = wrap(text, 120, face)
-    assert max(map(face.getlength, lines)) <= 120 and len(lines) > 3
-    assert "".join(lines).replace(" ", "") == text.replace(" ", "")
-    assert lines[0] == "look: constant" and lines[-1].endswith("others")
 
 
 def test_a_grid_wraps_its_pictures_and_keeps_captions_below_them() -> None:
