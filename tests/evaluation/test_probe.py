@@ -22,7 +22,7 @@ from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.evaluation import features as features_module
 from mvitac.evaluation.classifiers import fit_papers, train_heads
-from mvitac.evaluation.evaluate import END_TO_END, ProbeConfig, probe_runs
+from mvitac.evaluation.evaluate import ProbeConfig, probe_runs
 from mvitac.evaluation.probe import probe_all, probe_features, probe_model, split_rows
 from mvitac.evaluation.retrieval import cross_modal
 from mvitac.evaluation.run_names import _places
@@ -30,7 +30,7 @@ from mvitac.evaluation.scores import summarise
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.model_files import fresh, load
 from mvitac.recipes import recipe
-from mvitac.report.report import _as_scored, open_runs
+from mvitac.report.report import open_runs
 from mvitac.report.tables import print_retrieval, print_summary
 from mvitac.run import Optim
 from mvitac.training.loop import train
@@ -302,13 +302,6 @@ def test_runs_are_told_apart_by_the_end_of_their_path() -> None:
     assert _places([[a / "seed0", a / "seed1"], [b / "seed0", b / "seed1"]]) == ["a", "b"]
     assert _places([[a, b], [c]]) == ["runs", "c"]
     assert _places([[a, b], [c, Path("/runs/d")]]) == ["a, b", "c, d"]
-
-
-def test_a_report_of_an_older_result_keeps_its_names(runs: list[Path], tmp_path: Path) -> None:
-    opened = open_runs(runs)
-    older = {"records": [{"run": str(run.path), "source": "older" + END_TO_END} for run in opened], "retrieval": []}
-    assert [run.source for run in _as_scored(opened, older)] == ["older", "older"]
-    assert _as_scored(opened, {"records": [], "retrieval": []}) == opened
 
 
 def test_heads_trained_together_are_the_heads_trained_alone() -> None:
