@@ -11,7 +11,6 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -62,7 +61,8 @@ class Job:
 
     @property
     def done(self) -> bool:
-        return bool(self.failure) or _scored(self.out / "scores.json") == self.asked
+        path = self.out / "scores.json"
+        return bool(self.failure) or (path.exists() and read_json(path, "a run's scores")["asked"] == self.asked)
 
     def seconds(self) -> float:
         """Seconds of training."""
@@ -72,19 +72,6 @@ class Job:
         """Delete the checkpoints. A scored run needs none, and one is four times as large as the weights."""
         for name in (CHECKPOINT, PREVIOUS):
             (self.out / name).unlink(missing_ok=True)
-
-
-def _scored(path: Path) -> dict[str, Any] | None:
-    """``Job.asked`` of the scores in ``path``; None if there are none."""
-    try:
-        return _asked(path, path.stat().st_mtime_ns)
-    except FileNotFoundError:
-        return None
-
-
-@cache
-def _asked(path: Path, changed: int) -> dict[str, Any]:
-    return read_json(path, "a run's scores")["asked"]
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,6 @@
 """Which device a run computes on and in which precision, and their names for the record."""
 
-import time
-
 import torch
-
-SIDE = 256  # of the matrices in ``slowdown``: a product takes 10 ms where bf16 is 30 times as slow as fp32
 
 
 def pick_device(name: str) -> torch.device:
@@ -62,29 +58,8 @@ def describe_precision(asked: str, precision: str, device: torch.device) -> str:
     if asked == "auto":
         lacks = "" if precision == "bf16" else f", as this {kind} does not compute bf16 itself"
         return f"precision: {precision} (auto{lacks})"
-    slower = 1.0 if precision != "bf16" or has_bf16(device) else slowdown(device)
-    if slower <= 1:
-        return f"precision: {precision}"
-    return (
-        f"precision: bf16, which is emulated on this {kind}: a {SIDE}x{SIDE} product takes"
-        f" {slower:.{0 if slower >= 10 else 1}f} times as long as in fp32. Use --precision auto or fp32."
-    )
-
-
-def slowdown(device: torch.device) -> float:
-    """How many times as long as in fp32 a small matrix product takes in bf16, measured now, on a CPU with one thread."""
-    least = []
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # others may wait for each other on a busy machine
-    try:
-        for dtype in (torch.float32, torch.bfloat16):
-            matrix = torch.ones(SIDE, SIDE, device=device, dtype=dtype)
-            seconds = []
-            for _ in range(6):  # the first prepares the kernel
-                start = time.perf_counter()
-                (matrix @ matrix)[0, 0].item()  # waits for a GPU
-                seconds.append(time.perf_counter() - start)
-            least.append(min(seconds))
-    finally:
-        torch.set_num_threads(threads)
-    return least[1] / least[0]
+    if precision == "bf16" and not has_bf16(device):
+        return (
+            f"precision: bf16, which this {kind} only emulates, up to 100 times as slow as fp32: use --precision auto"
+        )
+    return f"precision: {precision}"
