@@ -392,7 +392,6 @@ DAMAGED: list[tuple[str, Callable[[dict[str, Any]], Any]]] = [
     ("check", lambda value: value["encoder"].pop("seeds")),
     ("check", lambda value: value.update(blocks=["x"])),
     ("board", lambda value: first(value).update(modality=["touch"])),
-    ("board", lambda value: value["encoder"].update(licence=["x"])),
     ("board", lambda value: value["encoder"].update(parameters=3)),
     ("board", lambda value: value["blocks"][0].pop("data")),
 ]

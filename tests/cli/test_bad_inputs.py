@@ -170,7 +170,6 @@ WORDS: list[tuple[str, str, str]] = [
     ("probe ", "", "run's folder"),
     ("probe ", "{tmp}/nowhere", "no trained model at {tmp}/nowhere"),
     ("probe ", "{pack}", "no trained model"),
-    ("export {run} --out {out} ", "--min-cosine nan", "nan"),
     (PACKED, "--values text:N", "'hard'"),
     (PACKED, "--values united:N", "'3.2 mN'"),
     (PACKED, "--values endless:N", "'inf'"),
