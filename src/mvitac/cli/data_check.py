@@ -66,7 +66,6 @@ def check(argv: list[str]) -> int:
     chosen, rest = selectors(argv, ("--data",))
     if "--data" not in chosen:
         options = parse(_PackOptions, rest, "data check", description=_MANUAL)
-        _check_places(options)
         window = Window(frames=options.num_frames, stride=options.stride, order=options.order)
         single = len(options.pack) == 1
         name = " + ".join(options.pack)
@@ -76,27 +75,23 @@ def check(argv: list[str]) -> int:
     name = f"--data {chosen['--data']}"
     usual = _SourceOptions(data=default(DatasetConfig, chosen["--data"]))
     options = parse(_SourceOptions, short(rest), f"data check {name}", default=usual, description=_MANUAL)
-    _check_places(options)
+    draw_sheet = _sheet(name, options)
     if options.items < 0:
         raise ValueError(f"--items {options.items}: give the number of items to read, 0 for all")
     data: Any = options.data
     # A leak is a finding here, beside all the others; packing refuses it.
     source = (replace(data, allow_leak=True) if isinstance(data, RowsConfig) else data).source()
     asked: Any = {"num": options.items, "size": options.thumbnail, "workers": data.workers, "quiet": options.quiet}
-    asked |= {"window": data.frame_window(), "draw": _sheet(name, options)}
+    asked |= {"window": data.frame_window(), "draw": draw_sheet}
     return _report(name, examine_source(source, **asked), options)
 
 
-def _check_places(options: _Options) -> None:
-    check_json(options.json)
-    if options.sheet:
-        check_place(options.sheet)
-
-
 def _sheet(what: str, options: _Options) -> Draw:
-    """What draws the contact sheet that ``options`` ask for."""
+    """What draws the contact sheet that ``options`` ask for; ValueError if their files cannot be written."""
+    check_json(options.json)
     if not (out := options.sheet):
         return nothing
+    check_place(out)
 
     def sheet(pack: Pack, findings: Sequence[Finding]) -> None:
         write_atomic(out, lambda file: draw(what, suspicious(pack, findings)).save(file, format="PNG"))
