@@ -229,8 +229,10 @@ def _leaks(result: dict[str, Any]) -> str:
 
 
 def _bars(board: Board, row: Row) -> Markup:
-    cells = {name: row.cells[name] for name in (*board.encoders, *board.controls[::-1]) if name in row.cells}
-    drawn = bars(row.task, {row.modality: cells}, {}, f"{row.score} %")
+    shown = [*board.encoders, *(name for name in board.controls[::-1] if name in CONTROLS and name != GUESS)]
+    cells = {name: row.cells[name] for name in shown if name in row.cells}
+    lines = {name: row.cells[name]["mean"] for name in board.controls if name in row.cells.keys() - cells.keys()}
+    drawn = bars(row.task, {row.modality: cells}, lines, f"{row.score} %")
     return page.figure(page.image(to_svg(drawn), f"{row.task}, {row.modality}; the numbers are in the table"))
 
 
