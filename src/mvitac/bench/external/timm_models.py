@@ -13,6 +13,7 @@ from torch import nn
 
 from mvitac.bench.external.base import NOTHING, RANDOM, UNKNOWN, Adapter, Loaded, seeded
 from mvitac.bench.external.preprocessing import Preprocessing
+from mvitac.nn import imagenet
 from mvitac.nn.encoders import IMAGENET, SCRATCH, EncoderConfig, build_trunk
 from mvitac.nn.weights import said_trained_on
 from mvitac.system.files import brief
@@ -65,13 +66,14 @@ class Timm(Adapter):
         usual = resolve_data_config(pretrained_cfg={"name": self.place, **cfg})
         random, file = self.weights == "random", Path(self.weights)
         named = self.weights in known
+        page = f"https://huggingface.co/{cfg.get('hf_hub_id')}"
         return Loaded(
             network=network,
             preprocessing=Preprocessing(size=usual["input_size"][1:], mean=usual["mean"], std=usual["std"]),
             title=f"{self.place}, {self.weights if named else file.name}",
             files=() if named else (file,),
             licence=RANDOM if random else (named and cfg.get("license")) or UNKNOWN,
-            source=f"https://huggingface.co/{cfg.get('hf_hub_id')}" if named and not random else self.weights,
+            source=imagenet.source(self.place) or page if self.weights == "pretrained" else self.weights,
             trained_on=NOTHING if random else said(cfg.get("tag") or "") if named else said_trained_on(file) or UNKNOWN,
         )
 
