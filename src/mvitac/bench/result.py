@@ -23,6 +23,7 @@ import numpy as np
 
 from mvitac.bench.external.base import parse
 from mvitac.bench.suite import Suite, SuiteSet, SuiteTask, find_suite, pinned, shipped
+from mvitac.evaluation import few_labels
 from mvitac.evaluation.controls import CONTROLS
 from mvitac.evaluation.probe import VALUE_PROBES
 from mvitac.evaluation.value_scores import SUMS, r_squared
@@ -197,7 +198,7 @@ Key = tuple[str, str, str, int | None]  # source ("" is the encoder), modality, 
 
 def _expected(suite: Suite, ask: SuiteTask, block: dict[str, Any], seeds: Sequence[int], values: bool) -> set[Key]:
     """The records that a block must have: every modality, probe and seed."""
-    few = [f"{100 * share:g} % of labels" for share in ask.labels]
+    few = [few_labels.name(100 * share) for share in ask.labels]
     probes = [*(kind for kind in suite.probes if not values or kind in VALUE_PROBES), *few]
     read = [m for m in ask.modalities if m not in block["left_out"]]
     found: set[Key] = {("", m, kind, seed) for m in read for kind in probes for seed in seeds}

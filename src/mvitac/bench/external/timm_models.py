@@ -84,6 +84,4 @@ class Timm(Adapter):
                 trunk.set_input_size(img_size=self.sides((224, 224)))  # type: ignore[operator]
             except Exception as error:  # each model has its own rules
                 raise ValueError(f"{self.place} cannot take size {self.size} ({brief(error)})") from None
-        if grid := getattr(getattr(trunk, "patch_embed", None), "grid_size", None):
-            trunk.grid = (1, *grid)  # type: ignore[assignment]
         return trunk
