@@ -50,13 +50,13 @@ def test_the_same_network_gives_the_same_features_as_in_a_run(pack: Pack, tmp_pa
     ours = fresh(replace(run, augment=replace(run.augment, size=32, whole=None)), pack.spec, pack.size)
     trunk = ours.encoders["touch"]
     torch.save(trunk.state_dict(), tmp_path / "trunk.pth")
-    text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32,mean=imagenet,std=imagenet"
+    text = f"external:timm/test_resnet,weights={tmp_path / 'trunk.pth'},size=32"
     theirs, same = open_model(text).on(pack)
     assert same is pack
     np.testing.assert_allclose(
         features(theirs, pack, "touch", rows(pack)), features(ours, pack, "touch", rows(pack)), atol=1e-4
     )
-    text = f"external:{tmp_path / 'trunk.pth'},trunk=test_resnet,size=32,mean=imagenet,std=imagenet"
+    text = f"external:{tmp_path / 'trunk.pth'},trunk=test_resnet,size=32"
     by_file = open_model(text).on(pack)[0]
     np.testing.assert_array_equal(
         features(by_file, pack, "touch", rows(pack)), features(theirs, pack, "touch", rows(pack))
