@@ -75,9 +75,13 @@ class Model(nn.Module):
         """Sides in pixels of the images that probes, and heads trained along, see."""
         return self.run.augment.whole_of(modality), self.run.augment.size_of(modality)
 
+    def levels(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Mean and standard deviation, of R, G and B in [0, 1], by which images are normalised."""
+        return self.run.encoder[modality].levels
+
     def input(self, modality: str, images: Tensor, *, for_heads: bool = False) -> Tensor:
         """The normalised images [B, C, S, S] that an encoder takes, of uint8 or floats in [0, 1], with their gradients."""
-        return encoder_input(images, self.sides(modality)[for_heads], self.run.encoder[modality].levels)
+        return encoder_input(images, self.sides(modality)[for_heads], self.levels(modality))
 
     def __repr__(self) -> str:
         widths = ", ".join(f"{modality} {num_features(trunk)}" for modality, trunk in self.encoders.items())
@@ -153,7 +157,7 @@ class Model(nn.Module):
         channels, size = self.spec.channels(modality), self.sides(modality)[0] if normalize else None
         frames = self.spec.frames(modality)
         free = None if background is None else to_array(background, channels // frames, "background")
-        return Preprocess(modality, channels, self.stored, size, free, frames, self.run.encoder[modality].levels)
+        return Preprocess(modality, channels, self.stored, size, free, frames, self.levels(modality))
 
     def trunk(self, modality: str) -> nn.Module:
         """A copy of one encoder as a plain timm model, from normalised images [B, C, S, S] to features [B, D].
@@ -164,9 +168,9 @@ class Model(nn.Module):
             ValueError: If the model has no such encoder, or it is not a single timm model.
         """
         self.check_modality(modality)
-        channels, size, config = self.spec.channels(modality), self.sides(modality)[0], self.run.encoder[modality]
-        mean, std = (values * (channels // 3) for values in config.levels)
-        return timm_trunk(self.encoders[modality], config.trunk, (channels, size, size), mean, std)
+        channels, size, trunk = self.spec.channels(modality), self.sides(modality)[0], self.run.encoder[modality].trunk
+        mean, std = (values * (channels // 3) for values in self.levels(modality))
+        return timm_trunk(self.encoders[modality], trunk, (channels, size, size), mean, std)
 
     @torch.no_grad()
     def features(self, modality: str, images: Tensor, *, for_heads: bool = False, bf16: bool = False) -> Tensor:

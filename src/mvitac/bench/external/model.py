@@ -80,6 +80,9 @@ class ExternalModel(Model):
         side = max(self.parts[modality].encoder.preprocessing.size)
         return side, side
 
+    def levels(self, modality: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return self.parts[modality].encoder.preprocessing.mean, self.parts[modality].encoder.preprocessing.std
+
     @property
     def title(self) -> str:
         """Its name in tables; (NC): the licence allows no commercial use."""
