@@ -177,20 +177,22 @@ def test_the_page_in_a_browser(address: str, land: ExplorerData, pack: Pack, tmp
         browser.open(address)
         browser.wait(f"{points} == {len(pack.rows('test'))}")
         assert browser.run("document.querySelectorAll('.map canvas').length") == 2
-        left, top, width, height = browser.run(
-            "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
-            " return [b.left, b.top, b.width, b.height] })()"
-        )
-        x, y = land.plane("both")[int(pack.rows("test")[0])]
-        place = left + 30 + x * (width - 42), top + 12 + y * (height - 42)  # the margins of scatter.js
+
+        def place() -> tuple[float, float]:
+            left, top, width, height = browser.run(
+                "(() => { const b = document.querySelector('.map canvas').getBoundingClientRect();"
+                " return [b.left, b.top, b.width, b.height] })()"
+            )
+            x, y = land.plane("both")[int(pack.rows("test")[0])]
+            return left + 30 + x * (width - 42), top + 12 + y * (height - 42)  # the margins of scatter.js
 
         def hover() -> None:
             browser.mouse("mouseMoved", 1, 1)
-            browser.mouse("mouseMoved", *place)
+            browser.mouse("mouseMoved", *place())
 
         browser.until("document.querySelector('.tip').style.display == 'block'", hover)
         assert browser.run("document.querySelector('.tip').textContent").split(" ·")[0] in pack.column("id")
-        browser.until("document.querySelectorAll('.found img').length == 12", lambda: browser.click(*place))
+        browser.until("document.querySelectorAll('.found img').length == 12", lambda: browser.click(*place()))
         browser.run("document.querySelector('input[type=checkbox]').click()")
         browser.wait(f"{points} == {len(land.shown('test', 'pattern', mistakes=True))}")
         assert browser.problems == []
