@@ -168,4 +168,4 @@ def test_probe_scores_the_best_weights(
 def test_the_report_shows_the_start_and_the_sentence(run: Path, tmp_path: Path) -> None:
     page = write_report([run], tmp_path / "report", quiet=True).read_text()
     assert "linear probe, pattern" in page and "Dashed: the value at the start" in page
-    assert log_of(run)[-1]["verdict"] in page.replace("&nbsp;", " ")
+    assert log_of(run)[-1]["verdict"] in page.replace("\xa0", " ")

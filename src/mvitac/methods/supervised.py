@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
-from mvitac.nn.encoders import Encoders, build_trunk, is_locked, num_features
+from mvitac.nn.encoders import Encoders, build_trunk, num_features
 from mvitac.registry import unknown
 
 
@@ -195,9 +195,8 @@ class Supervised(Method):
         return with_sum(losses)
 
     def prepare(self, rows: Tensor) -> None:
-        for trunk in self.trunks.values():
-            if not is_locked(trunk):
-                trunk.requires_grad_(self.trained)
+        if not self.trained:
+            self.trunks.requires_grad_(False)
 
     def train(self, mode: bool = True) -> Self:
         super().train(mode)
