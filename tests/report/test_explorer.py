@@ -132,8 +132,7 @@ def test_values_colour_the_map(land: ExplorerData, monkeypatch: pytest.MonkeyPat
     assert value["bar"] == [f"{low:.3g}", f"{high:.3g}", "force_n (N)"]
     some = decode(land.points("both", "label", "test", "force_n (N)"))
     assert some["bar"] == value["bar"]  # a filter leaves the scale
-    assert land.describe(5).endswith(" · force_n 5 N") and "force_n" not in land.describe(3)
-    assert land.name(5, "force_n (N)") == f"{land.name(5)}, force_n 5 N" and land.name(5, "pattern") == land.name(5)
+    assert land.describe(5).endswith(" · force_n (N) 5") and "force_n" not in land.describe(3)
     assert land.same_class(0, 1, "force_n (N)") is None
 
 

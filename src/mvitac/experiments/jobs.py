@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing import get_context, parent_process
 from pathlib import Path
@@ -68,11 +67,6 @@ class Job:
         """Seconds of training."""
         return seconds_of(read_log(self.out), self.run.batch_size)
 
-    def drop_checkpoint(self) -> None:
-        """Delete the checkpoints. A scored run needs none, and one is four times as large as the weights."""
-        for name in (CHECKPOINT, PREVIOUS):
-            (self.out / name).unlink(missing_ok=True)
-
 
 @dataclass(frozen=True)
 class Work:
@@ -106,7 +100,8 @@ def _do(job: Job, pack: Pack | None, quiet: bool) -> str:
     result = probe_runs([job.out], job.session, pack)
     scores = {"asked": job.asked, "records": result["records"], "retrieval": result["retrieval"]}
     write_json(job.out / "scores.json", scores, sealed=True)
-    job.drop_checkpoint()
+    for name in (CHECKPOINT, PREVIOUS):  # a scored run needs none, and one is four times as large as the weights
+        (job.out / name).unlink(missing_ok=True)
     return f"{job.seconds():.0f} s of training"
 
 
@@ -117,10 +112,6 @@ def do_all(work: Work, num_jobs: int = 1, *, quiet: bool = False) -> None:
     them. A job that fails is told and the others go on; ValueError at the end. Interrupted after Ctrl-C, when the runs
     under way have saved their checkpoints.
     """
-    for job in work.jobs:
-        if job.done and not job.failure:
-            with suppress(Busy), hold_lock(job.out, "", wait=False):
-                job.drop_checkpoint()  # a killed process may have left it, and its lock
     num_jobs = min(num_jobs, sum(not job.done for job in work.jobs))
     try:
         if num_jobs > 1:

@@ -150,8 +150,8 @@ def _found(
         css, mark = {None: ("", ""), True: ("right", "✓"), False: ("wrong", "✕")}[same]
         if task and mark:
             mark += f" {land.classes[task][land.labels[task][i]]}"
-        image = picture(land.picture(i, modality), f"{modality} of {land.name(i)}", 224)
-        cells.append(html.cell(css, image, mark, f"{land.name(i, task)} · {score:.2f}"))
+        image = picture(land.picture(i, modality), f"{modality} of {land.describe(i)}", 224)
+        cells.append(html.cell(css, image, mark, f"{land.describe(i)} · {score:.2f}"))
     return f'<h4>{escape(title)}</h4><div class="found">{"".join(cells)}</div>'
 
 

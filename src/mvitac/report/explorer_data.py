@@ -153,21 +153,8 @@ class ExplorerData:
                 if task in self.guess and self.guess[task][i] != labels[i]:
                     text += f" (probe: {self.classes[task][self.guess[task][i]]})"
                 parts.append(text)
-        parts += [self._measured(i, target) for target in self.values if np.isfinite(self.values[target][i])]
+        parts += [f"{target} {found[i]:.3g}" for target, found in self.values.items() if np.isfinite(found[i])]
         return " · ".join(parts)
-
-    def _measured(self, i: int, target: str) -> str:
-        """The value of a target, such as "force_n 3.2 N"."""
-        name, _, unit = target.removesuffix(")").partition(" (")
-        return f"{name} {self.values[target][i]:.3g} {unit}"
-
-    def name(self, i: int, target: str | None = None) -> str:
-        """The labels of row ``i``, or its id where it has none; and its value of ``target``, if that is one."""
-        said = [self.classes[task][labels[i]] for task, labels in self.labels.items() if labels[i] >= 0]
-        said = said or [str(self.pack.table.column("id")[int(self.rows[i])])]
-        if target in self.values and np.isfinite(self.values[target][i]):
-            said.append(self._measured(i, target))
-        return ", ".join(said)
 
     def picture(self, i: int, modality: str) -> np.ndarray:
         """uint8 [S, S, 3], or [S, 2 S, 3] for two sensors."""
