@@ -151,9 +151,10 @@ def test_a_window_trains_probes_and_reloads(presses: Pack, tmp_path: Path, tempo
         [out], ProbeConfig(controls=False), Pack(presses.path), allow_leak=True
     )  # as --on: windows of the run
     assert on["pack"] == result["pack"] and on["records"] == result["records"]
-    embedded = tmp_path / "touch.npz"
+    embedded = tmp_path / "touch.parquet"
     assert main(["embed", str(presses.path), "--model", str(out), "--out", str(embedded)]) == 0
-    assert np.load(embedded)["touch"].shape == (presses.num, model.encoders["touch"].num_features)
+    found = Embeddings(embedded, model).vectors["touch"]
+    assert found.shape == (presses.num, model.encoders["touch"].num_features)
     assert not isinstance(model.encoders["vision"], PerFrame)
     assert isinstance(model.encoders["touch"], PerFrame) == (temporal != "stack")
 
