@@ -15,7 +15,6 @@ import os
 import pickle
 import shutil
 import typing
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -560,27 +559,3 @@ def test_random_damage_to_a_model(finished: Path, model: Model, tmp_path: Path) 
         except ValueError as error:
             noticed += in_one_line(error)
     assert noticed > NUM_DAMAGES
-
-
-@pytest.mark.parametrize("kind", ["run.json", "checkpoint.pt"])
-def test_random_damage_to_a_run(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    """Resuming trains, or refuses in one line; it never shows a traceback."""
-    monkeypatch.setattr(StepViews, "make", trap("views"))
-    shutil.copytree(finished, tmp_path / "r")
-    (tmp_path / "r" / MODEL).unlink()
-    data, rng = (finished / kind).read_bytes(), np.random.default_rng(13)
-    run, _ = mvitac.run.load_run(finished)  # type: ignore[attr-defined]
-    noticed = 0
-    for _ in range(NUM_DAMAGES):
-        while (other := damaged(data, rng)) == data:  # zeros for zeros
-            pass
-        (tmp_path / "r" / kind).write_bytes(other)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                train(run, tmp_path / "r", resume=True, quiet=True)
-        except ValueError as error:
-            noticed += in_one_line(error)
-        finally:
-            (tmp_path / "r" / MODEL).unlink(missing_ok=True)
-    assert noticed == NUM_DAMAGES if kind == CHECKPOINT else noticed > NUM_DAMAGES // 4
