@@ -20,6 +20,7 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.nn.encoders import SCRATCH, EncoderConfig, Encoders, build_trunk
 from mvitac.nn.momentum import Momentum
 from mvitac.run import Optim, Run
+from mvitac.training import setup, views
 from mvitac.training.loop import train
 from mvitac.training.step import build_optimiser
 from mvitac.transforms.random_views import Augment, ViewAugment
@@ -108,6 +109,29 @@ def test_masked_methods_read_tokens_of_another_width_and_grid(pack: Pack, tmp_pa
     run = smoke(pack, encoder=vits, method=method, augment=SIZES, steps=1)
     model = mvitac.load(train(run, tmp_path / "run", quiet=True))
     assert {m: e.num_features for m, e in model.encoders.items()} == {"vision": 192, "touch": 64}
+
+
+@pytest.mark.parametrize("name", ["mvitac", "simclr", "supervised", "byol"])
+def test_a_locked_trunk_sees_each_whole_image_once(
+    pack: Pack, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """The run is the one whose trunk sees it at every step, to rounding, and resumes bit for bit."""
+    whole = ViewAugment(scale=(1.0, 1.0), flip=0.0, grayscale=0.0, size=24)
+    run = replace(started(pack, file, locked=True), method=small(name), augment=replace(SIZES, vision=whole))
+    seen: list[int] = []
+    real = views.plain_view
+    monkeypatch.setattr(views, "plain_view", lambda images, *rest: seen.append(len(images)) or real(images, *rest))
+    train(run, tmp_path / "straight", quiet=True, validate=False)
+    assert sum(seen) <= pack.num
+    with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
+        train(run, tmp_path / "cut", quiet=True, validate=False)
+    train(run, tmp_path / "cut", resume=True, quiet=True, validate=False)
+    assert_equal_weights(tmp_path / "straight", tmp_path / "cut")
+    monkeypatch.setattr(setup, "is_locked", lambda trunk: False)
+    train(run, tmp_path / "seen", quiet=True, validate=False)
+    first, second = weights(tmp_path / "straight"), weights(tmp_path / "seen")
+    for parameter, value in first.items():
+        torch.testing.assert_close(value, second[parameter], rtol=1e-3, atol=1e-4, msg=parameter)
 
 
 def test_a_momentum_copy_shares_a_locked_trunk() -> None:

@@ -28,7 +28,8 @@ class Views:
 
     images: dict[str, list[Tensor]]
     """modality -> V tensors [B, C, H, W], augmented and normalised. A modality that the dataset, or all but one row of the
-    batch, lacks is absent. If ``both`` is given, B is the number of rows that have the modality."""
+    batch, lacks is absent. If ``both`` is given, B is the number of rows that have the modality. A locked
+    trunk whose views do not vary is given its features [B, D] instead."""
     labels: dict[str, Tensor]
     """task -> [B] int64, -1 = unlabelled. Only supervised methods use it."""
     rows: Tensor

@@ -27,7 +27,16 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import DataSpec
 from mvitac.methods.base import Contrastive, Embeddings, MethodConfig, Views, present, row_pairs
-from mvitac.nn.encoders import EncoderConfig, Encoders, Head, build_trunk, draws_random_numbers, num_features, trunks
+from mvitac.nn.encoders import (
+    EncoderConfig,
+    Encoders,
+    Head,
+    build_trunk,
+    draws_random_numbers,
+    features_of,
+    num_features,
+    trunks,
+)
 from mvitac.nn.losses import info_nce
 from mvitac.nn.momentum import Momentum
 from mvitac.system.threads import in_branches
@@ -140,7 +149,7 @@ class Tower(nn.Module):
         self.inter = head()
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        features = self.trunk(images)
+        features = features_of(self.trunk, images)
         return self.intra(features), self.inter(features)
 
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from mvitac.data.pack import Pack
 from mvitac.data.spec import AnyTask, DataSpec, Task
 from mvitac.methods.base import Method, MethodConfig, Views, with_sum
-from mvitac.nn.encoders import Encoders, build_trunk, num_features
+from mvitac.nn.encoders import Encoders, build_trunk, features_of, num_features
 from mvitac.registry import unknown
 
 
@@ -183,7 +183,7 @@ class Supervised(Method):
         self.heads = nn.ModuleList(classifiers.values())
 
     def forward(self, batch: Views) -> dict[str, Tensor]:
-        features = torch.cat([trunk(batch.images[m][0]) for m, trunk in self.trunks.items()], dim=1)
+        features = torch.cat([features_of(trunk, batch.images[m][0]) for m, trunk in self.trunks.items()], dim=1)
         losses: dict[str, Tensor] = {}
         for task, head in zip(self.tasks, self.heads, strict=True):
             if isinstance(head, ValueHead):

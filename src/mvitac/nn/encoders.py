@@ -277,7 +277,12 @@ class Projected(nn.Module):
         self.trunk, self.head = trunk, head
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.head(self.trunk(images))
+        return self.head(features_of(self.trunk, images))
+
+
+def features_of(trunk: nn.Module, images: Tensor) -> Tensor:
+    """Features [B, D] of images [B, C, H, W]; what has two dimensions are features already (``Views.images``)."""
+    return images if images.ndim == 2 else trunk(images)
 
 
 def num_features(trunk: nn.Module) -> int:

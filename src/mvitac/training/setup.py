@@ -18,7 +18,7 @@ from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.nn.encoders import IMAGENET
+from mvitac.nn.encoders import IMAGENET, is_locked
 from mvitac.nn.imagenet import source
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
@@ -73,7 +73,8 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     method, taken = _build_method(run, pack, rows, device, world, start)
     step = Step(run, method, device, world)
     done, kept = checkpoint.restore(out, run, method, step.optimiser, world)
-    views = StepViews(run, pack, method.views, device, world)
+    locked = {m: t for m, t in method.encoders().items() if is_locked(t) and run.augment.of(m).fixed}
+    views = StepViews(run, pack, method.views, device, world, {} if run.method.needs_vit else locked)
     before = start.sensors if start and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
     num_steps = run.num_steps(len(rows))

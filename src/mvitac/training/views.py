@@ -1,11 +1,11 @@
 """From the rows of a step to random views on the device: a function of (seed, step)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvitac.data.lazy import Lazy
 from mvitac.data.pack import Pack
@@ -15,19 +15,31 @@ from mvitac.system.distributed import World
 from mvitac.training.loader import Feed, ahead, prefetch
 from mvitac.training.sampler import Batches, mix, partners
 from mvitac.training.step import Chunk
-from mvitac.transforms.random_views import random_view
+from mvitac.transforms.random_views import draw, plain_view, random_view
+
+BLOCK = 64  # rows whose features a locked trunk computes at once
 
 
 class StepViews:
     """Random views of the rows of a step, as the chunks that this process embeds.
 
     They depend on (seed, step, number of the chunk) only. Two processes thus see the same views as one process with chunks
-    of half the batch. ``num`` is the number of views of an image (``Method.views``).
+    of half the batch. ``num`` is the number of views of an image (``Method.views``). ``locked``: modality -> trunk whose
+    features it gives, because its views do not vary.
     """
 
-    def __init__(self, run: Run, pack: Pack, num: int, device: torch.device, world: World | None = None) -> None:
+    def __init__(
+        self,
+        run: Run,
+        pack: Pack,
+        num: int,
+        device: torch.device,
+        world: World | None = None,
+        locked: Mapping[str, nn.Module] | None = None,
+    ) -> None:
         self.run, self.pack, self.num, self.device, self.world = run, pack, num, device, world or World()
         self.feed = Feed(pack, device)
+        self.locked = {m: LockedFeatures(run, self.feed, m, trunk) for m, trunk in (locked or {}).items()}
         share = run.batch_size // self.world.size
         self.per_process = share // (run.chunk or share)
 
@@ -65,6 +77,11 @@ class StepViews:
         dtype = torch.bfloat16 if run.bf16 else torch.float32
         images: dict[str, list[Tensor]] = {}
         for m in has:
+            if m in self.locked:
+                for source in sources[m]:  # the other modality's views stay the same
+                    draw(run.augment.of(m), len(source), pack.size, generator)
+                images[m] = [self.locked[m](source) for source in sources[m]]
+                continue
             different = {id(source): source for source in sources[m]}  # an image of two views is loaded once
             fed = {name: self.feed(m, source) for name, source in different.items()}
             how = run.augment.of(m), run.augment.size_of(m), generator, dtype, run.encoder[m].levels
@@ -87,6 +104,33 @@ class StepViews:
         if run.method.sensor_view:
             sources["touch"] = [*sources["touch"], partners(pack, rows, generator, other_sensor=True)]
         return sources
+
+
+class LockedFeatures:
+    """Features of a locked trunk for whole images of the rows of a pack, each computed once.
+
+    They are computed in blocks of rows, so that their last digits do not depend on which row is asked for first.
+    """
+
+    def __init__(self, run: Run, feed: Feed, modality: str, trunk: nn.Module) -> None:
+        self.run, self.feed, self.modality, self.trunk = run, feed, modality, trunk
+        self.known = np.zeros(feed.pack.num, bool)
+        self.table = torch.zeros(feed.pack.num, int(trunk.num_features), device=feed.device)  # type: ignore[arg-type]
+
+    def __call__(self, rows: np.ndarray) -> Tensor:
+        """Features [B, D] of ``rows``, on the device."""
+        for block in np.unique(rows[~self.known[rows]] // BLOCK):
+            there = self.feed.pack.has(self.modality)[block * BLOCK : (block + 1) * BLOCK]
+            self._compute(block * BLOCK + np.flatnonzero(there))
+        return self.table[torch.from_numpy(rows).to(self.table.device)]
+
+    @torch.no_grad()
+    def _compute(self, rows: np.ndarray) -> None:
+        run, m = self.run, self.modality
+        view = plain_view(self.feed(m, rows), run.augment.size_of(m), run.encoder[m].levels)
+        with torch.autocast(view.device.type, torch.bfloat16, enabled=run.bf16):
+            self.table[torch.from_numpy(rows).to(view.device)] = self.trunk(view).float()
+        self.known[rows] = True
 
 
 def _some(sources: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:

@@ -41,6 +41,11 @@ class ViewAugment:
     whole: int | None = None
     """Side in pixels of whole images of this modality. Default: its own size, else that of both."""
 
+    @property
+    def fixed(self) -> bool:
+        """Whether every view is the whole image as it is."""
+        return self.scale == (1.0, 1.0) and not (self.flip or self.grayscale or self.jitter)
+
     def __post_init__(self) -> None:
         if not 0 < self.scale[0] <= self.scale[1] <= 1:
             raise ValueError(f"augment scale {self.scale}: give two fractions of the area, 0 < low <= high <= 1")
