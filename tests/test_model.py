@@ -179,25 +179,6 @@ def test_a_step_of_fine_tuning_changes_the_trunk(run: Path, pack: Pack) -> None:
         model.embed(touch=images)
 
 
-def test_wrong_calls_say_what_is_right(model: Model, pack: Pack) -> None:
-    images = batch(pack, 2)
-    for call, says in [
-        (lambda: model(images), r"images need a name: model\(vision=images\) or model\(touch=images\)"),
-        (lambda: model(), "no images given: give vision"),
-        (lambda: model(touch=images[0]), r"expected a tensor \[B, 3, H, W\]"),
-        (lambda: model(touch=images.permute(0, 2, 3, 1)), r"got torch.uint8 \[2, 32, 32, 3\]"),
-        (lambda: model(touch=pack.images["touch"][:2]), r"got memmap \(`embed` takes any image\)"),
-        (lambda: model.trunk("smell"), "no smell encoder: it has vision, touch"),
-        (lambda: model.transform("smell"), "no smell encoder: it has vision, touch"),
-        (lambda: model.transform("touch", background=images[0]), "not trained on difference images"),
-        (lambda: model.embed(touch="nowhere.png"), "nowhere.png does not exist"),
-        (lambda: model.embed(touch=b"image"), "expected one image or several, got bytes"),
-        (lambda: model.embed(touch=[]), "no images given"),
-    ]:
-        with pytest.raises(ValueError, match=says):
-            call()
-
-
 class Touches(torch.utils.data.Dataset):  # at module level, so that a worker that is a new process can unpickle it
     def __init__(self, images: np.ndarray, transform: Any) -> None:
         self.images, self.transform = images, transform
@@ -226,6 +207,9 @@ def test_transform_subtracts_a_background(model: Model, monkeypatch: pytest.Monk
     monkeypatch.setattr(model, "spec", replace(model.spec, difference=True))
     found = model(touch=model.transform("touch", background=free)(press)[None])["touch"]
     assert torch.equal(found, model.embed(touch=press, background=free)["touch"])
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match="not trained on difference images"):
+        model.transform("touch", background=free)
 
 
 def test_trunk_is_a_plain_timm_model(pack: Pack, tmp_path: Path) -> None:
@@ -299,13 +283,8 @@ def test_background_is_subtracted_before_resizing(model: Model, monkeypatch: pyt
     of_one = model.embed(touch=[difference(press[0], free[0]), difference(press[1], free[0])])["touch"]
     assert torch.equal(model.embed(touch=press, background=Image.fromarray(free[0]))["touch"], of_one)
     assert not torch.equal(of_one[1], expected[1])
-    for wrong, says in [
-        ({"touch": press, "background": [*free, *free]}, "got 4 images for 2 of touch"),
-        ({"touch": press, "background": free[:, :40]}, "image is 100 x 80, its background 100 x 40"),
-        ({"vision": press, "background": free}, "there is no touch"),
-    ]:
-        with pytest.raises(ValueError, match=says):
-            model.embed(**wrong)
+    with pytest.raises(ValueError, match="there is no touch"):
+        model.embed(vision=press, background=free)
 
 
 def test_shared_space_is_normalised(model: Model, pack: Pack) -> None:
@@ -313,13 +292,6 @@ def test_shared_space_is_normalised(model: Model, pack: Pack) -> None:
     assert both["vision"].shape == both["touch"].shape == (5, 16)
     for z in both.values():
         torch.testing.assert_close(z.norm(dim=1), torch.ones(5))
-
-
-def test_is_in_eval_mode_and_leaves_itself_alone(model: Model, pack: Pack) -> None:
-    assert not any(module.training for module in model.modules())
-    before = model.weights_digest()
-    model.embed(touch=pack.images["touch"][:4])
-    assert model.weights_digest() == before
 
 
 def test_two_sensors_keep_their_order(tmp_path: Path) -> None:

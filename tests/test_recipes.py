@@ -15,13 +15,12 @@ from PIL import Image
 from mvitac.cli.main import main
 from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.spec import DataSpec, Task
 from mvitac.datasets.base import DatasetConfig
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import GraspsConfig, MaterialsConfig
 from mvitac.methods.mvitac import MViTacConfig
 from mvitac.recipes import RECIPES, recipe
-from mvitac.registry import find, from_json, to_json
+from mvitac.registry import find, to_json
 from mvitac.run import Run, load_run
 
 
@@ -37,11 +36,6 @@ def test_paper_constants() -> None:
     assert (method.temperature, method.out, method.dropout, method.head_norm) == (0.07, 128, 0, False)
     for view in (run.augment.vision, run.augment.touch):
         assert (view.scale, view.flip, view.grayscale, view.jitter) == ((0.2, 1.0), 0.5, 0.2, 0)
-
-
-def test_no_grayscale_for_grasping() -> None:
-    grasping = recipe("paper", GraspsConfig()).augment
-    assert grasping.touch.grayscale == grasping.vision.grayscale == 0
 
 
 def test_authors_constants() -> None:
@@ -68,15 +62,6 @@ def test_every_recipe_survives_its_record(name: str, data: MaterialsConfig) -> N
     assert run.__doc__ and RECIPES[name].__doc__
 
 
-def test_data_is_chosen_by_a_recipe_never_by_the_run_itself() -> None:
-    with pytest.raises(TypeError, match="data"):
-        Run()  # pyright: ignore[reportCallIssue]
-    value = to_json(recipe("smoke"))
-    del value["data"]
-    with pytest.raises(ValueError, match="field 'data' is missing"):
-        Run.load(value)
-
-
 def test_digest_is_of_the_outcome() -> None:
     run = recipe("quick")
     assert replace(run, log_every=3, device="cpu").digest() == run.digest()
@@ -92,20 +77,6 @@ def test_digest_is_of_the_outcome() -> None:
         replace(run, method=MViTacConfig(keys="end-to-end", pairs=pairs)) for pairs in ("crossed", "all")
     )
     assert crossed.digest() != paired.digest()
-
-
-def test_spec_survives_its_record() -> None:
-    spec = DataSpec(
-        name="x",
-        vision_channels=3,
-        touch_channels=6,
-        tasks=(Task(name="t", classes=("a", "b"), only={"phase": "during"}),),
-        group_by="object",
-        controls={"width": ("width_mm",)},
-        licence="none",
-        source="here",
-    )
-    assert from_json(DataSpec, json.loads(json.dumps(to_json(spec)))) == spec
 
 
 def test_unknown_names_are_hinted() -> None:

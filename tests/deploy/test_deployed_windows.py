@@ -115,14 +115,8 @@ class Seeing:
     values: dict[str, Any]
 
     def __init__(self, frames: int = 3, stride: float = 1.0, order: str = "frame", **window: Any) -> None:
-        self.window = {
-            "frames": frames,
-            "stride": stride,
-            "order": order,
-            "of": ["touch"],
-            "minus_first": False,
-            **window,
-        }
+        window = {"of": ["touch"], "minus_first": False, **window}
+        self.window = {"frames": frames, "stride": stride, "order": order, **window}
         self.inputs = {"touch": (32, 32, 3 * frames)}
         self.classes, self.values, self.difference, self.seen = {}, {}, False, []
 

@@ -279,17 +279,6 @@ def test_an_engine_that_computes_otherwise_is_refused_on_the_spot(onnx: Path, mo
         Engine(onnx)
 
 
-def test_foreign_inputs_are_named(onnx: Path, pack: Pack) -> None:
-    engine = Engine(onnx, threads=1)
-    one = pack.images["touch"][:1]
-    with pytest.raises(ValueError, match="takes vision, touch; got touch"):
-        engine(touch=one)
-    with pytest.raises(ValueError, match="touch: expected uint8"):
-        engine(vision=one, touch=one.astype(np.float32))
-    with pytest.raises(ValueError, match="vision: expected uint8"):
-        engine(vision=one[:, :16], touch=one)
-
-
 def test_impossible_requests_are_refused_first(
     model: Model, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

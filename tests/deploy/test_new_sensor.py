@@ -137,15 +137,9 @@ def test_live_answers_as_the_probe_in_known_colours(engine: Engine, model: Model
     both = RecolouredPack(old, new)
     rows = both.rows("test")
     expected = by_the_probe(model, both, rows)
-    found = play(engine, new, np.concatenate([new.rows("test"), new.rows("test")[:1]]))[
-        : len(rows)
-    ]  # the last never ends
-    assert len(found) == len(rows) == 20 and found[0].keys() == expected.keys() == {
-        "category",
-        "soft",
-        "rough",
-        "force",
-    }
+    one_more = np.concatenate([new.rows("test"), new.rows("test")[:1]])  # the last touch never ends
+    found, tasks = play(engine, new, one_more), {"category", "soft", "rough", "force"}
+    assert len(found) == len(rows) == 20 and found[0].keys() == expected.keys() == tasks
     for task, wanted in expected.items():
         np.testing.assert_allclose([answers[task] for answers in found], wanted, atol=2e-3)
     plain = by_the_probe(model, JoinedPack(old, new), rows)  # as it is: another model
@@ -186,14 +180,11 @@ def test_a_recording_gives_one_image_of_each_touch(engine: Engine, old: Pack, ne
 
 
 def test_what_cannot_be_shown_is_refused(model: Model, old: Pack, new: Pack, tmp_path: Path) -> None:
-    few = Unlabelled(MaterialsConfig(num=30, touches=1, size=32, held_out_sensor=True))
+    config = MaterialsConfig(num=30, touches=1, size=32, held_out_sensor=True)
+    few = build(Unlabelled(config), tmp_path / "few", size=32, quiet=True)
     cases: list[tuple[Pack, ExportConfig, str]] = [
         (old, ExportConfig(), "no sensor but digit, mini"),
-        (
-            build(few, tmp_path / "few", size=32, quiet=True),
-            ExportConfig(),
-            "needs 32 of different presses.*--new-sensor out",
-        ),
+        (few, ExportConfig(), "needs 32 of different presses.*--new-sensor out"),
         (new, ExportConfig(modality="vision"), "about touch"),
     ]
     for pack, config, why in cases:

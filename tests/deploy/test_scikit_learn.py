@@ -52,12 +52,3 @@ def test_features_are_the_models(smoke_run: Path, pack: Pack, files: dict[str, l
     assert len(each.get_feature_names_out()) == 128
     for given in (pairs, frame, np.array(pairs).astype(str)):
         np.testing.assert_array_equal(each.transform(given), both)
-
-
-def test_what_does_not_fit_is_named(smoke_run: Path, files: dict[str, list[Path]]) -> None:
-    with pytest.raises(ValueError, match="no trained model at nowhere"):
-        ImageFeatures(Path("nowhere")).fit([])
-    with pytest.raises(ValueError, match="no smell encoder"):
-        ImageFeatures(smoke_run, "smell").fit([])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"takes pairs \(vision, touch\)"):
-        ImageFeatures(smoke_run, "both").fit([]).transform(files["touch"])

@@ -24,7 +24,7 @@ from mvitac.live.cameras import Camera, Ended, Folder, Simulated, source
 from mvitac.live.contact import Contact, LiveConfig
 from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder, finish
-from mvitac.live.streams import CaptureThread, Stream
+from mvitac.live.streams import Stream
 from mvitac.model import Model
 from mvitac.system.files import read_json, write_json
 from support.faults import Clock, Rig, World, faulty
@@ -237,8 +237,6 @@ def test_streams_must_fit_the_model(engine: Engine) -> None:
     streams = {m: [Stream(m, Rig(Clock(), 0))] for m in ("vision", "touch")}
     with pytest.raises(ValueError, match=r"takes 1 touch stream\(s\), 0 given"):
         Live(engine, {"vision": streams["vision"]})
-    with pytest.raises(ValueError, match="no input for smell"):
-        Live(engine, {**streams, "smell": streams["touch"]})
 
 
 def test_what_is_simulated_is_asked_for() -> None:
@@ -284,13 +282,6 @@ def test_files_that_cannot_be_read_are_named_at_once(tmp_path: Path) -> None:
     for name, message in (("empty", "holds no pictures"), ("no.mp4", "cannot be read as a video"), ("empty@0", "rate")):
         with pytest.raises(ValueError, match=message):
             source(str(tmp_path / name), "touch")
-
-
-def test_opencv_is_asked_for_where_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    for text in ("0", "serial:D20345"):
-        with pytest.raises(ValueError, match=r"needs OpenCV: pip install -e '.\[live\]'"):
-            source(text, "touch")
 
 
 def test_a_video_is_read_to_its_end_without_opencv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -401,32 +392,12 @@ def test_a_video_is_read_as_rgb(tmp_path: Path) -> None:
     video.close()
 
 
-def test_the_simulated_sensor_rests_and_touches() -> None:
-    sensor = Simulated("touch", 0, fps=2, size=32)
-    sensor.open()
-    frames = np.stack([sensor.read() for _ in range(18)]).astype(float)
-    change = np.abs(frames - frames[0]).mean((1, 2, 3))
-    assert (change[1:6] < 8).all()  # at rest: time to calibrate
-    for held, free in ((slice(6, 10), slice(10, 12)), (slice(12, 16), slice(16, 18))):
-        assert change[held].min() > 2 * change[1:6].max() and change[free].max() < 8
-
-
 def test_the_simulated_sensor_is_calibrated_while_free() -> None:
     """Even where a third of the frames is dropped; else contact would be found the wrong way round."""
     sensor, contact = Simulated("touch", 0, fps=30, size=32), Contact(LiveConfig())
     sensor.open()
     found = [contact(image) for image in [sensor.read() for _ in range(180)][::3]]
     assert found == [None] * 29 + [False] + [True] * 20 + [False] * 10
-
-
-def test_a_thread_pumps_until_the_end(tmp_path: Path) -> None:
-    for i in range(5):
-        Image.fromarray(np.full((4, 4, 3), i, np.uint8)).save(tmp_path / f"{i}.png")
-    stream, woken = Stream("touch", Folder(tmp_path, fps=1e6)), []
-    thread = CaptureThread(stream, lambda: woken.append(1))
-    thread.start()
-    thread.join(20)
-    assert not thread.is_alive() and stream.ended and stream.num_frames == 5 and len(woken) == 6
 
 
 def test_a_recording_is_a_pack(engine: Engine, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from sklearn.metrics import mean_absolute_error
 
-from mvitac.data.build import build
 from mvitac.data.pack import Pack
 from mvitac.evaluation.pack_features import pack_features
 from mvitac.evaluation.probe import probe_model, split_rows
@@ -23,15 +23,9 @@ from mvitac.run import Optim
 from mvitac.training.loop import train
 from mvitac.training.views import values_of
 from support.small_methods import TINY
-from support.toy import Toy
 from support.training_runs import smoke
 
 NAN = float("nan")
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    return build(Toy(values=True), tmp_path_factory.mktemp("measured") / "pack", size=32, workers=1, quiet=True)
 
 
 def test_loss_is_smooth_l1_of_standardised_values_that_were_measured() -> None:
@@ -66,6 +60,7 @@ def test_classes_are_the_default_and_values_are_learned_by_name_or_alone(measure
 def test_values_are_learned_from_the_rows_that_probes_are_fitted_on(measured: Pack) -> None:
     both = measured.spec.values[1]
     weight = replace(both, name="weight", targets=both.targets[1:])
+    measured = copy.copy(measured)
     measured.spec = replace(measured.spec, values=(*measured.spec.values[:2], weight))
     method = SupervisedConfig(tasks=("weight",))
     rows = method.training_rows(measured)

@@ -215,19 +215,3 @@ def test_a_lost_solver_is_a_failed_grasp_and_leaves_no_nan():
     assert last.unstable == 1
     assert last.success == 0
     assert np.isfinite(bench.data.qpos).all()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "allowed"),
-    [
-        ((0, grasps.NUM_OBJECTS, 0, 64), "0..105"),
-        ((0, -1, 0, 64), "0..105"),
-        ((0, 0, -1, 64), "0 or larger"),
-        ((-1, 0, 0, 64), "0 or larger"),
-        ((0, 0, 0, 8), "16..1024"),
-    ],
-)
-def test_bad_arguments_say_what_is_allowed(arguments, allowed):
-    seed, obj, index, size = arguments
-    with pytest.raises(ValueError, match=allowed):
-        grasps.grasp(seed, obj, index, size=size)

@@ -307,15 +307,6 @@ def test_learns_the_stripes(tmp_path: Path) -> None:
         assert lines[-2][part] < 0.9 * lines[1][part], part
 
 
-def test_supervised_reference_learns_too(pack: Pack, tmp_path: Path) -> None:
-    method = SupervisedConfig(tasks=("pattern",), labels="train")
-    run = smoke(pack, method=method, steps=30, batch_size=30, eval_every=0, optim=Optim(name="adamw", lr=3e-3))
-    out = train(run, tmp_path / "r", quiet=True)
-    values = json.loads((out / "log.jsonl").read_text().splitlines()[-1])["eval"]
-    assert values["touch/knn pattern"] > 0.9, values
-    assert "alignment" not in values  # it has no shared space
-
-
 def test_rows_that_were_trained_on_are_not_scored_as_held_out(pack: Pack) -> None:
     """With the labels of val, a supervised run has no held-out rows: spread and rank only, of training rows."""
     values = {}
@@ -419,14 +410,6 @@ def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> 
         assert other["vision"] == other["touch"] == ([False] if positives == "same-image" else [False, True])
     else:
         assert other == {"vision": [False], "touch": [positives == "same-touch-pairs"]}
-
-
-def test_same_touch_positives_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
-    for name, positives in (("a", "same-touch"), ("b", "same-touch"), ("c", "same-image")):
-        train(smoke(pack, positives=positives, steps=2), tmp_path / name, quiet=True, validate=False)
-    assert_equal_weights(tmp_path / "a", tmp_path / "b")
-    first = "encoders.touch.conv1.0.weight"
-    assert not torch.equal(weights(tmp_path / "a")[first], weights(tmp_path / "c")[first])
 
 
 def test_late_step_is_the_authors_schedule() -> None:

@@ -20,7 +20,6 @@ from mvitac.methods.mvitac import MViTacConfig
 from mvitac.methods.supervised import SupervisedConfig
 from mvitac.nn.losses import info_nce
 from mvitac.recipes import with_method
-from mvitac.registry import default
 from mvitac.training.loader import Feed
 from mvitac.training.loop import train
 from support.mixes import Gel, Slice, built, mix_run
@@ -252,11 +251,6 @@ def test_a_run_on_a_mix_is_probed_by_task(parts: dict[str, str], tmp_path: Path)
     assert {(r["modality"], r["num_test"]) for r in records if r["task"] == "pattern"} >= {("both", num[0])}
     assert not result["leaks"]
     assert main(["report", str(out), "--out", str(tmp_path / "report.html")]) == 0
-
-
-def test_every_method_says_what_it_takes() -> None:
-    assert set(MISSING) | set(PAIRED) | {"supervised", "calandra"} <= set(MethodConfig.choices)
-    assert not any(default(MethodConfig, name).takes_missing for name in PAIRED)
 
 
 def test_the_verdict_on_a_mix_tells_the_tasks_of_each_part(parts: dict[str, str], tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -129,15 +128,6 @@ def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
     run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, method=SupervisedConfig())
     with pytest.raises(ValueError, match="'supervised' supports neither several processes nor --chunk"):
         train(run, tmp_path / "r", quiet=True)
-
-
-def test_copies_do_not_share_weights() -> None:
-    """Guards the tests above: two builds are equal and apart."""
-    a, b = build(), build()
-    assert_close(dict(a.named_parameters()), dict(b.named_parameters()), 0)
-    before = copy.deepcopy(b.state_dict())
-    take(RUN, a, [views])
-    assert all(torch.equal(v, before[k]) for k, v in b.state_dict().items())
 
 
 def test_towers_side_by_side_are_those_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
