@@ -15,9 +15,6 @@ import pytest
 from benchmarks import gpu, gpu_tables, speed
 
 from mvitac.cli.main import main as mvitac
-from mvitac.datasets.simulated import MaterialsConfig
-from mvitac.experiments.plan import Plan
-from mvitac.registry import from_json
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -81,19 +78,6 @@ def test_a_part_is_stopped_at_its_limit(tmp_path):
     assert time.monotonic() - start < gpu.GRACE
     assert "NameError" in (tmp_path / "out" / "log").read_text()
     assert session.found["sessions"][-1]["commit"] == "abc"
-
-
-def test_the_plan_of_a_gpu_is_the_rows_of_table_1():
-    plan: Plan = from_json(Plan, json.loads(json.dumps(gpu.plan(gpu.Size()))), "plan")
-    data = MaterialsConfig(num=2000, size=256)
-    runs = {row.label: plan.run(row, data, 0) for row in plan.rows}
-    assert all(
-        (run.encoder.touch.trunk, run.augment.size, run.batch_size) == ("resnet18", 224, 256) for run in runs.values()
-    )
-    paper, modern, ssvtp, *_ = runs.values()
-    assert (paper.method.keys, paper.positives, paper.method.temperature) == ("momentum", "same-image", 0.07)
-    assert (modern.method.keys, modern.positives) == ("end-to-end", "same-touch")
-    assert ssvtp.steps == 2 * modern.steps and ssvtp.method.name == "ssvtp"
 
 
 def test_every_call_of_speed_is_valid(monkeypatch):

@@ -21,7 +21,6 @@ import mvitac
 from mvitac.cli.main import main
 from mvitac.data.images import difference
 from mvitac.data.pack import Pack
-from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.artifact import ARTIFACT, preprocessing
 from mvitac.deploy.card import card
 from mvitac.deploy.publish import fit_probes, push
@@ -283,28 +282,3 @@ def test_the_hub_mixin_takes_the_artifact_there_and_back(
     for load in (model.from_pretrained, mvitac.load):
         with pytest.raises(ValueError, match="does not match its digest"):
             load("someone/touch")
-
-
-@pytest.mark.parametrize(
-    ("command", "advice"),
-    [("export {} --out x", "--on PACK"), ("explore {}", "--on PACK"), ("live {}", "mvitac export MODEL --on PACK")],
-)
-def test_without_its_data_a_command_says_what_to_do(
-    command: str,
-    advice: str,
-    smoke_run: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """As on a robot, to which the run was copied."""
-
-    def gone(self: PackConfig, **_: Any) -> Pack:
-        raise ValueError("no pack at /somewhere/else")
-
-    monkeypatch.setattr(PackConfig, "open", gone)
-    monkeypatch.setenv("MVITAC_CACHE", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    assert main(command.format(smoke_run).split()) == 2
-    said = capsys.readouterr().err
-    assert "trained on is not here (no pack at /somewhere/else)" in said and advice in said

@@ -193,67 +193,57 @@ def above(trap: Path, whole: dict[str, Any]) -> None:
     whole["files"]["../trap/pairs.csv"] = "0"
 
 
-RUNS: list[tuple[str, Change, str]] = [
-    ("trunk from the Hub", encoder(trunk="hf-hub:stranger/model"), "unknown trunk"),
-    ("trunk from a folder", encoder(trunk="local-dir:{trap}"), "unknown trunk"),
-    ("another trunk", encoder(trunk="resnet18"), "holds other weights"),
-    ("unknown dataset", setting("data", value={"name": "evil"}), "unknown dataset 'evil'"),
-    ("a field that is none", setting("exec", value="rm"), "unknown field in run 'exec'"),
-    ("a list for a number", setting("steps", value=[1]), "steps"),
-]
 NO_SPREAD = {"name": "n", "unit": "N", "edges": [], "spread": []}
-ABOUT: list[tuple[str, str, Change, str]] = [
-    ("artifact", "file above", above, "names others than"),
-    ("artifact", "files are a list", setting("files", value=["model.safetensors"]), "lacks files"),
-    ("artifact", "without model", lambda trap, about: about["files"].pop("model.safetensors"), "lacks files"),
-    ("artifact", "version", setting("format_version", value=99), "is not mvitac-artifact"),
-    ("artifact", "no preprocessing", setting("preprocessing", value=3), "is damaged"),
-    ("artifact", "probe of sound", setting("probes", 0, "modality", value="sound"), "is damaged"),
-    ("artifact", "one class more", setting("probes", 0, "classes", value=["x"] * 4), "do not fit"),
-    ("onnx", "file above", above, "names others than"),
-    ("onnx", "no tolerance", lambda trap, about: about.pop("tolerance"), "is damaged"),
-    ("onnx", "a number for a class", setting("classes", value={"pattern": [1]}), "expected str, got 1"),
-    ("onnx", "a value without unit", setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
-    ("onnx", "no spread", setting("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
-    ("onnx", "a number for outputs", setting("outputs", value=1e308), "is damaged"),
-    ("onnx", "no inputs", setting("inputs", value={}), "cannot be run"),
-]
+LARGE = 10**9  # every image would be resized to it
+SIZE = {"stored": LARGE, "about": setting("preprocessing", "stored", value=LARGE)}
+RUNS: dict[str, tuple[Change, str]] = {
+    "trunk from the Hub": (encoder(trunk="hf-hub:stranger/model"), "unknown trunk"),
+    "trunk from a folder": (encoder(trunk="local-dir:{trap}"), "unknown trunk"),
+    "another trunk": (encoder(trunk="resnet18"), "holds other weights"),
+    "unknown dataset": (setting("data", value={"name": "evil"}), "unknown dataset 'evil'"),
+    "a field that is none": (setting("exec", value="rm"), "unknown field in run 'exec'"),
+    "a list for a number": (setting("steps", value=[1]), "steps"),
+}
+ARTIFACTS: dict[str, tuple[Change, str]] = {
+    "file above": (above, "names others than"),
+    "files are a list": (setting("files", value=["model.safetensors"]), "lacks files"),
+    "without model": (lambda trap, about: about["files"].pop("model.safetensors"), "lacks files"),
+    "version": (setting("format_version", value=99), "is not mvitac-artifact"),
+    "no preprocessing": (setting("preprocessing", value=3), "is damaged"),
+    "probe of sound": (setting("probes", 0, "modality", value="sound"), "is damaged"),
+    "one class more": (setting("probes", 0, "classes", value=["x"] * 4), "do not fit"),
+}
+EXPORTS: dict[str, tuple[Change, str]] = {
+    "file above": (above, "names others than"),
+    "no tolerance": (lambda trap, about: about.pop("tolerance"), "is damaged"),
+    "a number for a class": (setting("classes", value={"pattern": [1]}), "expected str, got 1"),
+    "a value without unit": (setting("values", value={"force": [{"name": "n"}]}), "field 'unit' is missing"),
+    "no spread": (setting("values", value={"force": [NO_SPREAD]}), "0 edges and 0 spreads: give n ascending"),
+    "a number for outputs": (setting("outputs", value=1e308), "is damaged"),
+    "no inputs": (setting("inputs", value={}), "cannot be run"),
+}
+FORGED = [("artifact", SIZE, "stored 1000000000: expected 1 to 1024 px")]
+FORGED += [("artifact", {"run": change}, says) for change, says in RUNS.values()]
+FORGED += [("artifact", {"about": change}, says) for change, says in ARTIFACTS.values()]
+FORGED += [("onnx", {"about": change}, says) for change, says in EXPORTS.values()]
 
 
-@pytest.mark.parametrize(("run", "says"), [pytest.param(change, says, id=name) for name, change, says in RUNS])
-def test_a_run_that_is_none_is_refused(copy: Path, trap: Path, touched: list[str], run: Change, says: str) -> None:
-    forge(copy, trap, run=run)
-    touched.clear()
-    with pytest.raises(ValueError, match=says):
-        mvitac.load(str(copy))
-    check(list(touched), trap)
-
-
-@pytest.mark.parametrize(("kind", "change", "says"), [
-    pytest.param(kind, change, says, id=f"{kind}: {name}") for kind, name, change, says in ABOUT
-])  # fmt: skip
-def test_a_description_that_is_none_is_refused(
+@pytest.mark.parametrize(("kind", "changes", "says"), FORGED, ids=["size", *RUNS, *ARTIFACTS, *EXPORTS])
+def test_a_run_or_a_description_that_is_none_is_refused(
     request: pytest.FixtureRequest,
     trap: Path,
     tmp_path: Path,
     touched: list[str],
     kind: str,
-    change: Change,
+    changes: dict[str, Any],
     says: str,
 ) -> None:
     folder = shutil.copytree(request.getfixturevalue(kind), tmp_path / kind)
-    forge(folder, trap, about=change)
+    forge(folder, trap, **changes)
     touched.clear()
     with pytest.raises(ValueError, match=says):
         mvitac.load(folder) if kind == "artifact" else Engine(folder)
     check(list(touched), trap)
-
-
-def test_a_size_that_no_pack_has_is_refused(copy: Path, trap: Path) -> None:
-    """Every image would be resized to it."""
-    forge(copy, trap, stored=10**9, about=setting("preprocessing", "stored", value=10**9))
-    with pytest.raises(ValueError, match="stored 1000000000: expected 1 to 1024 px"):
-        mvitac.load(str(copy))
 
 
 def test_a_probe_without_dimensions_is_refused(copy: Path, trap: Path) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -124,63 +126,30 @@ def test_the_ros_node_on_a_fake_publisher(onnx: Path) -> None:
     assert "publish rgb8 or bgr8" in warned[-1]
 
 
-class FakeRos:
-    """rclpy and its messages, as far as the node uses them; ``spin`` sends what a camera and a gel would."""
-
-    def __init__(self, topics: dict[str, Rig], clock: Clock) -> None:
-        self.rigs, self.clock, self.sent, self.said = topics, clock, [], []
-        self.callbacks: dict[str, Any] = {}
-        self.timers: list[Any] = []
-
-    def modules(self) -> dict[str, Any]:
-        message = type("Message", (SimpleNamespace,), {})
-        return {
-            "rclpy": SimpleNamespace(
-                init=lambda args: None, create_node=lambda name: self, spin=self.spin, shutdown=lambda: None
-            ),
-            "rclpy.qos": SimpleNamespace(
-                QoSProfile=lambda **given: given, ReliabilityPolicy=SimpleNamespace(BEST_EFFORT="best effort")
-            ),
-            "sensor_msgs.msg": SimpleNamespace(Image=message),
-            "std_msgs.msg": SimpleNamespace(Float32MultiArray=message, String=message),
-        }
-
-    def create_publisher(self, kind: Any, topic: str, depth: int) -> Any:
-        return SimpleNamespace(publish=lambda m: self.sent.append((topic, m.data)))
-
-    def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
-        assert qos == {"depth": 1, "reliability": "best effort"}  # a queue would hand over old frames as new ones
-        self.callbacks[topic] = callback
-
-    def create_timer(self, period: float, callback: Any) -> None:
-        self.timers.append(callback)
-
-    def get_logger(self) -> Any:
-        return SimpleNamespace(warning=self.said.append)
-
-    def destroy_node(self) -> None: ...
-
-    def spin(self, node: Any) -> None:
-        for tick in range(80):
-            self.clock.now = 99 + tick / 50
-            for topic, rig in self.rigs.items():
-                self.callbacks[topic](message(rig.read(), "bgr8"))
-            for timer in self.timers:
-                timer()
-
-
 def test_the_ros_node_itself(onnx: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its topics, messages and log, on a fake rclpy."""
+    """Its topics, messages and log, where ``rclpy.spin`` sends what a camera and a gel would."""
     ros2_node = load_example("ros2_node")
-    clock = Clock()
-    ros = FakeRos({"/camera": Rig(clock, 1), "/gel": Rig(clock, 2)}, clock)
-    for name, module in ros.modules().items():
-        monkeypatch.setitem(sys.modules, name, module)
+    clock, ros, rclpy = Clock(), MagicMock(), MagicMock()
+    rigs = {"/camera": Rig(clock, 1), "/gel": Rig(clock, 2)}
+
+    def spin(node: Any) -> None:
+        callbacks = {topic: callback for _, topic, callback, _ in map(attrgetter("args"), subscribed.call_args_list)}
+        for tick in range(80):
+            clock.now = 99 + tick / 50
+            for topic, rig in rigs.items():
+                callbacks[topic](message(rig.read(), "bgr8"))
+            ros.create_timer.call_args.args[1]()
+
+    rclpy.create_node.return_value, rclpy.spin, subscribed = ros, spin, ros.create_subscription
+    for name in ("rclpy", "rclpy.qos", "sensor_msgs.msg", "std_msgs.msg"):
+        monkeypatch.setitem(sys.modules, name, rclpy)
     monkeypatch.setattr(ros2_node.Node.__init__, "__kwdefaults__", {"warn": print, "clock": clock})
     monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera", "--touch", "/gel"])
     ros2_node.main()
-    assert {topic for topic, _ in ros.sent} == {"~/prediction", "~/embedding"} and len(ros.sent) >= 50
-    assert ros.said == ["touch 0 is calibrated without contact"]
+    assert [call.args[1] for call in ros.create_publisher.call_args_list] == ["~/prediction", "~/embedding"]
+    assert len(ros.create_publisher.return_value.publish.call_args_list) >= 50
+    assert rclpy.QoSProfile.call_args.kwargs["depth"] == 1  # a queue would hand over old frames as new ones
+    ros.get_logger.return_value.warning.assert_called_once_with("touch 0 is calibrated without contact")
     monkeypatch.setattr(sys, "argv", ["ros2_node.py", str(onnx), "--vision", "/camera"])
     with pytest.raises(SystemExit):
         ros2_node.main()

@@ -22,7 +22,6 @@ from mvitac.data.pack import Pack
 from mvitac.deploy.engine import Engine
 from mvitac.live.cameras import Camera, Ended, Folder, Simulated, source
 from mvitac.live.contact import Contact, LiveConfig
-from mvitac.live.predictor import Live
 from mvitac.live.recorder import Recorder, finish
 from mvitac.live.streams import Stream
 from mvitac.model import Model
@@ -193,18 +192,6 @@ def test_minutes_of_faults(engine: Engine) -> None:
     )
 
 
-def test_a_changed_resolution_calibrates_anew(engine: Engine) -> None:
-    world = World(engine)
-    world.run(9)
-    world.rigs["touch"].fault = "resolution"
-    world.run(0.3)
-    assert world.live.contact is None
-    world.run(12)
-    assert world.live.contact is not None
-    assert [e.what for e in world.heard].count("calibrated") == 2
-    assert "changed from 32x32 to 16x16" in " ".join(e.text for e in world.heard)
-
-
 @pytest.mark.parametrize("free", [7, 5])
 def test_a_touch_while_calibrating_is_named(free: int) -> None:
     """Also one of exactly half of the frames, which once passed for noise and hid every later touch."""
@@ -231,12 +218,6 @@ def test_the_background_follows_a_drifting_lamp() -> None:
         image = 100 + i * 0.02 + rng.normal(0, 1, (32, 32, 3))
         assert not contact(image.astype(np.uint8)), i
     assert contact((image + 20).astype(np.uint8))
-
-
-def test_streams_must_fit_the_model(engine: Engine) -> None:
-    streams = {m: [Stream(m, Rig(Clock(), 0))] for m in ("vision", "touch")}
-    with pytest.raises(ValueError, match=r"takes 1 touch stream\(s\), 0 given"):
-        Live(engine, {"vision": streams["vision"]})
 
 
 def test_what_is_simulated_is_asked_for() -> None:
@@ -375,21 +356,6 @@ def test_a_device_that_is_back_is_not_stalled_before_its_first_frame() -> None:
         clock.now += 2
         stream.pump()
     assert [e.what for e in heard] == ["unplugged", "back"]
-
-
-def test_a_video_is_read_as_rgb(tmp_path: Path) -> None:
-    import cv2
-
-    writer = cv2.VideoWriter(str(tmp_path / "red.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 24))
-    for _ in range(3):
-        writer.write(np.full((24, 32, 3), (0, 0, 200), np.uint8))  # BGR: red
-    writer.release()
-    video = source(str(tmp_path / "red.avi"), "vision")
-    video.open()
-    assert video.fps == 20
-    image = video.read()
-    assert image.shape == (24, 32, 3) and image[..., 0].mean() > 150 and image[..., 2].mean() < 60
-    video.close()
 
 
 def test_the_simulated_sensor_is_calibrated_while_free() -> None:
