@@ -33,11 +33,6 @@ def test_heads_alone_leave_the_trunks_as_they_were(pack: Pack, tmp_path: Path) -
     assert not any(torch.equal(a, b) for a, b in heads)
 
 
-def test_a_share_is_above_0() -> None:
-    with pytest.raises(ValueError, match=r"share 0: give a share of the groups, above 0, at most 1"):
-        SupervisedConfig(share=0)
-
-
 def groups_of(pack: Pack, rows: np.ndarray) -> set[str]:
     return set(pack.column("group")[rows].astype(str))
 
