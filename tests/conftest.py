@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -95,6 +96,12 @@ def artifact(smoke_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from mvitac.deploy.publish import publish
 
     return publish(smoke_run, tmp_path_factory.mktemp("artifact") / "artifact")
+
+
+@pytest.fixture
+def copy(artifact: Path, tmp_path: Path) -> Path:
+    """That artifact, to be changed."""
+    return shutil.copytree(artifact, tmp_path / "artifact")
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

@@ -31,11 +31,6 @@ from mvitac.evaluation.probe import split_rows
 from mvitac.system.files import digest_file, read_json, write_json
 
 
-@pytest.fixture
-def copy(artifact: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(artifact, tmp_path / "artifact")
-
-
 def reseal(folder: Path, change: Callable[[dict[str, Any]], object] = lambda m: None) -> None:
     """Make every digest fit again, as an attacker would."""
     manifest = read_json(folder / "artifact.json", "a description")
@@ -213,6 +208,7 @@ def test_probes_of_another_shape_are_refused(copy: Path) -> None:
     tensors = safetensors.torch.load_file(copy / "probes.safetensors")
     for name, wrong, message in (
         ("pattern.touch.weight", torch.zeros(3, 9), "reads 9 features"),
+        ("pattern.touch.weight", torch.tensor(1.0), r"weights of shape \(\)"),
         ("pattern.touch.bias", torch.zeros(2), "do not fit 3 classes"),
         ("pattern.touch.weight", torch.full((3, 64), torch.nan), "not all finite"),
     ):

@@ -112,11 +112,6 @@ def trap(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def copy(artifact: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(artifact, tmp_path / "artifact")
-
-
 def check(touched: list[str], trap: Path) -> None:
     """Nothing in the trap was touched, nothing was sent, nothing was deleted."""
     for one in touched:
@@ -244,16 +239,6 @@ def test_a_run_or_a_description_that_is_none_is_refused(
     with pytest.raises(ValueError, match=says):
         mvitac.load(folder) if kind == "artifact" else Engine(folder)
     check(list(touched), trap)
-
-
-def test_a_probe_without_dimensions_is_refused(copy: Path, trap: Path) -> None:
-    file = copy / "probes.safetensors"
-    tensors = safetensors.torch.load_file(file)
-    name = next(name for name in tensors if name.endswith(".weight"))
-    safetensors.torch.save_file({**tensors, name: torch.tensor(1.0)}, file)
-    forge(copy, trap)
-    with pytest.raises(ValueError, match=r"weights of shape \(\)"):
-        mvitac.load(str(copy))
 
 
 @pytest.mark.parametrize("weights", ["imagenet", "{trap}/trunk.pth"])

@@ -156,10 +156,3 @@ def test_a_batch_that_does_not_divide_is_named(pack: Pack, tmp_path: Path) -> No
 
     with pytest.raises(ValueError, match="batch_size 16 is not divisible by 3 processes: give a multiple of 3"):
         check_divisible(recipe("smoke"), World(0, 3))
-
-
-def test_a_world_of_one_does_nothing() -> None:
-    z = torch.randn(4, 3)
-    world = World()
-    assert world.gather(z) is z and torch.equal(world.own(z, 4), z)
-    assert world.writes and world.anyone(True) and not world.anyone(False)

@@ -122,20 +122,16 @@ def test_stopped_and_resumed_equals_straight(parts: dict[str, str], tmp_path: Pa
         train(other, tmp_path / "cut", resume=True, quiet=True)
 
 
-def views_of(run: Any, pack: Pack, rows: np.ndarray, num_views: int = 2) -> Views:
-    return views_by(Feed, run, pack, rows, num_views)
-
-
 def test_views_are_of_the_rows_that_have_the_modality(parts: dict[str, str]) -> None:
     run = mix_run(parts["a"], parts["gel"], positives="same-touch")
     pack = run.data.open()
     rows = np.array([*pack.rows("train")[[2, 0]], *pack.rows("train")[-3:], pack.rows("train")[4]])
-    made = views_of(run, pack, rows)
+    made = views_by(Feed, run, pack, rows)
     assert {m: [len(view) for view in found] for m, found in made.images.items()} == {"vision": [3, 3], "touch": [6, 6]}
     assert {m: found.tolist() for m, found in made.both.items()} == {"vision": [0, 1, 2], "touch": [0, 1, 5]}
-    few = views_of(run, pack, rows[:5][[0, 2, 3, 4]])  # a single camera image has no negative
+    few = views_by(Feed, run, pack, rows[:5][[0, 2, 3, 4]])  # a single camera image has no negative
     assert few.images.keys() == {"touch"} and not few.both
-    whole = views_of(run, pack, rows[:2])
+    whole = views_by(Feed, run, pack, rows[:2])
     assert whole.images.keys() == {"vision", "touch"} and not whole.both
 
 

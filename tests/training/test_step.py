@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 
@@ -109,15 +108,6 @@ def test_gradient_caching_is_exact_with_batchnorm_and_dropout_chunk_by_chunk() -
     assert set(counts.values()) == {3}
     for name, buffer in direct.query.named_buffers():
         torch.testing.assert_close(buffer, dict(cached.query.named_buffers())[name])
-
-
-def test_chunks_train_and_repeat(pack: Pack, tmp_path: Path) -> None:
-    from mvitac.datasets.pack import PackConfig
-
-    run = replace(recipe("smoke", PackConfig(path=pack.path)), chunk=4, steps=2)
-    first, second = (train(run, tmp_path / name, quiet=True, validate=False) / "model.safetensors" for name in "ab")
-    a, b = (safetensors.torch.load_file(path) for path in (first, second))
-    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_impossible_steps_are_named(pack: Pack, tmp_path: Path) -> None:
