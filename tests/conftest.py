@@ -53,6 +53,15 @@ def pack(tmp_path_factory: pytest.TempPathFactory) -> Pack:
     return toy_pack(tmp_path_factory.mktemp("toy") / "pack")
 
 
+@pytest.fixture(scope="session")
+def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
+    """The same pairs, of which those of test are to learn from, and those of train to test."""
+    from mvitac.data.build import build
+    from support.toy import Turned
+
+    return build(Turned(), tmp_path_factory.mktemp("turned") / "pack", size=32, quiet=True)
+
+
 @pytest.fixture
 def ctrl_c() -> Iterator[None]:
     """Ctrl-C raises, as in a terminal; a shell that starts pytest in the background has it ignored."""

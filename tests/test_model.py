@@ -28,23 +28,14 @@ from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD, plain_vi
 from support.toy import toy_pack
 
 
-def trained(pack: Pack, out: Path) -> Path:
-    return train(replace(recipe("smoke", PackConfig(path=pack.path)), steps=2), out, quiet=True)
-
-
 def batch(pack: Pack, num: int, modality: str = "touch") -> torch.Tensor:
     """The first ``num`` images, uint8 [num, C, H, W]."""
     return torch.from_numpy(np.array(pack.images[modality][:num])).permute(0, 3, 1, 2)
 
 
 @pytest.fixture(scope="module")
-def run(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(pack, tmp_path_factory.mktemp("model") / "run")
-
-
-@pytest.fixture(scope="module")
-def model(run: Path) -> Model:
-    return mvitac.load(run)
+def model(smoke_run: Path) -> Model:
+    return mvitac.load(smoke_run)
 
 
 def test_loading_draws_nothing_from_the_callers_chance(smoke_run: Path) -> None:
@@ -158,8 +149,8 @@ def test_forward_gives_the_features_of_embed_with_gradients(model: Model, pack: 
     assert floats.grad is not None and floats.grad.abs().sum() > 0
 
 
-def test_a_step_of_fine_tuning_changes_the_trunk(run: Path, pack: Pack) -> None:
-    model = mvitac.load(run)
+def test_a_step_of_fine_tuning_changes_the_trunk(smoke_run: Path, pack: Pack) -> None:
+    model = mvitac.load(smoke_run)
     assert not any(module.training for module in model.modules())
     head = torch.nn.Linear(64, 3)
     optimiser = torch.optim.SGD([*model.encoders["touch"].parameters(), *head.parameters()], lr=0.05)
@@ -295,8 +286,9 @@ def test_shared_space_is_normalised(model: Model, pack: Pack) -> None:
 
 
 def test_two_sensors_keep_their_order(tmp_path: Path) -> None:
-    pack = toy_pack(tmp_path / "p", touch_channels=6, num=90)
-    model = mvitac.load(trained(pack, tmp_path / "r"))
+    pack = toy_pack(tmp_path / "p", touch_channels=6, num=12)
+    run = recipe("smoke", PackConfig(path=pack.path))
+    model = fresh(run, pack.spec, pack.size)
     stacked = pack.images["touch"][:2]
     swapped = np.concatenate([stacked[..., 3:], stacked[..., :3]], axis=-1)
     assert model.embed(touch=stacked)["touch"].shape == (2, 64)
@@ -305,8 +297,8 @@ def test_two_sensors_keep_their_order(tmp_path: Path) -> None:
         model.embed(touch=stacked[..., :3])
 
 
-def test_changed_weights_are_refused(run: Path, tmp_path: Path) -> None:
-    data = bytearray((run / "model.safetensors").read_bytes())
+def test_changed_weights_are_refused(smoke_run: Path, tmp_path: Path) -> None:
+    data = bytearray((smoke_run / "model.safetensors").read_bytes())
     data[-2] ^= 1
     (tmp_path / "model.safetensors").write_bytes(data)
     with pytest.raises(ValueError, match="does not match its digest"):

@@ -37,21 +37,6 @@ from support.training_runs import smoke
 ALL = "72 of 72 test rows and 36 of 36 test instances were trained on (toy)"
 
 
-@dataclass
-class Turned(Toy):
-    """The same samples with train and test the other way round."""
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        turned = {"train": "test", "test": "train"}
-        return [replace(sample, columns={**sample.columns, "split": turned.get(s := sample.columns["split"], s)})]
-
-
-@pytest.fixture(scope="module")
-def turned(tmp_path_factory: pytest.TempPathFactory) -> Pack:
-    return build(Turned(), tmp_path_factory.mktemp("turned") / "pack", size=32, quiet=True)
-
-
 @pytest.fixture
 def run(smoke_run: Path, tmp_path: Path) -> Path:
     return shutil.copytree(smoke_run, tmp_path / "run", ignore=shutil.ignore_patterns("probe.json"))

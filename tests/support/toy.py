@@ -91,6 +91,16 @@ class Toy(Source):
 
 
 @dataclass
+class Turned(Toy):
+    """The same samples with train and test the other way round."""
+
+    def read(self, item: int) -> list[Sample]:
+        (sample,) = super().read(item)
+        split = {"train": "test", "test": "train"}.get(sample.columns["split"], sample.columns["split"])
+        return [replace(sample, columns={**sample.columns, "split": split})]
+
+
+@dataclass
 class Counting(Toy):
     """The toy, which keeps what was read of it."""
 

@@ -389,23 +389,28 @@ def test_partners_are_other_rows_of_the_same_touch(pack: Pack, monkeypatch: pyte
     assert np.array_equal(partners(pack, rows, torch.Generator().manual_seed(0)), rows)
 
 
-@pytest.mark.parametrize("num_views", [1, 2])
-@pytest.mark.parametrize("positives", ["same-image", "same-touch", "same-touch-pairs"])
-def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> None:
-    rows = pack.rows("train")[:16]
-    asked: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
+def asked(run: Run, pack: Pack, rows: np.ndarray, num: int = 2) -> tuple[list[int], dict[str, list[np.ndarray]]]:
+    """How many views there are of vision and of touch for ``rows``, and the rows that the feed is asked for."""
+    seen: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
 
     class Spy(Feed):
         def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
-            asked[modality].append(rows)
+            seen[modality].append(rows)
             return super().__call__(modality, rows)
 
-    made = views_by(Spy, smoke(pack, positives=positives), pack, rows, num_views)
-    assert {m: len(views) for m, views in made.images.items()} == {"vision": num_views, "touch": num_views}
-    touch_groups = pack.touch_groups
-    for found in (one for each in asked.values() for one in each):
+    made = views_by(Spy, run, pack, rows, num).images
+    return [len(made["vision"]), len(made["touch"])], seen
+
+
+@pytest.mark.parametrize("num_views", [1, 2])
+@pytest.mark.parametrize("positives", ["same-image", "same-touch", "same-touch-pairs"])
+def test_which_rows_a_view_is_of(pack: Pack, positives: Any, num_views: int) -> None:
+    rows, touch_groups = pack.rows("train")[:16], pack.touch_groups
+    num, views = asked(smoke(pack, positives=positives), pack, rows, num_views)
+    assert num == [num_views, num_views]
+    for found in (*views["vision"], *views["touch"]):
         assert np.array_equal(touch_groups[found], touch_groups[rows])
-    other = {m: [bool((found != rows).all()) for found in each] for m, each in asked.items()}
+    other = {m: [bool((found != rows).all()) for found in each] for m, each in views.items()}
     if num_views == 2:
         assert other["vision"] == other["touch"] == ([False] if positives == "same-image" else [False, True])
     else:
@@ -444,20 +449,11 @@ def twice(tmp_path_factory: pytest.TempPathFactory) -> Pack:
 def test_the_other_sensors_view_is_of_the_same_press(twice: Pack) -> None:
     rows = twice.rows("train")
     run = replace(recipe("smoke", PackConfig(path=twice.path)), augment=Augment(size=16))
-    asked: dict[str, list[np.ndarray]] = {"vision": [], "touch": []}
-
-    class Spy(Feed):
-        def __call__(self, modality: str, rows: np.ndarray) -> torch.Tensor:
-            asked[modality].append(rows)
-            return super().__call__(modality, rows)
-
-    def made(run: Run) -> dict[str, list[torch.Tensor]]:
-        return views_by(Spy, run, twice, rows).images
-
-    plain = made(run)
-    one_more = made(replace(run, method=MViTacConfig(hidden=32, out=16, lambda_sensor=0.5)))
-    assert [len(plain[m]) for m in plain] == [2, 2] and [len(one_more[m]) for m in one_more] == [2, 3]
-    found = asked["touch"][-1]
+    one_more = replace(run, method=MViTacConfig(hidden=32, out=16, lambda_sensor=0.5))
+    assert asked(run, twice, rows)[0] == [2, 2]
+    num, views = asked(one_more, twice, rows)
+    assert num == [2, 3]
+    found = views["touch"][-1]
     assert np.array_equal(twice.presses[found], twice.presses[rows])
     assert (twice.sensors[found] != twice.sensors[rows]).all()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,9 +14,7 @@ from safetensors.torch import save_file
 
 import mvitac
 from mvitac.cli.main import main
-from mvitac.data.build import build
 from mvitac.data.pack import Pack
-from mvitac.data.source import Sample
 from mvitac.datasets.pack import PackConfig
 from mvitac.deploy.publish import publish
 from mvitac.evaluation.leaks import read_sources, weights_files
@@ -31,7 +29,7 @@ from mvitac.nn.weights import adapt_stem
 from mvitac.run import Run, load_run
 from mvitac.training.loop import train
 from mvitac.training.start import describe, load_start, read_start
-from support.toy import Toy, toy_pack
+from support.toy import toy_pack
 from support.training_runs import assert_equal_weights, power_cut, smoke, weights
 
 TINY = Encoders.both(trunk="mvitac_tiny", weights="scratch")
@@ -175,21 +173,10 @@ def test_other_weights_are_refused_at_resume(pack: Pack, smoke_run: Path, tmp_pa
         train(load_run(out)[0], tmp_path / "again", quiet=True)
 
 
-@dataclass
-class Turned(Toy):
-    """The same samples with train and test the other way round."""
-
-    def read(self, item: int) -> list[Sample]:
-        (sample,) = super().read(item)
-        turned = {"train": "test", "test": "train"}
-        return [replace(sample, columns={**sample.columns, "split": turned.get(s := sample.columns["split"], s)})]
-
-
 @pytest.fixture(scope="module")
-def chain(pack: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def chain(pack: Pack, turned: Pack, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """b learned from the rows that the striped pairs test; c started from b, and d from the artifact of c."""
     folder = tmp_path_factory.mktemp("chain")
-    turned = build(Turned(), folder / "turned", size=32, quiet=True)
     run = smoke(pack, steps=1, eval_every=0)
     runs = {"b": train(replace(run, data=PackConfig(path=turned.path)), folder / "b", quiet=True)}
     runs["c"] = train(replace(run, init=Init(path=runs["b"])), folder / "c", quiet=True)
