@@ -23,7 +23,6 @@ from mvitac.methods.calandra import CalandraConfig
 from mvitac.model import Model
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
-from mvitac.training.loop import train
 from mvitac.transforms.random_views import IMAGENET_MEAN, IMAGENET_STD, plain_view
 from support.toy import toy_pack
 
@@ -303,23 +302,6 @@ def test_changed_weights_are_refused(smoke_run: Path, tmp_path: Path) -> None:
     (tmp_path / "model.safetensors").write_bytes(data)
     with pytest.raises(ValueError, match="does not match its digest"):
         mvitac.load(tmp_path)
-
-
-def test_loading_needs_no_network_and_no_start_weights(pack: Pack, tmp_path: Path) -> None:
-    """A run that started from a weights file loads where that file is gone."""
-    import safetensors.torch
-    import timm
-
-    from mvitac.nn.encoders import Encoders
-
-    torch.manual_seed(0)
-    start = tmp_path / "start.safetensors"
-    safetensors.torch.save_file(timm.create_model("resnet10t").state_dict(), start)
-    base = recipe("smoke", PackConfig(path=pack.path))
-    run = replace(base, steps=1, encoder=Encoders.both(trunk="resnet10t", weights=str(start)))
-    out = train(run, tmp_path / "r", quiet=True)
-    start.unlink()
-    assert mvitac.load(out).embed(touch=pack.images["touch"][0])["touch"].shape == (1, 512)
 
 
 def test_says_what_it_is(artifact: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.csv
-import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
@@ -110,30 +109,25 @@ def test_a_recipe_takes_an_open_pack(pack: Pack) -> None:
 
 @pytest.fixture(scope="module")
 def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four simulated grasps as a pack, as files with a manifest, and as a parquet file of the Hub."""
+    """Four simulated grasps as a pack, and as files with a manifest."""
     root = tmp_path_factory.mktemp("grasps")
     pack = build(GraspsConfig(num=4, size=32).source(), root / "pack", size=32, quiet=True)
-    rows, cells = [], []
+    rows = []
     for i in range(pack.num):
         names = {"vision": f"v{i}.png", "left": f"l{i}.png", "right": f"r{i}.png"}
         touch = pack.images["touch"][i]
         for file, image in zip(names.values(), (pack.images["vision"][i], touch[..., :3], touch[..., 3:]), strict=True):
             Image.fromarray(image).save(root / file)
-        about = {name: str(pack.column(name)[i]) for name in ("phase", "group", "touch_group")}
-        rows.append({**names, **about})
-        cells.append({**{k: {"bytes": (root / v).read_bytes(), "path": v} for k, v in names.items()}, **about})
-    table = pa.Table.from_pylist(rows)
-    pa.csv.write_csv(table, root / "folder.csv")
-    pq.write_table(pa.Table.from_pylist(cells), root / "hub.parquet")
+        rows.append({**names, **{name: str(pack.column(name)[i]) for name in ("phase", "group", "touch_group")}})
+    pa.csv.write_csv(pa.Table.from_pylist(rows), root / "folder.csv")
     return root
 
 
-@pytest.mark.parametrize("name", ["pack", "folder", "hub"])
+@pytest.mark.parametrize(("name", "file"), [("pack", "pack"), ("folder", "folder.csv")])
 def test_grasps_have_the_recipe_of_the_simulator_however_they_are_read(
-    name: str, grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, file: str, grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The opened pack decides: in Python, and in `mvitac pretrain`, where single fields still come after the recipe."""
-    file = {"pack": "pack", "folder": "folder.csv", "hub": "hub.parquet"}[name]
     config = find(DatasetConfig, name)(size=32, path=grasps / file)
     for one in RECIPES:
         expected, found = recipe(one, GraspsConfig()), recipe(one, config)
@@ -141,7 +135,7 @@ def test_grasps_have_the_recipe_of_the_simulator_however_they_are_read(
     monkeypatch.chdir(grasps)
     words = ["--data", name, "--data.path", file, "--recipe", "smoke", "--batch-size", "2", "--steps", "1"]
     words += ["--data.size", "32", "--quiet", "--log-every", "5", "--augment.touch.grayscale", "0.1"]
-    if name in ("folder", "hub"):
+    if name == "folder":
         words += ["--data.test-share", "0", "--data.val-share", "0", "--data.touch-group", "touch_group"]
     assert main(["pretrain", *words, "--out", str(tmp_path / "run")]) == 0
     run, _ = load_run(tmp_path / "run")

@@ -19,7 +19,6 @@ from mvitac.data.pack import Pack
 from mvitac.data.spec import Window
 from mvitac.data.windows import windowed
 from mvitac.datasets.pack import PackConfig
-from mvitac.deploy.artifact import ARTIFACT
 from mvitac.deploy.engine import Engine, frame_shapes
 from mvitac.deploy.publish import publish
 from mvitac.live.contact import LiveConfig
@@ -79,13 +78,6 @@ def test_each_frame_is_minus_the_first_one_of_its_touch(model: Model, measured: 
         other.embed(touch=clip, background=first)
     with pytest.raises(ValueError, match="background cannot be used"):
         model.embed(touch=clip, background=first)
-
-
-def test_the_artifact_says_what_a_window_is(published: Path, artifact: Path) -> None:
-    window = ARTIFACT.read(published)["preprocessing"]["window"]
-    assert (window["frames"], window["stride"], window["order"], window["of"]) == (2, 1.0, "frame", ["touch"])
-    assert "newest frame first" in window["layout"]
-    assert "window" not in ARTIFACT.read(artifact)["preprocessing"]
 
 
 # -- live -------------------------------------------------------------------------------------------------------------

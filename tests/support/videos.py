@@ -43,6 +43,7 @@ def write_video(
     num: int,
     paint: Callable[[int], np.ndarray],
     *,
+    rate: int = 25,
     codec: str = "mpeg4",
     gop: int = 12,
     b_frames: int = 0,
@@ -52,7 +53,7 @@ def write_video(
     """``num`` frames painted by ``paint``; the defaults are the codec and key frame distance of Touch and Go's own files."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w", options=flags or {}) as container:
-        stream: Any = container.add_stream(codec, rate=25, options=options or {})
+        stream: Any = container.add_stream(codec, rate=rate, options=options or {})
         height, width = paint(0).shape[:2]
         stream.width, stream.height = width, height
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
