@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mvitac
 from mvitac.data.build import build
 from mvitac.data.source import Sample
 from mvitac.data.spec import DataSpec
 from mvitac.datasets.pack import PackConfig
 from mvitac.datasets.simulated import Grasps, GraspsConfig
-from mvitac.deploy.policy import ObservationEncoder
 from mvitac.model_files import fresh
 from mvitac.recipes import recipe
 from support.examples import load_example
@@ -86,18 +84,6 @@ def test_lifts_are_counted_by_object() -> None:
     found = regrasp.play(y.astype(float), y, objects, hands, 0.5)
     assert found == {"group_sizes": [1, 1, 1], "group_correct": [1, 1, 0], "tried": 5 / 3}
     assert regrasp.play(np.ones(6), y, objects, hands, 0.5)["group_correct"] == [0, 1, 0]
-
-
-def test_features_are_those_of_one_encoder_of_all_cameras(run: Path) -> None:
-    model = mvitac.load(run)
-    pack, rows = model.run.data.open(), np.array([3, 8, 120])
-    x = regrasp.encode(model, pack, rows)
-    whole = ObservationEncoder(model, {**regrasp.KEYS["vision"], **regrasp.KEYS["touch"]})
-    seen = regrasp.observe(pack, rows)
-    left, right = (seen[f"observation.images.gel_{side}"].permute(0, 2, 3, 1).numpy() for side in ("left", "right"))
-    assert np.array_equal(np.concatenate([left, right], axis=3), pack.images["touch"][rows])
-    expected = whole(seen).detach().numpy()
-    np.testing.assert_allclose(np.hstack([x["vision"], x["touch"]]), expected, atol=1e-5)
 
 
 def test_touch_that_knows_the_outcome_lifts_like_the_oracle(

@@ -27,6 +27,7 @@ from support.toy import Toy
 from support.training_runs import smoke
 
 GRID, SIDE = (4, 4), 8
+MASKED = {"mae": MAEConfig(), "ijepa": IJEPAConfig()}
 
 
 def spec(**changes: object) -> DataSpec:
@@ -144,19 +145,15 @@ def test_hidden_pixels_reach_the_loss_as_targets_only() -> None:
         assert np.abs(cut(image.grad[i])[seen[i]]).max() > 0
 
 
-@pytest.mark.parametrize("name", ["mae", "ijepa"])
+@pytest.mark.parametrize("name", MASKED)
 def test_the_other_sense_teaches_only_if_it_is_seen(name: str) -> None:
     """The gradient of touch's loss for vision's trunk: none for own, some for both."""
     for senses in ("own", "both"):
-        config = replace(recipe_config(name), senses=senses)
+        config = replace(MASKED[name], senses=senses)
         method = build(name, config=config)
         outcome(method, views(method))["touch"].backward()
         reached = any(p.grad is not None and bool(p.grad.any()) for p in method.encoders()["vision"].parameters())
         assert reached == (senses == "both")
-
-
-def recipe_config(name: str) -> MAEConfig | IJEPAConfig:
-    return MAEConfig() if name == "mae" else IJEPAConfig()
 
 
 # -- I-JEPA -----------------------------------------------------------------------------------------------------------
@@ -255,11 +252,11 @@ def test_the_teacher_follows_with_a_linear_momentum() -> None:
 # -- both -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["mae", "ijepa"])
+@pytest.mark.parametrize("name", MASKED)
 def test_frames_are_channels_or_images_with_one_mask(name: str) -> None:
     """A window of two equal frames: frame by frame it has the loss of one frame."""
     window = Window(frames=2, stride=1, of=("vision", "touch"))
-    config, seen = recipe_config(name), spec(window=window)
+    config, seen = MASKED[name], spec(window=window)
     single = build(name)
     batch = views(single, num=4)
     twice = Views(images={m: [v[0].repeat(1, 2, 1, 1)] for m, v in batch.images.items()}, labels={}, rows=batch.rows)
@@ -279,9 +276,9 @@ def test_frames_are_channels_or_images_with_one_mask(name: str) -> None:
         replace(config, senses="both").build(seen, TINY_VIT.changed(temporal="mean"))
 
 
-@pytest.mark.parametrize("name", ["mae", "ijepa"])
+@pytest.mark.parametrize("name", MASKED)
 def test_other_trunks_and_views_of_one_patch_are_refused(name: str) -> None:
-    config, run = recipe_config(name), recipe("smoke")
+    config, run = MASKED[name], recipe("smoke")
     with pytest.raises(ValueError, match=f"method '{name}' needs a plain ViT, and trunk mvitac_tiny is a ResNet: give"):
         config.build(spec(), TINY)
     with pytest.raises(ValueError, match="needs a plain ViT, and trunk mvitac_tiny is a ResNet"):
