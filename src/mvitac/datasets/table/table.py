@@ -184,9 +184,9 @@ class Rows(Source):
         own: dict[str, Sequence[Any]] = {"id": selected.ids(), "group": grouping.groups}
         own |= {"touch_group": grouping.touch_groups, "split": assigned}
         own |= {f"label_{task.name}": label for task, label in read}
-        own |= {f"has_{modality}": [not lacks for lacks in lacking] for modality, lacking in missing.items()}
         columns.check_names(selected.where, [*values, *extra], {*own, "sensor"})
-        self._rows = self._make_rows(selected, own | values, extra)
+        own |= values | {f"has_{m}": [not lacks for lacks in lacking] for m, lacking in missing.items()}
+        self._rows = self._make_rows(selected, own, extra)
 
         row_bytes = 3 * config.size**2 * sum(bool(column) for column in (self._vision, *self._touch))
         self._items = bundles(self._rows, max(1, min(MAX_TOGETHER, MAX_TOGETHER_BYTES // row_bytes)))
