@@ -110,7 +110,8 @@ class Run:
     orders the frames of a touch (--data.order). 0 = any distance. Not for same-image."""
     precision: Literal["auto", "fp32", "tf32", "bf16"] = "fp32"
     """Arithmetic of the networks. Losses, weights and the optimiser stay in fp32. auto: bf16 where the hardware computes it
-    (GPUs from Ampere, CPUs with AVX512-BF16 or AMX), else fp32; run.json says which. fp32 never uses TF32. tf32 lets a GPU
+    (GPUs from Ampere; CPUs with AVX512-BF16 or AMX where half a second of the run's networks is faster in it), else fp32;
+    run.json says which. fp32 never uses TF32. tf32 lets a GPU
     round products to 10 bits."""
     chunk: int = 0
     """Pairs that are embedded at a time (gradient caching). A batch of any size then needs the memory of one chunk, for
@@ -201,7 +202,7 @@ class Run:
     @property
     def bf16(self) -> bool:
         """Whether the networks compute in bf16."""
-        assert self.precision != "auto", "auto is resolved earlier (device.pick_precision)"
+        assert self.precision != "auto", "auto is resolved earlier (system.device.Hardware)"
         return self.precision == "bf16"
 
     def without_idle(self, spec: DataSpec) -> "Run":

@@ -27,19 +27,20 @@ from mvitac.experiments.table import lines_of
 from mvitac.experiments.table_formats import latex, markdown
 from mvitac.run import Run, load_run
 from mvitac.system import device as devices
-from mvitac.system.device import describe_precision, pick_precision
+from mvitac.system.device import Hardware
 from mvitac.training.loop import train
 from support.training_runs import assert_equal_weights, power_cut, smoke
 
 CPU = torch.device("cpu")
 OLD_CPU = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
 """What makes torch treat any x86 CPU as one that has AVX2 and nothing newer."""
-Hardware = Callable[[bool], None]
+Machine = Callable[[bool], None]
 
 
 @pytest.fixture
-def hardware(monkeypatch: pytest.MonkeyPatch) -> Hardware:
+def hardware(monkeypatch: pytest.MonkeyPatch) -> Machine:
     """Calling it with True or False moves the test to a machine that computes bf16 itself, or not."""
+    monkeypatch.setattr(devices, "slowdown", lambda device, work: 0.5)
     return lambda own: monkeypatch.setattr(devices, "has_bf16", lambda device: own)
 
 
@@ -76,8 +77,8 @@ def test_auto_on_cpus(
             monkeypatch.setattr(where, name, lambda answer=answer: answer)
     known = {} if onednn is None else {"_is_mkldnn_bf16_supported": lambda: onednn}
     monkeypatch.setattr(torch.ops, "mkldnn", SimpleNamespace(**known))
-    assert pick_precision("auto", CPU) == expected
-    assert [pick_precision(name, CPU) for name in ("fp32", "tf32", "bf16")] == ["fp32", "tf32", "bf16"]
+    assert Hardware.choose(CPU, "auto").precision == expected
+    assert [Hardware.choose(CPU, name).precision for name in ("fp32", "tf32", "bf16")] == ["fp32", "tf32", "bf16"]
 
 
 @pytest.mark.parametrize(("capability", "expected"), [((7, 5), "fp32"), ((8, 0), "bf16"), ((9, 0), "bf16")])
@@ -85,28 +86,45 @@ def test_auto_on_gpus(capability: tuple[int, int], expected: str, monkeypatch: p
     monkeypatch.setattr(torch.cuda, "device", lambda device: torch.no_grad())
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
-    assert pick_precision("auto", torch.device("cuda:0")) == expected
+    assert Hardware.choose(torch.device("cuda:0"), "auto").precision == expected
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: including_emulation)
-    assert pick_precision("auto", torch.device("cuda:0")) == "fp32"
-    assert pick_precision("auto", torch.device("mps")) == "fp32"
+    assert Hardware.choose(torch.device("cuda:0"), "auto").precision == "fp32"
+    assert Hardware.choose(torch.device("mps"), "auto").precision == "fp32"
 
 
 # -- said and kept ----------------------------------------------------------------------------------------------------
 
 
-def test_emulated_bf16_is_told(hardware: Hardware) -> None:
+def test_emulated_bf16_is_told(hardware: Machine) -> None:
     told = {}
     for own in (True, False):
         hardware(own)
-        told[own] = [describe_precision(asked, pick_precision(asked, CPU), CPU) for asked in ("auto", "bf16", "fp32")]
+        told[own] = [Hardware.choose(CPU, asked).sentence for asked in ("auto", "bf16", "fp32")]
     assert told[True] == ["precision: bf16 (auto)", "precision: bf16", "precision: fp32"]
     assert told[False][0] == "precision: fp32 (auto, as this CPU does not compute bf16 itself)"
     assert "this CPU only emulates" in told[False][1] and told[False][2] == told[True][2]
 
 
+@pytest.mark.parametrize("slower", [0.8, 1.3])
+def test_auto_is_the_faster_one_where_both_are_computed(slower: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Xeon without AMX computes bf16 itself, and more slowly than fp32."""
+    monkeypatch.setattr(devices, "has_bf16", lambda device: True)
+    clock = iter(range(10**6))
+    now = [0.0]
+    monkeypatch.setattr(devices.time, "perf_counter", lambda: now[0])
+
+    def work() -> None:
+        next(clock)
+        now[0] += 0.01 * (slower if torch.is_autocast_enabled("cpu") else 1.0)
+
+    found = Hardware.choose(CPU, "auto", work)
+    assert found.precision == ("bf16" if slower < 1 else "fp32") and found.slowdown == pytest.approx(slower)
+    assert f"bf16 takes {slower:.2f} of fp32's time" in found.sentence and 0.5 < now[0] < 0.6 and next(clock) > 20
+
+
 @pytest.mark.parametrize("own", [True, False])
 def test_what_auto_became_is_printed_and_kept(
-    pack: Pack, tmp_path: Path, hardware: Hardware, own: bool, capsys: pytest.CaptureFixture[str]
+    pack: Pack, tmp_path: Path, hardware: Machine, own: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hardware(own)
     became = "bf16" if own else "fp32"
@@ -127,27 +145,23 @@ def test_what_auto_became_is_printed_and_kept(
     assert train(asked, out, resume=True, quiet=True) == out
 
 
-def test_a_checkpoint_goes_on_in_its_own_precision_alone(pack: Pack, tmp_path: Path, hardware: Hardware) -> None:
+def test_a_checkpoint_goes_on_in_its_own_precision_alone(pack: Pack, tmp_path: Path, hardware: Machine) -> None:
     run, out = auto(pack, steps=4, checkpoint_every=2), tmp_path / "r"
     hardware(True)
     train(run, tmp_path / "straight", quiet=True)
     with power_cut(3), pytest.raises(RuntimeError, match="power cut"):
         train(run, out, quiet=True)
     hardware(False)
-    with pytest.raises(
-        ValueError, match=r"begun in bf16, and --precision auto means fp32 .* --precision bf16, or delete"
-    ):
-        train(run, out, resume=True, quiet=True)
     with pytest.raises(ValueError, match="holds a different run"):
         train(replace(run, precision="fp32"), out, resume=True, quiet=True)
-    train(replace(run, precision="bf16"), out, resume=True, quiet=True)
+    train(run, out, resume=True, quiet=True)
     assert_equal_weights(tmp_path / "straight", out)
 
 
 # -- other commands ---------------------------------------------------------------------------------------------------
 
 
-def test_compare_says_where_runs_differ(pack: Pack, tmp_path: Path, hardware: Hardware) -> None:
+def test_compare_says_where_runs_differ(pack: Pack, tmp_path: Path, hardware: Machine) -> None:
     rows = (Row(label="MViTac"), Row(label="in fp32", set={"precision": "fp32"}))
     plan = Plan(name="p", rows=rows, recipe="smoke", seeds=2, set={"steps": 2, "eval_every": 0, "precision": "auto"})
     plan = replace(plan, data=PackConfig(path=pack.path))

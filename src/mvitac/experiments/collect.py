@@ -28,7 +28,7 @@ from mvitac.experiments.plan import ONE_ROW, Plan, Row, slug
 from mvitac.nn.encoders import SCRATCH
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
-from mvitac.system.device import describe, describe_precision, pick_device, pick_precision
+from mvitac.system.device import Hardware, describe, pick_device
 from mvitac.system.files import digest, read_json, write_json
 from mvitac.system.provenance import provenance
 from mvitac.training.setup import check_same
@@ -236,6 +236,5 @@ def outline(work: Work) -> list[str]:
     lines += [f"  left out: {label} ({reason})" for label, reason in work.left_out.items()]
     todo = [job for job in work.jobs if not job.done]
     for asked, run in {job.run.precision: job.run for job in todo}.items():
-        device = pick_device(run.device)
-        lines.append(f"on this machine: {describe_precision(asked, pick_precision(asked, device), device)}")
+        lines.append(f"on this machine: {Hardware.choose(pick_device(run.device), asked).sentence}")
     return [*lines, f"{len(todo)} runs left" if todo else "all runs are finished"]

@@ -17,7 +17,6 @@ from mvitac.data.pack import Pack
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.run import Run
-from mvitac.system.device import describe_precision
 from mvitac.system.distributed import join
 from mvitac.system.locks import hold_lock
 from mvitac.training import checkpoint
@@ -98,7 +97,7 @@ def _loop(setup: Setup, out: Path, *, quiet: bool, loggers: tuple[Logger, ...], 
     log_or_none = Log(out, start, num_steps, run.batch_size, quiet=quiet, loggers=loggers) if world.writes else None
     with log_or_none or nullcontext() as log, _stop_signals() as stop_requested:
         if log and not quiet:
-            log.say(describe_precision(setup.asked.precision, run.precision, setup.device))
+            log.say(setup.hardware.sentence)
         validation = Validation(out, run, method, pack, setup.spec, log, setup.kept) if log and validate else None
         if validation and start == 0:
             validation(0)

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,11 @@ from mvitac.evaluation.sensors import sensors_of
 from mvitac.methods.base import Method
 from mvitac.model import Model
 from mvitac.model_files import load
-from mvitac.nn.encoders import IMAGENET, is_locked
+from mvitac.nn.encoders import IMAGENET, SCRATCH, build_trunk, is_locked
 from mvitac.nn.imagenet import source
 from mvitac.registry import to_json
 from mvitac.run import Run, load_run, precision_of
-from mvitac.system.device import describe, pick_device, pick_precision
+from mvitac.system.device import Hardware, describe, has_bf16, pick_device
 from mvitac.system.distributed import World, local_device, synchronise_norms
 from mvitac.system.files import brief, check_place, is_temporary, write_json
 from mvitac.system.malloc import keep_freed_memory
@@ -43,7 +44,7 @@ class Setup:
     run: Run  # the same with ``precision`` resolved for this machine
     pack: Pack
     rows: np.ndarray  # pack rows to train on
-    device: torch.device
+    hardware: Hardware
     world: World
     method: Method
     views: StepViews
@@ -62,11 +63,12 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     """Open the data, build the method, restore a checkpoint, and write run.json; None if the run is finished."""
     asked = replace(asked, init=asked.init.resolved())
     device = pick_device(local_device(asked.device))
-    run = replace(asked, precision=_precision(asked, device, world))
-    pack = open_pack(run.data, world, quiet) if pack is None else pack
-    rows = check(run, pack, world)
+    pack = open_pack(asked.data, world, quiet) if pack is None else pack
+    rows = check(asked, pack, world)
     resumed = (out / "run.json").exists()
-    if resumed and _is_finished(asked, run, pack, out, world):
+    hardware = _hardware(asked, pack, device, world, out if resumed else None)
+    run = replace(asked, precision=hardware.precision)
+    if resumed and _is_finished(asked, pack, out, world):
         return None
 
     start = read_start(run.init)
@@ -78,7 +80,7 @@ def set_up(asked: Run, out: Path, world: World, *, quiet: bool, pack: Pack | Non
     before = start.sensors if start and "touch" in taken["taken"] else ()
     spec = replace(pack.spec, sensors=tuple(sorted({*sensors_of(pack, rows), *before})))
     num_steps = run.num_steps(len(rows))
-    setup = Setup(asked, run, pack, rows, device, world, method, views, step, done, num_steps, kept, spec)
+    setup = Setup(asked, run, pack, rows, hardware, world, method, views, step, done, num_steps, kept, spec)
     # Also a barrier: rank 0 writes run.json only after all processes have looked for it.
     world.same_everywhere([*method.parameters(), *method.buffers()])
     if world.writes:
@@ -103,7 +105,8 @@ def _record(setup: Setup, out: Path, start: Start | None, taken: dict[str, Any],
     run, pack, method = setup.run, setup.pack, setup.method
     if not (out / "run.json").exists():
         data = {"pack": pack.digest, "num_pairs": pack.num, "data": to_json(setup.spec)}
-        record = {"run": to_json(setup.asked), **data, "device": describe(setup.device), "precision": run.precision}
+        record = {"run": to_json(setup.asked), **data, "device": describe(setup.hardware.device)}
+        record |= {"precision": run.precision, "bf16_slowdown": setup.hardware.slowdown}
         used = {m: run.encoder[m] for m in method.encoders() if run.encoder[m].weights == IMAGENET}
         said = []
         if imagenet := {m: source(config.trunk) for m, config in used.items()}:
@@ -139,12 +142,12 @@ def check_still_there(out: Path) -> None:
         raise ValueError(f"{out / 'run.json'} is gone: {out} was deleted or moved during training, start again")
 
 
-def _is_finished(asked: Run, run: Run, pack: Pack, out: Path, world: World) -> bool:
+def _is_finished(asked: Run, pack: Pack, out: Path, world: World) -> bool:
     """Return whether the run in ``out`` has its model. A damaged one is made again from the checkpoint.
 
-    ValueError if ``out`` holds another run, or was begun in another precision: its weights would match neither.
+    ValueError if ``out`` holds another run.
     """
-    begun = check_same(asked, pack, out)
+    check_same(asked, pack, out)
     if (out / "model.safetensors").exists():
         try:
             load(out)
@@ -156,11 +159,6 @@ def _is_finished(asked: Run, run: Run, pack: Pack, out: Path, world: World) -> b
                 raise ValueError(f"{error} (its checkpoint is gone: delete {out} to train again)") from None
             if world.writes:
                 print(f"mvitac: {error}; making it again from {out / checkpoint.CHECKPOINT}", file=sys.stderr)
-    if begun != run.precision:
-        raise ValueError(
-            f"{out} was begun in {begun}, and --precision {asked.precision} means {run.precision} on this machine:"
-            f" continue it with --precision {begun}, or delete it to start over in {run.precision}"
-        )
     return False
 
 
@@ -175,23 +173,44 @@ def check_divisible(run: Run, world: World) -> None:
         )
 
 
-def check_same(run: Run, pack: Pack, out: Path) -> str:
-    """Check that the run in folder ``out`` is ``run`` on ``pack``. Precision auto matches any precision.
-
-    Returns the precision in which the run in ``out`` was started; ValueError if it is a different run.
-    """
+def check_same(run: Run, pack: Pack, out: Path) -> None:
+    """Raise ValueError unless the run in folder ``out`` is ``run`` on ``pack``. Precision auto matches any precision."""
     old, record = load_run(out)
     begun = precision_of(old, record)
     same = replace(run, precision=begun) if run.precision == "auto" else run
     if replace(old, precision=begun).digest() != same.digest() or record.get("pack") != pack.digest:
         raise ValueError(f"{out} holds a different run (other settings or data): give the same ones, or another --out")
-    return begun
 
 
-def _precision(run: Run, device: torch.device, world: World) -> str:
-    """Resolve ``run.precision`` on ``device``. auto is bf16 only if every process supports it."""
-    precision = pick_precision(run.precision, device)
-    return "fp32" if run.precision == "auto" and world.anyone(precision == "fp32") else precision
+def _hardware(run: Run, pack: Pack, device: torch.device, world: World, begun: Path | None) -> Hardware:
+    """The precision of ``run`` on ``device``. A run that was ``begun`` goes on in its own; auto is bf16 if all agree."""
+    if run.precision == "auto" and begun:
+        return Hardware.choose(device, precision_of(*load_run(begun)))
+    measured = run.precision == "auto" and device.type == "cpu" and has_bf16(device)
+    work = partial(_pass, _sample_networks(run, pack, device)) if measured else None
+    made = Hardware.choose(device, run.precision, work)
+    fp32 = run.precision == "auto" and world.anyone(made.precision == "fp32")
+    return Hardware.choose(device, "fp32") if fp32 and made.precision == "bf16" else made
+
+
+def _sample_networks(run: Run, pack: Pack, device: torch.device) -> list[tuple[torch.nn.Module, torch.Tensor]]:
+    """The trunks of ``run`` with random weights, each with a few images of the size that it is trained on."""
+    found, spec = [], pack.spec
+    with torch.random.fork_rng(devices=[]):
+        for m in spec.modalities:
+            trunk = build_trunk(replace(run.encoder[m], weights=SCRATCH), spec.channels(m), spec.frames(m)).to(device)
+            images = torch.rand(8, spec.channels(m), *[run.augment.size_of(m)] * 2, device=device)
+            trunk.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+            found.append((trunk, images.to(memory_format=torch.channels_last)))
+    return found
+
+
+def _pass(networks: list[tuple[torch.nn.Module, torch.Tensor]]) -> None:
+    """Forward and, of trunks that are trained, backward."""
+    for trunk, images in networks:
+        features = trunk(images)
+        if features.requires_grad:
+            features.float().sum().backward()
 
 
 def open_pack(data: DatasetConfig, world: World, quiet: bool) -> Pack:
