@@ -74,8 +74,8 @@ def controls_of(
     fitted = sum(len(probes_of(task, probes)) for task in tasks) * (len(starts) + len(weights))
     num = len(modalities) * (len(tasks) + fitted) + len(tasks) * ("touch" in modalities)
 
-    def probed(model: Model) -> Records:
-        return probe_model(model, pack, tasks, modalities, probes, standardise)
+    def probed(model: Model, which: Sequence[str] = modalities) -> Records:
+        return probe_model(model, pack, tasks, which, probes, standardise)
 
     with work("fitting probes of the controls", num, "probes"):
         records += pixel_controls(pack, tasks, modalities)
@@ -88,7 +88,9 @@ def controls_of(
             retrieval += _named("untrained", run.seed, ranked)
         for encoder in weights:
             run, spec = starts[0]
-            records += _named("imagenet", None, probed(fresh(replace(run, encoder=encoder), spec, pack.size)))
+            # A modality that starts from random weights is no control of this name, nor are both with it.
+            which = [m for m in modalities if all(encoder[own].weights != SCRATCH for own in names_in(m, pack))]
+            records += _named("imagenet", None, probed(fresh(replace(run, encoder=encoder), spec, pack.size), which))
     return records, retrieval
 
 
