@@ -10,6 +10,7 @@ import torch.nn.functional as F
 
 from mvitac.transforms import random_views
 from mvitac.transforms.random_views import (
+    IMAGENET,
     IMAGENET_MEAN,
     IMAGENET_STD,
     Drawn,
@@ -61,7 +62,7 @@ def test_both_routes_replay_the_same_parameters(size: int, channels: int) -> Non
     raw = images(16, channels, side=40)
     drawn = draw(ViewAugment(scale=(0.3, 1.0), grayscale=0.3, jitter=0.2), 16, 40, generator())
     one_by_one, batched = (
-        f(raw, drawn, size, torch.float32) for f in (random_views._one_by_one, random_views._batched)
+        f(raw, drawn, size, torch.float32, IMAGENET) for f in (random_views._one_by_one, random_views._batched)
     )
     off = 255 * (denormalise(one_by_one) - denormalise(batched)).abs()
     assert off.max() < 2.5 and off.mean() < 0.5
@@ -73,7 +74,7 @@ def test_both_routes_replay_the_same_parameters(size: int, channels: int) -> Non
 @pytest.mark.parametrize("route", [random_views._one_by_one, random_views._batched])
 def test_views_are_rounded_to_bf16_once(route: Callable[..., torch.Tensor]) -> None:
     drawn = draw(ViewAugment(), 8, 40, generator())
-    exact, rounded = (route(images(), drawn, 24, dtype) for dtype in (torch.float32, torch.bfloat16))
+    exact, rounded = (route(images(), drawn, 24, dtype, IMAGENET) for dtype in (torch.float32, torch.bfloat16))
     assert torch.equal(exact.bfloat16(), rounded)
     assert rounded.is_contiguous(memory_format=torch.channels_last)
 
