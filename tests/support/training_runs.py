@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,6 +20,7 @@ from mvitac.methods.base import Views
 from mvitac.recipes import recipe
 from mvitac.run import Run
 from mvitac.training.loader import Feed
+from mvitac.training.loop import Interrupted, train
 from mvitac.training.sampler import Batches
 from mvitac.training.views import StepViews
 
@@ -65,3 +68,16 @@ def assert_equal_weights(a: Path, b: Path) -> None:
     assert first.keys() == second.keys()
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
+
+
+def stopped_at_four(pack: Path, out: Path) -> None:
+    """Train in ``out`` until Ctrl-C comes in step 4, and print what is said then."""
+
+    def press(step: int, values: dict[str, float]) -> None:
+        if step == 4 and "loss" in values:  # not also at its evaluation: a second Ctrl-C stops at once
+            os.kill(os.getpid(), signal.SIGINT)
+
+    try:
+        train(smoke(Pack(pack)), out, quiet=True, loggers=(press,))
+    except Interrupted as error:
+        print(error)
